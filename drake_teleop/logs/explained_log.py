@@ -18,7 +18,7 @@ from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.log_instants import log_instants
+from drake_teleop.logs.read.gravity import log_instants
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 _MARGIN = 2.0  # knots, at either end
@@ -76,8 +76,8 @@ def _shake(splines: PoseSplines) -> float:
     """Standard deviation of the splines' acceleration by noise of the positions [m/s^2]."""
     f = np.linspace(0.0, _HIGHEST, 500)
     share = passed(f, splines.spacing)
-    if splines.aid is not None:
-        share = share * splines.aid.share(f)[0]
+    if splines.imu_rows is not None:
+        share = share * splines.imu_rows.share(f)[0]
     power = 2.0 * splines.noise()[0] ** 2 / splines.rate * share * (2.0 * np.pi * f) ** 4
     return float(np.sqrt(np.trapezoid(power, f)))
 

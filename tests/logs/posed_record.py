@@ -65,7 +65,7 @@ def record(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
     wrench = non_contact_wrench(at.specific_force, at.omega, at.alpha, PHI)
     wrench = wrench @ (np.eye(6) + kind.gain * rng.normal(size=(6, 6)) * UNITS).T
     wrench = wrench + OFFSETS + np.repeat([0.1, 0.004], 3) * rng.normal(size=wrench.shape)
-    # Stamps that jitter, and each pose really of its stamp but for the delay.
+    # Stamps jitter; each pose belongs to its stamp, except for the delay.
     stamps = np.arange(0.0, SECONDS, 1 / kind.rate)
     stamps += rng.uniform(-0.2, 0.2, len(stamps)) / kind.rate
     posed = motion_at(stamps - LATE)

@@ -17,13 +17,13 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.canonical import Log
 
 
-def a_log(t: np.ndarray) -> Log:
+def make_log(t: np.ndarray) -> Log:
     motion = motion_at(t)
     wrench = np.hstack([motion.specific_force, motion.omega])
     return Log(t, wrench, motion.specific_force, motion.omega, motion.alpha)
 
 
-def test_low_pass_halves_the_cutoff_and_shifts_nothing() -> None:
+def test_low_pass_halves_the_amplitude_at_the_cutoff_without_phase_shift() -> None:
     t = np.arange(4000) * 1e-3
     for f, gain in ((3.0, 1 / (1 + 1e-4)), (30.0, 0.5), (90.0, 1 / 82)):
         x = np.sin(2 * np.pi * f * t)[:, None]
@@ -54,14 +54,14 @@ def test_smoother_is_exact_on_quintics_even_at_the_ends(bandwidth: float | None)
     np.testing.assert_allclose(second[:, 0], -4 + 18 * t - 20 * t**3, atol=1e-5)
 
 
-def test_smoother_is_that_of_savitzky_and_golay() -> None:
+def test_smoother_equals_savgol_filter() -> None:
     x = np.random.default_rng(2).normal(size=(200, 2))
     for order, ours in enumerate(smooth_derivatives(x, 0.01, 10.0)):  # a window of 19 samples
         scipys = savgol_filter(x, 19, 5, deriv=order, delta=0.01, axis=0)
         np.testing.assert_allclose(ours, scipys, atol=1e-10 * np.abs(scipys).max())
 
 
-def test_smoother_keeps_its_digits_in_long_windows() -> None:
+def test_smoother_is_accurate_in_long_windows() -> None:
     t = np.arange(4000) / 8e3
     x = t**5 - t**3 + 1.0
     _, first, second = smooth_derivatives(x, t[1], 10.0)  # a window of 1441 samples
@@ -69,7 +69,7 @@ def test_smoother_keeps_its_digits_in_long_windows() -> None:
     np.testing.assert_allclose(second, 20 * t**3 - 6 * t, atol=1e-6)
 
 
-def test_noise_gain_is_what_noise_does() -> None:
+def test_noise_gain_predicts_the_output_noise() -> None:
     noise = np.random.default_rng(2).normal(size=(200_000, 1))
     measured = [part[500:-500].std() for part in smooth_derivatives(noise, 1e-3, 30.0)]
     np.testing.assert_allclose(measured, noise_gain(1e-3, 30.0), rtol=0.02)
@@ -84,10 +84,10 @@ def test_angular_motion_from_orientations() -> None:
     np.testing.assert_allclose(alpha[4:-4], motion.alpha[4:-4], atol=1e-3)
 
 
-def test_undelayed_moves_the_motion_and_not_the_wrench() -> None:
+def test_undelayed_shifts_motion_but_not_wrench() -> None:
     t = np.arange(0, 2, 0.001)
     late = motion_at(t - 0.0123)
-    log = Log(t, a_log(t).wrench, late.specific_force, late.omega, late.alpha)
+    log = Log(t, make_log(t).wrench, late.specific_force, late.omega, late.alpha)
     back = undelayed(log, 0.0123)
     now = motion_at(back.t)
     assert len(back) == len(t) - 13
@@ -97,7 +97,7 @@ def test_undelayed_moves_the_motion_and_not_the_wrench() -> None:
     np.testing.assert_allclose(back.angular_acceleration, now.alpha, atol=1e-2)
 
 
-def test_uniform_times_removes_jitter_only() -> None:
+def test_uniform_times_removes_only_jitter() -> None:
     even = 5.0 + np.arange(100) * 0.01
     assert uniform_times(even) is even
     jitter = even + np.random.default_rng(3).uniform(-2e-3, 2e-3, 100)

@@ -1,4 +1,4 @@
-"""ROS bags and MCAP files, written here by the library that reads them, with messages of ROS."""
+"""ROS bags and MCAP files, written with rosbags and messages of ROS."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ PLAIN = {"time": {"rate": 100}, "force": {"columns": [0]}, "torque": {"columns":
 Messages = Iterable[tuple[float, Any]]
 
 
-def ros(version: str = "ROS2_JAZZY") -> SimpleNamespace:
-    """The message classes of a ROS, by their short names."""
+def ros_messages(version: str = "ROS2_JAZZY") -> SimpleNamespace:
+    """Return the message classes of a ROS version by short name."""
     store = typesys.get_typestore(typesys.Stores[version])
     types = {name.split("/")[-1]: kind for name, kind in store.types.items()}
     types["Time"] = store.types["builtin_interfaces/msg/Time"]
     return SimpleNamespace(store=store, **types)
 
 
-ROS2 = ros()
+ROS2 = ros_messages()
 KIND = {"sqlite3": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.MCAP}
 
 
@@ -108,7 +108,7 @@ def poses(kind: str) -> Messages:
 def write_bag(
     path: Path, topics: dict[str, Messages], storage: str = "sqlite3", store: Any = ROS2.store
 ) -> Path:
-    """Writes a bag whose messages are received 2 ms after their stamp."""
+    """Write a bag whose messages are received 2 ms after their stamp."""
     with rosbag2.Writer(path, version=9, storage_plugin=KIND[storage]) as bag:
         for name, messages in topics.items():
             connection = None
@@ -128,7 +128,7 @@ def described(folder: Path, **streams: dict[str, Any]) -> Path:
 
 @pytest.fixture(scope="module")
 def parquet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same record as a canonical table."""
+    """Write the same record as a canonical table."""
     q = quaternions(MOTION.R_WS)
     names = "t f_x f_y f_z tau_x tau_y tau_z s_x s_y s_z omega_x omega_y omega_z q_w q_x q_y q_z"
     values = np.column_stack([T, FORCES, MOTION.specific_force, MOTION.omega, q, MOTION.p_WS])
@@ -139,7 +139,7 @@ def parquet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("storage", "lone"), [("sqlite3", False), ("mcap", False), ("mcap", True)])
-def test_the_same_load_by_bag_and_by_parquet(
+def test_bag_and_parquet_give_the_same_load(
     tmp_path: Path, parquet: Path, storage: str, lone: bool
 ) -> None:
     topics = {"/ft/wrench": wrenches(), "/imu": imus(), "/pose": poses("PoseStamped")}
@@ -163,7 +163,7 @@ def test_the_same_load_by_bag_and_by_parquet(
 
 
 @pytest.mark.parametrize("kind", ["PoseStamped", "Odometry", "TransformStamped", "TFMessage"])
-def test_every_kind_of_pose(tmp_path: Path, kind: str) -> None:
+def test_every_pose_message_type_is_read(tmp_path: Path, kind: str) -> None:
     write_bag(tmp_path / "run1", {"/wrench": wrenches(), "/pose": poses(kind)}, "mcap")
     pose = {"file": "run1", "topic": "/pose"} | ({"child_frame": "tool0"} if kind[0] == "T" else {})
     wrench = {"file": "run1", "topic": "/wrench"}
@@ -173,7 +173,7 @@ def test_every_kind_of_pose(tmp_path: Path, kind: str) -> None:
     np.testing.assert_allclose(log.angular_velocity[inner], MOTION.omega[inner], atol=1e-3)
 
 
-def test_stamps_of_the_sender_or_of_the_recorder(tmp_path: Path) -> None:
+def test_stamps_of_sender_or_recorder_are_used(tmp_path: Path) -> None:
     def unstamped() -> Messages:
         return ((t, message.wrench) for t, message in wrenches())
 
@@ -203,7 +203,7 @@ def test_stamps_of_the_sender_or_of_the_recorder(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.specific_force, sent.specific_force, atol=1e-6)
 
 
-def test_a_type_of_ones_own_and_paths_of_fields(tmp_path: Path) -> None:
+def test_custom_message_type_is_read_by_field_paths(tmp_path: Path) -> None:
     text = """
     builtin_interfaces/Time taken
     geometry_msgs/Wrench load
@@ -234,8 +234,8 @@ def test_a_type_of_ones_own_and_paths_of_fields(tmp_path: Path) -> None:
     assert read_topic(tmp_path / "run1", "/gauge").columns["raw"].shape == (len(T), 6)
 
 
-def test_a_bag_of_ros_1(tmp_path: Path) -> None:
-    old = ros("ROS1_NOETIC")
+def test_bag_of_ros_1_is_read(tmp_path: Path) -> None:
+    old = ros_messages("ROS1_NOETIC")
     with rosbag1.Writer(tmp_path / "old.bag") as bag:
         kind = "geometry_msgs/msg/WrenchStamped"
         connection = bag.add_connection("/wrench", kind, typestore=old.store)
@@ -247,7 +247,7 @@ def test_a_bag_of_ros_1(tmp_path: Path) -> None:
     np.testing.assert_allclose(table.columns["stamp"], T, atol=1e-9)
 
 
-def test_what_a_description_says_stands_beside_what_the_topic_gives(tmp_path: Path) -> None:
+def test_description_fields_override_topic_defaults(tmp_path: Path) -> None:
     path = described(
         tmp_path,
         wrench={"file": "run1", "topic": "/ft", "force": {"unit": "lbf"}, "time": {"offset": 0.2}},
@@ -294,14 +294,14 @@ def test_inspecting_a_bag_lists_its_topics_and_drafts_a_description(
         assert word in shown
     draft = (tmp_path / "out" / "draft.yaml").read_text()
     assert "DRAFT" in draft and "would do: /odometry (pose)" in draft
-    # The draft is right as it stands: every stream is used, and nothing is suspicious.
+    # The draft is complete: every stream is used, without findings.
     found = inspect_command(tmp_path / "out" / "draft.yaml", tmp_path / "again", quiet=True)
     assert set(found["streams"]) == {"wrench", "imu", "pose"}
     assert found["findings"] == []
     assert found["fit"]["mass"] == pytest.approx(1.7, rel=0.01)
 
 
-def test_the_draft_of_a_bag_without_wrenches_has_none(tmp_path: Path) -> None:
+def test_draft_of_a_bag_without_wrench_topic_has_a_placeholder(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "run1", {"/odometry": islice(poses("Odometry"), 5)})
     (finding,) = inspect_command(bag, tmp_path / "out", quiet=True)["findings"]
     assert finding["message"].startswith("the draft has no wrench: add wrench")
@@ -317,10 +317,10 @@ def test_the_draft_of_a_bag_without_wrenches_has_none(tmp_path: Path) -> None:
         (
             "wrench",
             {"topic": None} | PLAIN,
-            ["run1", "does not say", "`drake-teleop inspect` drafts"],
+            ["run1", "no topic is specified", "`drake-teleop inspect` drafts"],
         ),
         ("wrench", {"file": "none.mcap"}, ["none.mcap", "no such file"]),
-        ("wrench", {"file": "log.yaml"}, ["is no bag", "metadata.yaml"]),
+        ("wrench", {"file": "log.yaml"}, ["is not a bag", "metadata.yaml"]),
         ("wrench", {"file": "broken.mcap"}, ["broken.mcap", "cannot be read"]),
         ("wrench", {"file": "broken.bag"}, ["broken.bag", "cannot be read"]),
         ("wrench", {"file": "broken"}, ["cannot be read"]),
@@ -335,7 +335,9 @@ def test_the_draft_of_a_bag_without_wrenches_has_none(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_bags(tmp_path: Path, stream: str, change: dict[str, Any], words: list[str]) -> None:
+def test_invalid_bag_raises_error(
+    tmp_path: Path, stream: str, change: dict[str, Any], words: list[str]
+) -> None:
     topics = {
         "/wrench": wrenches(),
         "/imu": imus(),
@@ -359,20 +361,18 @@ def test_bad_bags(tmp_path: Path, stream: str, change: dict[str, Any], words: li
         assert word in str(error.value)
 
 
-def test_without_the_library_the_message_names_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_error_names_the_missing_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_bag(tmp_path / "run1", {"/wrench": islice(wrenches(), 20)})
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(DrakeTeleopError, match=r"; install .*: pip install '\.\[ros\]' "):
         topics_of(tmp_path / "run1")
 
 
-@pytest.mark.parametrize("limit", ["_MOST_UNPACKED", "_MOST_MEMORY"])
-def test_a_bag_that_unpacks_to_too_much_is_one_line(
+@pytest.mark.parametrize("limit", ["_MAX_UNPACKED_BYTES", "_MAX_MEMORY_BYTES"])
+def test_bag_with_excessive_uncompressed_size_raises_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
-    """By what its chunks say, and by what they are."""
+    """The size is declared in chunks or found while unpacking."""
     mcap = pytest.importorskip("mcap.writer")
     path, size = tmp_path / "x.mcap", 60_000_000
     with path.open("wb") as file:
@@ -383,19 +383,21 @@ def test_a_bag_that_unpacks_to_too_much_is_one_line(
         writer.add_message(channel, 0, b"\0\1\0\0" + bytes(size), 0)
         writer.finish()
     assert path.stat().st_size < size / 100
-    monkeypatch.setattr(bags, "_MOST_RATIO", 1 if limit == "_MOST_UNPACKED" else 10**6)
+    monkeypatch.setattr(bags, "_MAX_UNPACK_RATIO", 1 if limit == "_MAX_UNPACKED_BYTES" else 10**6)
     monkeypatch.setattr(bags, limit, 40_000_000)
-    with pytest.raises(DrakeTeleopError, match="unpacks to more than can be read; cut it"):
+    with pytest.raises(DrakeTeleopError, match="its uncompressed size is too large; cut it"):
         read_topic(path, "/x")
     assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
 
 
-def test_many_messages_are_the_same_as_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_in_blocks_give_the_same_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bag = write_bag(tmp_path / "bag", {"/ft": wrenches(), "/tf": poses("TFMessage")})
     for topic, child in (("/ft", None), ("/tf", "tool0")):
         whole = read_topic(bag, topic, child).columns
         with monkeypatch.context() as patch:
-            patch.setattr(bags, "_BLOCK", 7)
+            patch.setattr(bags, "_BLOCK_MESSAGES", 7)
             parts = read_topic(bag, topic, child).columns
         assert parts.keys() == whole.keys() and len(whole["received"]) > 7
         for name, values in whole.items():

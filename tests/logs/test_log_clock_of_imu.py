@@ -1,4 +1,4 @@
-"""What a whole log can hide: streams that are folded, and the first guess of a lag."""
+"""Aliasing in resampling, and the first estimate of a lag."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from drake_teleop.logs.read.streams import Stream, on_clock
 
 
 @pytest.mark.parametrize("ratio", [1.5, 4.0])
-def test_what_a_slower_clock_cannot_show_is_not_folded_down(ratio):
-    """A tone above half the clock's rate, of a stream that is little or much faster than it."""
+def test_resampling_to_a_slower_clock_does_not_alias(ratio):
+    """A tone above half the clock's rate, in streams slightly and much faster than it."""
     t, rate = np.arange(0, 4, 0.01), 100.0 * ratio
     fast = np.arange(0, 4, 1 / rate)
     tone, slow = np.sin(2 * np.pi * 61.0 * fast), np.sin(2 * np.pi * 3.0 * fast)
     stream = Stream("wrench", fast)
     seen = on_clock(t, stream, np.stack([tone, slow], axis=1))[50:-50]
-    # Butterworth of second order at 0.4 of the rate, forth and back.
+    # Second-order Butterworth at 0.4 of the rate, forward and backward.
     assert np.abs(seen[:, 0]).max() < 1.02 / (1 + (61 / 40) ** 4)
     np.testing.assert_allclose(seen[:, 1], np.sin(2 * np.pi * 3.0 * t)[50:-50], atol=0.01)
 
 
 @pytest.mark.parametrize("lag", [-0.173, 0.0, 0.062])
-def test_the_first_guess_of_a_lag_is_the_lag(lag):
-    """Before any refinement, and with axes that are turned."""
+def test_best_shift_is_the_lag_for_rotated_axes(lag):
     rng = np.random.default_rng(2)
     clock = np.arange(0, 12, 0.005)
     kernel = np.exp(-0.5 * (np.arange(-40, 41) / 12) ** 2)

@@ -1,4 +1,4 @@
-"""Time stamps as recorders write them: what is left out, what is repaired, and what is refused."""
+"""Time stamps of recorders: removal, correction and errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def clock_of(stamps: object, values: object = None, **time: object) -> Clock:
     return read_clock(Time.model_validate({"column": "t"} | time), table, ["x"], "here")
 
 
-def test_good_stamps_are_left_alone() -> None:
+def test_valid_stamps_are_unchanged() -> None:
     t = 1.7e9 + np.arange(50) * 0.01
     clock = clock_of(t, offset=0.5)
     np.testing.assert_array_equal(clock.t, t + 0.5)
@@ -43,20 +43,20 @@ def test_good_stamps_are_left_alone() -> None:
     np.testing.assert_allclose(scaled - t[0] - 0.5, 1.001 * (t - t[0]), atol=1e-6)
 
 
-def test_five_hertz_are_enough() -> None:
+def test_rate_of_5_hz_is_accepted() -> None:
     assert len(clock_of(np.arange(9.0) * 0.19).t) == 9
 
 
-def test_rows_without_a_stamp_are_left_out() -> None:
+def test_rows_without_a_stamp_are_removed() -> None:
     clock = clock_of([0.0, 0.1, NAN, NAN, 0.4, 0.5])
     assert clock.rows.tolist() == [0, 1, 4, 5] and clock.total == 6
-    assert clock.notes == ("2 rows without a time stamp are left out",)
+    assert clock.notes == ("2 rows without a time stamp are removed",)
 
 
-def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
+def test_repeated_rows_are_removed() -> None:
     clock = clock_of([0.0, 0.1, 0.1, 0.1, 0.2, 0.3], [1, 2, 2, 2, NAN, 5])
     assert clock.rows.tolist() == [0, 1, 4, 5]
-    assert "2 rows that repeat the one before" in clock.notes[0]
+    assert "2 rows that repeat the previous row" in clock.notes[0]
     blank = clock_of([0.0, 0.1, 0.1, 0.2], [1, NAN, NAN, 2])
     assert blank.rows.tolist() == [0, 1, 3]
 
@@ -64,7 +64,7 @@ def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("stamps", "time", "words"),
     [
-        ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps go back, the first is row 5 of log.csv, by"),
+        ([0, 0.1, 0.2, 0.15, 0.3], {}, "1 time stamps decrease, the first in row 5 of log.csv, by"),
         ([0.1] * 9, {}, "the time stamps of log.csv never increase; name another column"),
         ([NAN] * 9, {}, "no finite number in 9 rows"),
         (np.arange(9.0), {}, "a rate of 1 Hz; probably `unit: ms`"),
@@ -75,10 +75,10 @@ def test_rows_that_are_repeated_with_their_stamp_are_left_out() -> None:
         (np.arange(9.0) * 0.21, {"unit": "s"}, "a rate of 4.76 Hz; probably `unit: ms`"),
         (np.arange(9.0) * 20, {"unit": "s"}, "a rate of 0.05 Hz; probably `unit: ms`"),
         ([0, 0.01, 0.02, 0.03, 99, 99.01], {}, "longest 99 s to row 6 of log.csv; cut the log"),
-        ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "stand still around row 2"),
+        ([*np.arange(200) * 0.01, *[2.0] * 400, 2.01], {}, "do not increase around row 2"),
     ],
 )
-def test_stamps_that_nothing_can_be_made_of(stamps: object, time: dict, words: str) -> None:
+def test_unusable_stamps_raise_error(stamps: object, time: dict, words: str) -> None:
     with pytest.raises(DrakeTeleopError) as error:
         clock_of(stamps, **time)
     assert words in str(error.value)
@@ -92,10 +92,10 @@ def test_stamps_that_nothing_can_be_made_of(stamps: object, time: dict, words: s
     start=st.sampled_from([0.0, 1.7e9]),
     missing=st.sets(st.sampled_from([0.25, 0.5, 0.75])),
 )
-def test_bursts_are_spread_to_what_they_were(
+def test_spread_restores_times_of_bursts(
     rate: float, burst: int, start: float, missing: set[float]
 ) -> None:
-    """Rows come in bursts, each with the time of its last row; whole bursts may be missing."""
+    """Each burst has the time of its last row; some bursts are missing."""
     true = np.arange(300 * burst) / rate
     kept = np.ones(len(true), bool)
     for share in missing:
@@ -104,12 +104,12 @@ def test_bursts_are_spread_to_what_they_were(
     stamps = start + true[burst - 1 :: burst].repeat(burst)[kept]
     found = spread(stamps) - start
     assert (np.diff(found) > 0).all()
-    # Late by half a burst, the same everywhere; the rest is one burst among the 50 of a window.
+    # Constant delay of half a burst; the remainder is one burst among 50 of a window.
     late = (burst - 1) / 2 / rate
     np.testing.assert_allclose(found - late, true[kept], atol=1e-6 + burst / 50 / rate)
 
 
-def test_a_burst_between_gaps_is_spread_about_its_stamp() -> None:
+def test_burst_between_gaps_is_spread_about_its_stamp() -> None:
     stamps = np.concatenate([np.arange(20) * 0.1, [5.0], 8.0 + np.arange(20) * 0.1]).repeat(4)
     found = spread(stamps)
     np.testing.assert_allclose(found[80:84], 5.0 + 0.025 * np.array([-1.5, -0.5, 0.5, 1.5]))
@@ -123,10 +123,10 @@ def test_a_burst_between_gaps_is_spread_about_its_stamp() -> None:
     jitter=st.floats(0, 0.3),
     seed=st.integers(0, 2**31),
 )
-def test_coarse_stamps_are_spread_to_what_they_were(
+def test_spread_restores_coarse_stamps(
     rate: float, resolution: float, jitter: float, seed: int
 ) -> None:
-    """Rounded down to a multiple of several periods, on top of jitter."""
+    """Stamps with jitter are rounded down to a multiple of several periods."""
     rng = np.random.default_rng(seed)
     true = np.arange(2000) / rate
     step = resolution / rate
@@ -134,7 +134,7 @@ def test_coarse_stamps_are_spread_to_what_they_were(
     stamps = np.floor(uneven / step) * step
     found = spread(stamps)
     assert (np.diff(found) > 0).all()
-    # Rounding down makes all of them early, which is a delay like any other; the rest is halved.
+    # Rounding down causes a constant delay; the remaining error is halved.
     error, raw = found - true, stamps - true
     assert np.ptp(error) < 0.5 * np.ptp(raw)
     assert error.std() < 0.5 * raw.std()
@@ -182,7 +182,7 @@ def frame(t: np.ndarray, names: tuple[str, ...], values: np.ndarray) -> pl.DataF
     wrench_gap=st.booleans(),
     seed=st.integers(0, 2**31),
 )
-def test_the_load_is_found_whatever_the_clocks(
+def test_load_is_identified_despite_clock_errors(
     tmp_path_factory: pytest.TempPathFactory,
     offset: float,
     jitter: float,
@@ -192,7 +192,7 @@ def test_the_load_is_found_whatever_the_clocks(
     wrench_gap: bool,
     seed: int,
 ) -> None:
-    """Two clocks with another zero and rate, jitter, repeated rows, lost stamps, and a gap."""
+    """Two clocks with different zero and rate, jitter, repeated rows, missing stamps and a gap."""
     rng = np.random.default_rng(seed)
     tables = []
     for rate, zero, unit, columns, holed in (
@@ -221,8 +221,8 @@ def test_the_load_is_found_whatever_the_clocks(
     assert any("1 gaps" in note for note in found.log.notes)
 
 
-def test_what_is_invented_in_a_gap_is_not_used(tmp_path: Path) -> None:
-    """One second of the wrench is missing; a straight line there would be 20 N off."""
+def test_interpolated_samples_in_a_gap_are_not_used(tmp_path: Path) -> None:
+    """One second of the wrench is missing; interpolation would cause an error of 20 N."""
     t = np.arange(0.0, 8.0, 0.002)
     x = record(t)
     kept = (t < 3.0) | (t > 4.0)
@@ -244,7 +244,7 @@ def test_what_is_invented_in_a_gap_is_not_used(tmp_path: Path) -> None:
     assert np.abs(free.contact).max() < 0.05
 
 
-def test_dates_have_no_unit() -> None:
+def test_unit_of_dates_raises_error() -> None:
     stamps = np.array(["2026-03-01T12:00:00.000", "2026-03-01T12:00:00.002"], "datetime64[ms]")
     table = Table(Path("x.csv"), {"t": stamps, "f": np.zeros(2)})
     with pytest.raises(DrakeTeleopError, match=r"here\.unit.*no unit; leave it out"):

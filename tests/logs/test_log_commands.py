@@ -271,7 +271,7 @@ def test_bad_load_files(tmp_path: Path, text: str | None, words: str) -> None:
 def test_a_foreign_table_is_told_what_to_do(tmp_path: Path) -> None:
     pl.DataFrame({"time": [0.0, 0.1], "fx": [1.0, 2.0]}).write_csv(tmp_path / "log.csv")
     with pytest.raises(
-        DrakeTeleopError, match=r"log\.csv: is no canonical log.*`drake-teleop insp"
+        DrakeTeleopError, match=r"log\.csv: is not a canonical log.*`drake-teleop insp"
     ):
         identify_log(tmp_path / "log.csv")
 

@@ -62,7 +62,7 @@ BASE = yaml.safe_load(THREE_INSTRUMENTS)
         (("pose", "orientation", "form"), "euler", ["pose.orientation.form", "'matrix'"]),
         (("gravity",), "down", ["gravity"]),
         (("wrench",), None, ["no wrench"]),
-        (("pose",), None, ["nothing gives the angular velocity", "imu.angular_velocity"]),
+        (("pose",), None, ["the angular velocity is missing", "imu.angular_velocity"]),
         (("wrench", "file"), None, ["wrench.file"]),
     ],
 )
@@ -74,7 +74,7 @@ def test_errors_name_file_and_field(
     for key in where[:-1]:
         place = place[key]
     place[where[-1]] = value
-    _expect(tmp_path, yaml.safe_dump(data), words)
+    _expect_error(tmp_path, yaml.safe_dump(data), words)
 
 
 @pytest.mark.parametrize(
@@ -85,14 +85,14 @@ def test_errors_name_file_and_field(
         ("", ["holds no fields"]),
         ("static: {}", ["static.file: is missing", "add file"]),
         (yaml.safe_dump({"wrench": BASE["wrench"]}), ["without kinematics", "add imu or pose"]),
-        (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["stand alone"]),
+        (AT_REST + THREE_INSTRUMENTS.replace("gravity: 9.82 ", "#"), ["cannot be combined"]),
     ],
 )
-def test_files_that_are_no_descriptions(tmp_path: Path, text: str, words: list[str]) -> None:
-    _expect(tmp_path, text, words)
+def test_invalid_description_file_raises_error(tmp_path: Path, text: str, words: list[str]) -> None:
+    _expect_error(tmp_path, text, words)
 
 
-def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
+def test_auto_without_the_required_streams_raises_error(tmp_path: Path) -> None:
     data = yaml.safe_load(THREE_INSTRUMENTS)
     omega = {"columns": ["wx", "wy", "wz"]}
     data["imu"] |= {"frame": "auto", "position": "auto", "angular_velocity": omega}
@@ -101,18 +101,18 @@ def test_what_is_left_to_the_data_needs_data(tmp_path: Path) -> None:
     imu = load_description(path).imu
     assert imu and imu.automatic and (imu.frame, imu.position) == ("auto", "auto")
     del data["pose"]
-    _expect(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu.frame: auto", "add pose"])
     data["imu"]["frame"] = "sensor"
     del data["imu"]["specific_force"]
-    _expect(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
+    _expect_error(tmp_path, yaml.safe_dump(data), ["imu", "found from specific_force"])
 
 
-def test_missing_description(tmp_path: Path) -> None:
+def test_missing_description_raises_error(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match="no such file"):
         load_description(tmp_path / "log.yaml")
 
 
-def _expect(folder: Path, text: str, words: list[str]) -> None:
+def _expect_error(folder: Path, text: str, words: list[str]) -> None:
     path = folder / "log.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(DrakeTeleopError) as error:

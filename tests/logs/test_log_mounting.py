@@ -1,4 +1,4 @@
-"""Rotation and lever arm of an IMU, found without being told, against mountings that are known."""
+"""Rotation and lever arm of an IMU: estimates against known mountings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
-from drake_teleop.logs.read import auto_mounting
+from drake_teleop.logs.read import auto_frames
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
@@ -35,8 +35,8 @@ RIGHT_ANGLED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
 LAG = 0.006
 
 
-def turning_about_y(t: np.ndarray, *, arm: float = 0.0) -> Motion:
-    """Swinging about the y axis of S, with So on an arc of this radius."""
+def rotation_about_y(t: np.ndarray, *, arm: float = 0.0) -> Motion:
+    """Return a swing about the y axis of S, with So on an arc of this radius."""
     angle, rate = 1.4 * np.sin(1.1 * t), 1.4 * 1.1 * np.cos(1.1 * t)
     acceleration = -1.1 * 1.1 * angle
     R_WS = Rotation.from_rotvec(np.outer(angle, [0.0, 1, 0])).as_matrix()
@@ -49,7 +49,7 @@ def turning_about_y(t: np.ndarray, *, arm: float = 0.0) -> Motion:
 
 @dataclass(frozen=True)
 class Recorder:
-    """An IMU somewhere on the sensor, the wrench of a load, and a pose; each on its own clock."""
+    """IMU on the sensor, wrench of a load, and pose, each with its own clock."""
 
     R_SI: np.ndarray
     p_SoIo_S: np.ndarray
@@ -89,7 +89,7 @@ class Recorder:
 def described(
     *, gyroscope: bool = True, pose: bool = True, positioned: bool = True, **imu: Any
 ) -> Description:
-    """The description of a `Recorder`'s tables."""
+    """Return the description of the tables of a `Recorder`."""
 
     def stream(file: str, **fields: str) -> dict[str, Any]:
         columns = {name: {"columns": [column]} for name, column in fields.items()}
@@ -117,29 +117,29 @@ def mounting(
     return found
 
 
-def a_rotation(seed: int) -> np.ndarray:
+def random_rotation(seed: int) -> np.ndarray:
     return Rotation.random(random_state=np.random.default_rng(seed)).as_matrix()
 
 
-def turn(R: np.ndarray) -> np.ndarray:
-    """Rotation vector [deg]."""
+def rotation_vector_deg(R: np.ndarray) -> np.ndarray:
+    """Return the rotation vector [deg]."""
     return np.degrees(Rotation.from_matrix(R).as_rotvec())
 
 
-rotations = st.integers(0, 10**6).map(a_rotation)
+rotations = st.integers(0, 10**6).map(random_rotation)
 places = st.tuples(*[st.floats(-0.1, 0.1)] * 3).map(np.array)
 
 
 @pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(rotations, places, st.integers(0, 10**6), st.booleans())
-def test_any_mounting_is_found_within_what_is_stated(
+def test_mounting_is_estimated_within_its_deviations(
     R_SI: np.ndarray, p_SoIo_S: np.ndarray, seed: int, gyroscope: bool
 ) -> None:
     found = mounting(Recorder(R_SI, p_SoIo_S, seed), gyroscope=gyroscope)
     assert found.determined and found.lever is not None and found.lever.determined.all()
-    # 0.1 % of the lever arm, and as much of a rotation, is what interpolating the pose costs.
-    error = np.abs(turn(found.R_SI @ R_SI.T))
+    # Interpolation of the pose causes errors of 0.1 % of lever arm and rotation.
+    error = np.abs(rotation_vector_deg(found.R_SI @ R_SI.T))
     assert (error < 5 * found.deviations_deg + 0.02).all()
     assert (np.abs(found.lever.p_SoIo_S - p_SoIo_S) < 5 * found.lever.deviations + 3e-4).all()
     assert found.deviations_deg.max() < 0.1
@@ -148,32 +148,34 @@ def test_any_mounting_is_found_within_what_is_stated(
 
 
 @pytest.mark.parametrize(("lag", "is_found"), [(0.9, True), (1.2, False)])
-def test_the_clock_is_looked_for_within_a_second(lag: float, is_found: bool) -> None:
-    found = mounting(Recorder(a_rotation(3), np.array([0.05, -0.03, 0.08]), seconds=8.0, lag=lag))
+def test_lag_is_searched_within_one_second(lag: float, is_found: bool) -> None:
+    found = mounting(
+        Recorder(random_rotation(3), np.array([0.05, -0.03, 0.08]), seconds=8.0, lag=lag)
+    )
     assert found.fits == is_found
     assert (found.lag_s == pytest.approx(lag, abs=1e-3)) == is_found
 
 
 @pytest.mark.slow
-def test_deviations_are_those_of_repeated_records() -> None:
-    truth = [(a_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
+def test_deviations_equal_the_scatter_of_repeated_records() -> None:
+    truth = [(random_rotation(seed), np.array([0.05, -0.03, 0.08])) for seed in range(16)]
     ratios = []
     for seed, (R_SI, p) in enumerate(truth):
         found = mounting(Recorder(R_SI, p, seed, noise=8.0), gyroscope=False)
         assert found.lever is not None
-        ratios.append(turn(found.R_SI @ R_SI.T) / found.deviations_deg)
+        ratios.append(rotation_vector_deg(found.R_SI @ R_SI.T) / found.deviations_deg)
         ratios.append((found.lever.p_SoIo_S - p) / found.lever.deviations)
     ratios = np.array(ratios)
-    # 96 ratios, of which 95 % are to be within +-1.96: 86 or more in 99 of 100 such tests.
+    # 95 % of 96 ratios should be within +-1.96: at least 86 in 99 of 100 such tests.
     assert (np.abs(ratios) < 1.96).sum() >= 86
     assert 0.7 < np.sqrt((ratios**2).mean()) < 1.3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
-def test_the_wrench_tells_the_lever_arm_without_a_pose(seed: int) -> None:
+def test_wrench_determines_the_lever_arm_without_a_pose(seed: int) -> None:
     p = np.random.default_rng(seed).uniform(-0.1, 0.1, 3)
-    recorder = Recorder(a_rotation(seed), p, seed, noise=3.0)
+    recorder = Recorder(random_rotation(seed), p, seed, noise=3.0)
     description = described(pose=False, frame=recorder.R_SI.tolist())
     tables = recorder.tables()
     found = lever_arm_from_wrench(read_description(description, "log.yaml", tables=tables))
@@ -190,40 +192,40 @@ def test_the_wrench_tells_the_lever_arm_without_a_pose(seed: int) -> None:
 @pytest.mark.parametrize(
     ("of_wrench", "taken"), [(0, "pose"), (1, "pose"), (2, "pose"), (3, "wrench")]
 )
-def test_the_wrench_is_believed_where_it_tells_more_than_the_pose(
+def test_wrench_is_used_if_it_determines_more_coordinates_than_the_pose(
     monkeypatch: pytest.MonkeyPatch, of_wrench: int, taken: str
 ) -> None:
-    """The pose tells two coordinates of three here."""
+    """The pose determines two of three coordinates here."""
     of_pose, other = (
         LeverArm(np.zeros(3), np.where(np.arange(3) < known, 1e-3, np.inf), source)
         for known, source in ((2, "pose"), (of_wrench, "wrench"))
     )
-    monkeypatch.setattr(auto_mounting, "lever_arm_from_wrench", lambda _: other)
+    monkeypatch.setattr(auto_frames, "lever_arm_from_wrench", lambda _: other)
     of_the_pose: Any = SimpleNamespace(fits=True, lever=of_pose)
     if taken == "wrench":
-        assert auto_mounting._lever(of_the_pose, None, "here") is other
+        assert auto_frames._choose_lever_arm(of_the_pose, None, "here") is other
         return
     with pytest.raises(DrakeTeleopError, match=r"determine z of .* from the pose\)"):
-        auto_mounting._lever(of_the_pose, None, "here")
+        auto_frames._choose_lever_arm(of_the_pose, None, "here")
 
 
-def test_a_load_that_touches_something_tells_nothing() -> None:
+def test_contact_prevents_a_lever_arm_from_the_wrench() -> None:
     tables = Recorder(np.eye(3), np.array([0.05, 0, 0])).tables()
     touched = tables[Path("w")].columns["f"].copy()
     touched[1000:1600] += 40.0
     tables[Path("w")] = replace(
         tables[Path("w")], columns=tables[Path("w")].columns | {"f": touched}
     )
-    with pytest.raises(DrakeTeleopError, match="nothing tells the place of the accelerometer"):
+    with pytest.raises(DrakeTeleopError, match="determine the position of the accelerometer"):
         read_description(described(pose=False, position="auto"), "log.yaml", tables=tables)
 
 
 @pytest.mark.parametrize(("force", "torque"), [(0.043, 0.043), (0.0, 0.057)])
-def test_a_load_may_leave_a_twentieth_of_the_wrench(force: float, torque: float) -> None:
+def test_load_may_leave_5_percent_of_the_wrench_unexplained(force: float, torque: float) -> None:
     recorder = Recorder(np.eye(3), np.array([0.05, 0, 0]))
     log = read_description(described(pose=False), "log.yaml", tables=recorder.tables())
     touch = np.zeros((len(log), 2, 3))
-    # Of the variance of a step down and up, 1/6 of the record long, the motion explains a little.
+    # The motion explains a small part of a step of 1/6 of the record.
     touch[len(log) // 3 : len(log) // 2, :, 0] = 1.0
     whole = log.wrench.reshape(-1, 2, 3).var(axis=0).sum(axis=1)
     touch *= np.sqrt(np.array([force, torque]) * whole / (5 / 36))[:, None]
@@ -233,8 +235,8 @@ def test_a_load_may_leave_a_twentieth_of_the_wrench(force: float, torque: float)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["pose", "wrench"])
-def test_rotation_about_one_axis_tells_two_coordinates(source: str) -> None:
-    recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=turning_about_y)
+def test_rotation_about_one_axis_determines_two_coordinates(source: str) -> None:
+    recorder = Recorder(np.eye(3), np.array([0.03, 0.04, -0.05]), motion=rotation_about_y)
     streams = {"pose": True} if source == "pose" else {"pose": False}
     at_Io = read_description(described(**streams), "log.yaml", tables=recorder.tables())
     lever = mounting(recorder).lever if source == "pose" else lever_arm_from_wrench(at_Io)
@@ -249,22 +251,22 @@ def test_rotation_about_one_axis_tells_two_coordinates(source: str) -> None:
         )
 
 
-def test_an_orientation_alone_does_not_tell_the_lever_arm() -> None:
-    # So swings on an arc of 0.3 m, and the accelerometer is 0.3 m + p from the centre.
+def test_orientation_alone_does_not_determine_the_lever_arm() -> None:
+    # So moves on an arc of 0.3 m; the accelerometer is 0.3 m + p from the centre.
     recorder = Recorder(
-        a_rotation(2),
+        random_rotation(2),
         np.array([0.02, 0.0, 0.05]),
-        motion=lambda t: turning_about_y(t, arm=0.3),
+        motion=lambda t: rotation_about_y(t, arm=0.3),
     )
     found = mounting(recorder, gyroscope=False, positioned=False)
     assert found.lever is None
-    # The arc is allowed for: it does not turn the IMU.
+    # The arc does not affect the estimated rotation.
     assert found.determined
-    assert np.linalg.norm(turn(found.R_SI @ recorder.R_SI.T)) < 0.3
+    assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.3
 
 
-def written(folder: Path, recorder: Recorder, **imu: Any) -> Path:
-    """The tables as NPZ files and their description."""
+def write_tables(folder: Path, recorder: Recorder, **imu: Any) -> Path:
+    """Write the tables as NPZ files with their description."""
     for name, table in recorder.tables().items():
         np.savez(folder / f"{name}.npz", **table.columns)
     data = described(**imu).model_dump(mode="json", exclude_none=True)
@@ -277,10 +279,10 @@ def written(folder: Path, recorder: Recorder, **imu: Any) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("oblique", [False, True])
-def test_what_was_found_can_be_written_down(tmp_path: Path, oblique: bool) -> None:
+def test_estimates_from_notes_reproduce_the_log(tmp_path: Path, oblique: bool) -> None:
     R_SI = Rotation.from_rotvec([0.1, -0.4, 0.2]).as_matrix() @ RIGHT_ANGLED
     recorder = Recorder(R_SI if oblique else RIGHT_ANGLED, np.array([0.04, -0.06, 0.02]))
-    path = written(tmp_path, recorder, frame="auto", position="auto")
+    path = write_tables(tmp_path, recorder, frame="auto", position="auto")
     auto = read_log(path)
     notes = "\n".join(auto.notes)
     assert ("warning: the IMU is mounted obliquely, 26." in notes) == oblique
@@ -293,17 +295,17 @@ def test_what_was_found_can_be_written_down(tmp_path: Path, oblique: bool) -> No
     path.write_text(yaml.safe_dump(data))
     given_now = read_log(path)
     assert given_now.notes == ()
-    # Four digits of the rotation and 0.1 mm make this difference.
+    # Rounding to four digits and 0.1 mm causes this difference.
     np.testing.assert_allclose(auto.specific_force, given_now.specific_force, atol=0.01)
     assert inspect_command(path, tmp_path / "out", quiet=True)["mounting"]["angle_deg"] < 0.1
 
 
 @pytest.mark.slow
-def test_a_position_that_is_given_is_that_of_the_found_frame(tmp_path: Path) -> None:
+def test_given_position_is_in_the_estimated_frame(tmp_path: Path) -> None:
     p = np.array([0.04, -0.06, 0.02])
-    recorder = Recorder(a_rotation(5), p, noise=0.1)
-    log = read_log(written(tmp_path, recorder, frame="auto", position="auto"))
-    half = read_log(written(tmp_path, recorder, frame="auto"))
+    recorder = Recorder(random_rotation(5), p, noise=0.1)
+    log = read_log(write_tables(tmp_path, recorder, frame="auto", position="auto"))
+    half = read_log(write_tables(tmp_path, recorder, frame="auto"))
     data = yaml.safe_load((tmp_path / "log.yaml").read_text())
     data["imu"]["position"] = p.tolist()
     (tmp_path / "log.yaml").write_text(yaml.safe_dump(data))
@@ -319,12 +321,10 @@ def test_a_position_that_is_given_is_that_of_the_found_frame(tmp_path: Path) -> 
         ({"rest": True}, ["the specific force hardly changes", "turn the sensor"]),
         ({"mirror": True}, ["mirrored", "exchange two of its columns"]),
         ({"sign": -1}, ["mirrored", "imu.sign"]),
-        ({"degrees": True}, ["no rotation brings", "angular velocity", "drake-teleop inspect"]),
+        ({"degrees": True}, ["no rotation makes", "angular velocity", "drake-teleop inspect"]),
     ],
 )
-def test_a_rotation_that_the_data_do_not_determine_is_an_error(
-    changes: dict[str, Any], words: list[str]
-) -> None:
+def test_undetermined_rotation_raises_error(changes: dict[str, Any], words: list[str]) -> None:
     motion = (lambda t: motion_at(0 * t)) if changes.get("rest") else motion_at
     tables = Recorder(RIGHT_ANGLED, np.zeros(3), motion=motion).tables()
     columns = tables[Path("i")].columns
@@ -344,15 +344,15 @@ def test_a_rotation_that_the_data_do_not_determine_is_an_error(
         assert word in message
 
 
-def test_a_late_clock_does_not_hide_that_axes_are_mirrored() -> None:
-    recorder = Recorder(a_rotation(3), np.zeros(3), seconds=3.0, lag=0.4)
+def test_mirrored_axes_are_found_despite_a_lag() -> None:
+    recorder = Recorder(random_rotation(3), np.zeros(3), seconds=3.0, lag=0.4)
     tables = recorder.tables()
     columns = tables[Path("i")].columns
     columns |= {"s": columns["s"][:, [1, 0, 2]], "omega": columns["omega"][:, [1, 0, 2]]}
     assert mounting(recorder, tables).mirrored
 
 
-def test_the_clock_of_the_imu_is_mentioned_and_left_alone() -> None:
+def test_lag_of_the_imu_is_reported_but_not_corrected() -> None:
     tables = Recorder(RIGHT_ANGLED, np.zeros(3)).tables()
     late = tables[Path("i")].columns["t"] + 0.2
     tables[Path("i")] = replace(tables[Path("i")], columns=tables[Path("i")].columns | {"t": late})
@@ -362,9 +362,9 @@ def test_the_clock_of_the_imu_is_mentioned_and_left_alone() -> None:
     assert np.abs(log.specific_force - s)[20:-20].mean() < 0.4
 
 
-def test_gaps_are_not_taken_for_motion() -> None:
+def test_gaps_are_excluded_from_the_mounting() -> None:
     p = np.array([0.05, -0.04, 0.06])
-    recorder = Recorder(a_rotation(3), p)
+    recorder = Recorder(random_rotation(3), p)
     tables = recorder.tables()
     for name in ("p", "i"):
         columns = tables[Path(name)].columns
@@ -374,7 +374,7 @@ def test_gaps_are_not_taken_for_motion() -> None:
         )
     found = mounting(recorder, tables)
     assert found.lever is not None and found.determined and found.unexplained < 1e-3
-    assert np.linalg.norm(turn(found.R_SI @ recorder.R_SI.T)) < 0.1
+    assert np.linalg.norm(rotation_vector_deg(found.R_SI @ recorder.R_SI.T)) < 0.1
     assert np.abs(found.lever.p_SoIo_S - p).max() < 1e-3
 
 
@@ -386,7 +386,7 @@ def test_gaps_are_not_taken_for_motion() -> None:
     ("record", "residual", "delay_s"),
     [("1-baseline", 0.296, 0.00612), ("2-vibrations", 0.316, 0.00588)],
 )
-def test_ntnu_mounting_and_delay_without_being_told(
+def test_ntnu_mounting_and_delay_are_estimated(
     ntnu: Path, tmp_path: Path, record: str, residual: float, delay_s: float
 ) -> None:
     path = describe_record(tmp_path, ntnu, record)
@@ -398,24 +398,24 @@ def test_ntnu_mounting_and_delay_without_being_told(
     own = identify_log(path)
     note = next(note for note in own.log.notes if note.startswith("imu.frame found"))
     R_SI = np.array(yaml.safe_load(note.split("imu.frame: ")[1]))
-    assert np.linalg.norm(turn(R_SI @ np.array(known.imu.frame).T)) < 1.5
+    assert np.linalg.norm(rotation_vector_deg(R_SI @ np.array(known.imu.frame).T)) < 1.5
     assert not any("warning" in note for note in own.log.notes)
     assert own.identification.delay_s == pytest.approx(delay_s, abs=3e-4)
     assert own.identification.mass == pytest.approx(0.9323, rel=0.01)
     assert own.identification.com[2] == pytest.approx(0.0439, abs=3e-4)
-    # The load of the poses, which know nothing of the IMU, leaves less than with the axes exact.
+    # The load fitted with poses alone leaves a smaller residual than with exact axes.
     poses = identify_log(describe_poses(tmp_path, ntnu, GRAVITY)).identification
     contact = eliminate_log(path, poses).contact[:, :3]
     assert np.sqrt(np.mean(np.sum(contact**2, axis=1))) < residual
     data["imu"]["position"] = "auto"
     path.write_text(yaml.safe_dump(data))
-    # 0.8 rad/s about one axis do not show a few centimetres.
+    # 0.8 rad/s about one axis cannot determine a few centimetres.
     with pytest.raises(DrakeTeleopError, match="determine x, y, z of"):
         read_log(path)
 
 
 def test_ur5_imu_has_the_axes_of_the_tool(ur5: Path) -> None:
-    """So says the map of the gyroscope; its clock lags and drifts, which is said, not corrected."""
+    """The map of the gyroscope is the identity; lag and drift are reported, not corrected."""
     record = "No9_Singularity_Free_ForceSensor__"
 
     def stream(name: str, unit: str, **columns: Any) -> dict[str, Any]:
@@ -436,5 +436,5 @@ def test_ur5_imu_has_the_axes_of_the_tool(ur5: Path) -> None:
     notes = read_description(description, "log.yaml").notes
     found = next(note for note in notes if note.startswith("imu.frame found"))
     R_SI = np.array(yaml.safe_load(found.split("imu.frame: ")[1]))
-    assert np.linalg.norm(turn(R_SI)) < 1.0
+    assert np.linalg.norm(rotation_vector_deg(R_SI)) < 1.0
     assert any("the clock of the IMU lags that of the pose by 0.1" in note for note in notes)

@@ -1,4 +1,4 @@
-"""Logs whose motion is known by noisy poses, of S or of another frame, from file to load."""
+"""Logs whose motion is known only by noisy poses, from file to load."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Records of 10 s: of S, of a frame that is shifted and turned, with gains that are wrong."""
+    """Records of 10 s: poses of S, of a shifted and rotated frame, and with gain errors."""
     folder = tmp_path_factory.mktemp("posed")
     for name, kind in (
         ("own", Kind(seed=1)),
@@ -80,7 +80,7 @@ def whole(folder) -> IdentifiedLog:
     return identify_log(described(folder, "own"), cutoff_hz=10.0)
 
 
-def test_identify_takes_the_noise_of_poses_into_account(whole):
+def test_identify_compensates_for_noise_of_poses(whole):
     found = whole
     load = found.identification
     assert np.abs(deviations(found)).max() < 3.5
@@ -93,8 +93,8 @@ def test_identify_takes_the_noise_of_poses_into_account(whole):
 
 
 @pytest.mark.parametrize("bursts", [True, False])
-def test_stamps_need_not_be_exact(whole, folder, tmp_path, bursts):
-    """Five at once and to 1 ms, or off by 1.6 ms and 0.04 % faster than those of the wrench."""
+def test_load_is_identified_despite_inexact_stamps(whole, folder, tmp_path, bursts):
+    """Five rows per stamp of 1 ms resolution, or 1.6 ms jitter and a clock 0.04 % faster."""
     table = pl.read_csv(folder / "own_pose.csv")
     t = table["t"].to_numpy()
     jitter = np.random.default_rng(1).uniform(-1.6e-3, 1.6e-3, len(t))
@@ -111,14 +111,14 @@ def test_stamps_need_not_be_exact(whole, folder, tmp_path, bursts):
 
 
 @pytest.mark.parametrize("method", ["consistent", "ordinary"])
-def test_gains_that_are_stated_widen_the_deviations(folder, method):
+def test_stated_gain_errors_increase_the_deviations(folder, method):
     path = described(folder, "own", wrench={"gain_std": 0.01})
     load = identify_log(path, method=method).identification
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
 
 
 @pytest.mark.slow
-def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder):
+def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
     found = identify_log(described(folder, "gains"))
     assert not found.identification.identifiable[6:].any()
     assert any("state wrench.gain_std" in note for note in found.log.notes)
@@ -128,10 +128,10 @@ def test_what_no_rigid_load_explains_identifies_none_unless_it_is_stated(folder)
 
 
 LIMITS = {
-    "read.tables._LARGE": 100,
-    "read.reading._CHUNK": 300,
-    "read.alignment._CHUNK": 170,
-    "pose_motion.splines._CHUNK": 260,
+    "read.tables._MAX_CELLS_IN_MEMORY": 100,
+    "read.reading._CHUNK_ROWS": 300,
+    "read.alignment._CHUNK_ROWS": 170,
+    "pose_motion.splines._CHUNK_ROWS": 260,
     "posed_fit._SHOWN": 300,
     "posed_fit._CHUNK": 70,
     "posed_fit._BESIDE": 30,
@@ -139,7 +139,7 @@ LIMITS = {
 """What an hour at 1 kHz is too long for, so low that 10 s are."""
 
 
-def test_a_long_log_in_parts_says_what_it_says_as_a_whole(whole, folder, tmp_path, monkeypatch):
+def test_long_log_read_in_parts_gives_the_same_load(whole, folder, tmp_path, monkeypatch):
     files = {}
     for stream in ("wrench", "pose"):
         files[stream] = f"own_{stream}.parquet"
@@ -167,7 +167,7 @@ def test_a_long_log_in_parts_says_what_it_says_as_a_whole(whole, folder, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):
+def test_wrong_pose_frame_is_reported_with_the_lines_that_fix_it(folder):
     path = described(folder, "tcp")
     found = identify_log(path)
     (finding,) = found.findings
@@ -185,8 +185,8 @@ def test_a_pose_of_another_frame_is_named_with_the_lines_that_mend_it(folder):
 
 
 @pytest.mark.slow
-def test_what_is_named_counts_from_what_was_described(folder, tmp_path):
-    """Half of the shift and the whole turn are described: the line has the whole shift."""
+def test_reported_frame_is_relative_to_S_not_to_the_description(folder, tmp_path):
+    """The description has half of the shift; the report has the full shift."""
     path = described(folder, "tcp", position_in_sensor=(0.5 * SHIFT).tolist(), frame=TURN.tolist())
     (finding,) = identify_log(path).findings
     assert "rotation_in_sensor" not in finding.message
@@ -196,7 +196,7 @@ def test_what_is_named_counts_from_what_was_described(folder, tmp_path):
     np.testing.assert_allclose(place, SHIFT, atol=1e-3)
 
 
-def test_auto_finds_the_frame_and_says_so(folder):
+def test_auto_estimates_the_frame_with_a_note(folder):
     path = described(folder, "tcp", position_in_sensor="auto", rotation_in_sensor="auto")
     log = read_log(path)
     assert log.posed is not None
@@ -208,7 +208,7 @@ def test_auto_finds_the_frame_and_says_so(folder):
     ]
 
 
-def test_auto_that_the_data_do_not_tell_is_an_error(folder, tmp_path):
+def test_undetermined_auto_raises_error(folder, tmp_path):
     t, wrench, poses = record(Kind(seed=3))
     rest = np.hstack([np.repeat(poses.quaternion[:1], len(poses.t), 0), 0.0 * poses.position])
     still = pl.DataFrame({"t": poses.t} | dict(zip(POSE, rest.T, strict=True)))
@@ -230,14 +230,14 @@ def test_auto_that_the_data_do_not_tell_is_an_error(folder, tmp_path):
         ({}, {"gain_std": -0.1}, "greater than or equal to 0"),
     ],
 )
-def test_descriptions_that_contradict_themselves_are_refused(folder, pose, wrench, message):
+def test_contradictory_description_raises_error(folder, pose, wrench, message):
     with pytest.raises(DrakeTeleopError, match=message):
         load_description(described(folder, "own", wrench, **pose))
 
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3, 8.8507])
-def test_a_wrong_unit_of_the_torque_is_no_shift(unit):
-    """The motion shows r + R c and the torque says c: a lever along c explains a wrong unit too."""
+def test_wrong_torque_unit_is_not_reported_as_a_shift(unit):
+    """The motion determines r + R c and the torque c, so a lever along c resembles a wrong unit."""
     t, wrench, poses = record(Kind(seed=4))
     wrench = wrench * np.repeat([1.0, unit], 3)
     posed = Posed(poses, GRAVITY_W)
@@ -246,9 +246,9 @@ def test_a_wrong_unit_of_the_torque_is_no_shift(unit):
 
 
 @pytest.mark.parametrize("inverse", [False, True])
-def test_quaternions_are_read_as_their_matrices_are(tmp_path, inverse):
+def test_quaternions_and_matrices_give_the_same_poses(tmp_path, inverse):
     t, wrench, poses = record(Kind(seed=3))
-    q = 1.002 * poses.quaternion[:, [1, 2, 3, 0]]  # as long as rounding may make them
+    q = 1.002 * poses.quaternion[:, [1, 2, 3, 0]]  # length error by rounding
     R = rotation_matrices(poses.quaternion, "quaternion_wxyz").reshape(-1, 9)
     columns = {"t": t} | dict(zip(WRENCH, wrench.T, strict=True))
     pl.DataFrame(columns).write_parquet(tmp_path / "a_wrench.parquet")

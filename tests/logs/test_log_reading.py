@@ -29,19 +29,19 @@ T = np.arange(0, 3, 0.002)
 TURNED = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])
 
 
-def a_wrench(motion: Motion) -> np.ndarray:
-    """Anything smooth that the motion determines, so that a wrong clock shows."""
+def smooth_wrench(motion: Motion) -> np.ndarray:
+    """Return a smooth function of the motion, which makes clock errors visible."""
     return np.hstack([2 * motion.specific_force, 0.1 * motion.omega])
 
 
-def a_log(t: np.ndarray = T) -> Log:
+def make_log(t: np.ndarray = T) -> Log:
     motion = motion_at(t)
-    return Log(t, a_wrench(motion), motion.specific_force, motion.omega, motion.alpha)
+    return Log(t, smooth_wrench(motion), motion.specific_force, motion.omega, motion.alpha)
 
 
 def canonical(*groups: str) -> pl.DataFrame:
     motion = motion_at(T)
-    columns: dict[str, Any] = {"t": T} | dict(zip(WRENCH, a_wrench(motion).T, strict=True))
+    columns: dict[str, Any] = {"t": T} | dict(zip(WRENCH, smooth_wrench(motion).T, strict=True))
     for name, names, values in (
         ("s", SPECIFIC_FORCE, motion.specific_force),
         ("omega", ANGULAR_VELOCITY, motion.omega),
@@ -55,8 +55,8 @@ def canonical(*groups: str) -> pl.DataFrame:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_canonical_log_survives_writing_and_reading(tmp_path: Path, suffix: str) -> None:
-    log = a_log(2.0 + T)
+def test_written_canonical_log_reads_unchanged(tmp_path: Path, suffix: str) -> None:
+    log = make_log(2.0 + T)
     path = tmp_path / f"log.{suffix}"
     write_log(log, path)
     found = read_log(path)
@@ -72,7 +72,7 @@ def test_canonical_log_survives_writing_and_reading(tmp_path: Path, suffix: str)
 @pytest.mark.parametrize(
     "groups", [("q", "p"), ("s", "omega"), ("s", "q"), ("omega", "q", "p"), ("s", "omega", "alpha")]
 )
-def test_a_pose_stands_in_for_missing_kinematics(tmp_path: Path, groups: tuple[str, ...]) -> None:
+def test_pose_replaces_missing_kinematics(tmp_path: Path, groups: tuple[str, ...]) -> None:
     canonical(*groups).write_parquet(tmp_path / "log.parquet")
     found = read_log(tmp_path / "log.parquet", bandwidth_hz=None)
     motion = motion_at(found.t)
@@ -86,7 +86,7 @@ def test_a_pose_stands_in_for_missing_kinematics(tmp_path: Path, groups: tuple[s
         np.testing.assert_allclose(found.gravity, expected, atol=1e-9)
 
 
-def test_orientation_alone_is_taken_for_slow_motion_and_says_so(tmp_path: Path) -> None:
+def test_orientation_without_position_sets_acceleration_to_zero_with_a_note(tmp_path: Path) -> None:
     canonical("q").write_csv(tmp_path / "log.csv")
     found = read_log(tmp_path / "log.csv")
     assert "acceleration of S is taken as zero" in found.notes[0]
@@ -104,14 +104,14 @@ def test_orientation_alone_is_taken_for_slow_motion_and_says_so(tmp_path: Path) 
         (lambda f: f.head(15), "15 samples in log.csv are too few"),
         (
             lambda f: f.with_columns(t=pl.col("t").reverse()),
-            "1499 time stamps go back, the first is row 3",
+            "1499 time stamps decrease, the first in row 3",
         ),
-        (lambda f: pl.concat([f[:9], f[4:]]), "1 time stamps go back, the first is row 11"),
+        (lambda f: pl.concat([f[:9], f[4:]]), "1 time stamps decrease, the first in row 11"),
         (lambda f: f.with_columns(s_x=pl.lit("?")), "log.csv:s_x: '?' in row 2 is not a number"),
         (lambda f: f.with_columns(f_x=pl.lit(float("nan"))), "no finite number in 1500 rows"),
     ],
 )
-def test_bad_canonical_logs(
+def test_invalid_canonical_log_raises_error(
     tmp_path: Path, change: Callable[[pl.DataFrame], pl.DataFrame], words: str
 ) -> None:
     path = tmp_path / "log.csv"
@@ -123,15 +123,15 @@ def test_bad_canonical_logs(
     assert ";" in str(error.value)
 
 
-def test_unknown_kind_of_log(tmp_path: Path) -> None:
+def test_unknown_file_format_raises_error(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match=r"'\.xls' is not known; give a canonical log"):
         read_log(tmp_path / "log.xls")
     with pytest.raises(DrakeTeleopError, match=r"is a bag, .*; describe it"):
         read_log(tmp_path / "log.bag")
 
 
-def foreign(folder: Path, **changes: Any) -> Path:
-    """Three files with their own clocks, rates, units, axes and signs; and their description."""
+def write_streams(folder: Path, **changes: Any) -> Path:
+    """Write three files with different clocks, units, axes and signs, and their description."""
     rng = np.random.default_rng(5)
     epoch = 1_700_000_000
 
@@ -140,7 +140,7 @@ def foreign(folder: Path, **changes: Any) -> Path:
         return t + rng.uniform(-0.02, 0.02, len(t)) / rate
 
     t_wrench, t_imu, t_pose = stamps(700, 0.013), stamps(1500, 0.0), stamps(200, 0.031)
-    wrench = a_wrench(motion_at(t_wrench))
+    wrench = smooth_wrench(motion_at(t_wrench))
     frame = pl.DataFrame({"time": np.rint((epoch + t_wrench) * 1e6).astype(np.int64)})
     frame = frame.with_columns(
         **{f"F{i}": -wrench[:, i] / 4.4482216152605 for i in range(3)},
@@ -195,15 +195,15 @@ def foreign(folder: Path, **changes: Any) -> Path:
     return path
 
 
-def test_streams_with_own_clocks_units_axes_and_signs(tmp_path: Path) -> None:
-    log = read_log(foreign(tmp_path), bandwidth_hz=60.0)
+def test_streams_with_different_clocks_units_axes_and_signs_give_one_log(tmp_path: Path) -> None:
+    log = read_log(write_streams(tmp_path), bandwidth_hz=60.0)
     motion = motion_at(log.t + 0.013)
     inner = slice(40, -40)
     assert 1 / log.dt == pytest.approx(700, rel=0.01)
     assert log.t[0] == pytest.approx(0.018, abs=1 / 700)
-    # Interpolation between jittered stamps is what limits these, not the conversions.
+    # Interpolation between jittered stamps limits the accuracy, not the conversions.
     for found, expected, tolerance in (
-        (log.wrench, a_wrench(motion), 0.01),
+        (log.wrench, smooth_wrench(motion), 0.01),
         (log.specific_force, motion.specific_force, 0.02),
         (log.angular_velocity, motion.omega, 2e-3),
         (log.angular_acceleration, motion.alpha, 0.15),
@@ -214,9 +214,9 @@ def test_streams_with_own_clocks_units_axes_and_signs(tmp_path: Path) -> None:
     assert log.notes == ()
 
 
-def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
+def test_base_axes_are_rotated_to_S_by_the_orientation(tmp_path: Path) -> None:
     motion = motion_at(T)
-    wrench_W = np.einsum("nij,nkj->nki", motion.R_WS, a_wrench(motion).reshape(-1, 2, 3))
+    wrench_W = np.einsum("nij,nkj->nki", motion.R_WS, smooth_wrench(motion).reshape(-1, 2, 3))
     s_W = np.einsum("nij,nj->ni", motion.R_WS, motion.specific_force)
     np.savez(
         tmp_path / "all.npz", t=T, w=wrench_W.reshape(-1, 6), s=s_W, R=motion.R_WS, n=T[:, None]
@@ -246,7 +246,7 @@ def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
     path = tmp_path / "log.yaml"
     path.write_text(yaml.safe_dump(description), encoding="utf-8")
     log = read_log(path)
-    np.testing.assert_allclose(log.wrench, a_wrench(motion), atol=1e-9)
+    np.testing.assert_allclose(log.wrench, smooth_wrench(motion), atol=1e-9)
     np.testing.assert_allclose(log.specific_force, motion.specific_force, atol=1e-9)
 
 
@@ -265,7 +265,7 @@ def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
             ["wrench.time.unit", "a rate of 0.7 Hz", "`unit: us`"],
         ),
         ({"pose__time": {"column": "sec"}}, ["do not overlap in time", "pose 0.03"]),
-        ({"pose__time": {"column": "q0"}}, ["pose.time", "go back", "time.rate"]),
+        ({"pose__time": {"column": "q0"}}, ["pose.time", "decrease", "time.rate"]),
         (
             {"pose__orientation": {"columns": ["q0", "q1", "q2"], "form": "quaternion_wxyz"}},
             ["pose.orientation.columns", "3 columns where 4"],
@@ -278,8 +278,10 @@ def test_base_axes_are_turned_by_the_orientation(tmp_path: Path) -> None:
         ({"imu__frame": "base", "pose": None}, ["imu.frame", "add a pose stream"]),
     ],
 )
-def test_bad_streams(tmp_path: Path, changes: dict[str, Any], words: list[str]) -> None:
-    path = foreign(tmp_path, **changes)
+def test_invalid_stream_raises_error(
+    tmp_path: Path, changes: dict[str, Any], words: list[str]
+) -> None:
+    path = write_streams(tmp_path, **changes)
     with pytest.raises(DrakeTeleopError) as error:
         read_log(path)
     message = str(error.value)
@@ -288,15 +290,15 @@ def test_bad_streams(tmp_path: Path, changes: dict[str, Any], words: list[str]) 
         assert word in message
 
 
-def test_arrays_that_do_not_belong_together(tmp_path: Path) -> None:
-    path = foreign(tmp_path, imu__time={"column": "t"})
+def test_arrays_with_wrong_shapes_raise_error(tmp_path: Path) -> None:
+    path = write_streams(tmp_path, imu__time={"column": "t"})
     with np.load(tmp_path / "imu.npz") as archive:
         np.savez(tmp_path / "imu.npz", t=archive["clock"][:-1] * 1e-3, **archive)
     with pytest.raises(DrakeTeleopError, match="has 4500 rows where 4499 are needed"):
         read_log(path)
 
 
-def test_nominal_rate_in_place_of_time_stamps(tmp_path: Path) -> None:
+def test_nominal_rate_replaces_time_stamps(tmp_path: Path) -> None:
     canonical("s", "omega").write_csv(tmp_path / "all.csv")
     stream = {"file": "all.csv", "time": {"rate": 500.0}}
     description = {
@@ -326,11 +328,11 @@ def test_a_gap_is_noted_and_marked(tmp_path: Path) -> None:
     marked = log.t[log.bridged]
     assert [marked[0], marked[-1]] == pytest.approx([0.998 - 0.03, 1.2 + 0.03], abs=0.003)
     known = log.only(~log.bridged)
-    np.testing.assert_allclose(known.wrench, a_wrench(motion_at(known.t)), atol=1e-3)
+    np.testing.assert_allclose(known.wrench, smooth_wrench(motion_at(known.t)), atol=1e-3)
     np.testing.assert_allclose(known.angular_acceleration, motion_at(known.t).alpha, atol=0.02)
 
 
-def test_too_many_gaps(tmp_path: Path) -> None:
+def test_too_many_gaps_raise_error(tmp_path: Path) -> None:
     frame = canonical("s", "omega")
     pieces = [frame[i : i + 14] for i in range(0, 600, 30)]
     pl.concat(pieces).write_csv(tmp_path / "log.csv")
@@ -338,11 +340,11 @@ def test_too_many_gaps(tmp_path: Path) -> None:
         read_log(tmp_path / "log.csv")
 
 
-def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
+def test_static_poses_accept_gravity_or_orientation(tmp_path: Path) -> None:
     motion = motion_at(np.linspace(0, 5, 12))
     gravity = np.einsum("nji,j->ni", motion.R_WS, GRAVITY_W)
     wrench_W = np.einsum("nij,nj->ni", motion.R_WS, -2 * gravity)
-    bias = [0.1, -0.2, 0.3]  # in g, as the column that has it
+    bias = [0.1, -0.2, 0.3]  # in g, the unit of its column
     np.savez(
         tmp_path / "x.npz",
         f=-2 * gravity,
@@ -375,7 +377,7 @@ def test_static_poses_from_gravity_or_orientation(tmp_path: Path) -> None:
 @pytest.mark.parametrize("columns", [["s"], ["q"], ["s", "omega"], ["q", "p"]])
 @pytest.mark.parametrize("rate", [None, 1.0, 0.2])
 @pytest.mark.parametrize("rows_a_pose", [1, 4])
-def test_a_canonical_table_of_poses_at_rest(
+def test_canonical_rows_at_rest_are_static_poses(
     tmp_path: Path, columns: list[str], rate: float | None, rows_a_pose: int
 ) -> None:
     R_WS = Rotation.random(12, np.random.default_rng(2)).as_matrix().repeat(rows_a_pose, axis=0)
@@ -394,13 +396,13 @@ def test_a_canonical_table_of_poses_at_rest(
         values["t"] = np.arange(len(g_S)) / rate
     pl.DataFrame(values).write_csv(tmp_path / "log.csv")
     log = read_log(tmp_path / "log.csv")
-    assert log.static and log.notes == ("each row is taken for a pose at rest",)
+    assert log.static and log.notes == ("each row is interpreted as a pose at rest",)
     assert log.gravity is not None
     np.testing.assert_allclose(log.gravity, g_S, atol=1e-9)
     np.testing.assert_allclose(log.wrench[:, :3], -2 * g_S, atol=1e-9)
 
 
-def test_a_moving_log_in_ms_is_no_table_of_poses(tmp_path: Path) -> None:
+def test_moving_log_with_stamps_in_ms_is_not_static(tmp_path: Path) -> None:
     for columns in (("s", "omega"), ("q", "p")):
         frame = canonical(*columns).with_columns(t=1e3 * pl.col("t"))
         frame.write_csv(tmp_path / "log.csv")
@@ -413,12 +415,12 @@ def test_a_moving_log_in_ms_is_no_table_of_poses(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["wrench", "static"])
-def test_axes_of_the_force_sensor_are_turned_to_S(tmp_path: Path, kind: str) -> None:
-    """The columns of `frame` are the axes of the file, seen in S."""
+def test_axes_of_the_force_sensor_are_rotated_to_S(tmp_path: Path, kind: str) -> None:
+    """The columns of `frame` are the axes of the file in S."""
     x, y, z = np.array([0.0, 0.6, -0.8]), np.array([1.0, 0.0, 0.0]), np.array([0.0, -0.8, -0.6])
     motion = motion_at(T)
     columns: dict[str, Any] = {"t": T, "s": motion.specific_force, "omega": motion.omega}
-    for name, vectors in zip(("f", "tau"), np.split(a_wrench(motion), 2, axis=1), strict=True):
+    for name, vectors in zip(("f", "tau"), np.split(smooth_wrench(motion), 2, axis=1), strict=True):
         columns[name] = np.column_stack([vectors @ axis for axis in (x, y, z)])
     np.savez(tmp_path / "x.npz", **columns)
     stream: dict[str, Any] = {
@@ -441,7 +443,7 @@ def test_axes_of_the_force_sensor_are_turned_to_S(tmp_path: Path, kind: str) -> 
         }
     path = tmp_path / "log.yaml"
     path.write_text(yaml.safe_dump(description), encoding="utf-8")
-    np.testing.assert_allclose(read_log(path).wrench, a_wrench(motion), atol=1e-9)
+    np.testing.assert_allclose(read_log(path).wrench, smooth_wrench(motion), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -452,7 +454,7 @@ def test_axes_of_the_force_sensor_are_turned_to_S(tmp_path: Path, kind: str) -> 
         ({"angular_velocity": np.full((4, 3), np.nan)}, "angular_velocity: holds NaN"),
     ],
 )
-def test_a_log_that_cannot_be(changes: dict[str, Any], words: str) -> None:
+def test_log_with_impossible_values_raises_error(changes: dict[str, Any], words: str) -> None:
     good = {
         "t": np.arange(4.0),
         "wrench": np.zeros((4, 6)),
@@ -465,9 +467,9 @@ def test_a_log_that_cannot_be(changes: dict[str, Any], words: str) -> None:
 
 
 def test_ur5_gyroscope_agrees_with_the_pose(ur5: Path, tmp_path: Path) -> None:
-    """Files without header, a clock in ms and one in s, a rotation vector; IMU axes are the tool's.
+    """Files without header, clocks in ms and s, rotation vectors; the IMU has the axes of the tool.
 
-    The IMU's clock lags by 0.11 s, and its map to the tool's axes is the identity within 2.5 %.
+    The IMU's clock lags by 0.11 s; its map to the axes of the tool is the identity within 2.5 %.
     """
     time_ms, time_s = {"column": 0, "unit": "ms"}, {"column": 0}
     record = f"{ur5}/No9_Singularity_Free_ForceSensor__"

@@ -1,4 +1,4 @@
-"""Orientations in every form that a log may have."""
+"""Orientations in every form of a log."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.logs.read.jackknife import solve
-from drake_teleop.logs.read.orientations import Orientations
 from drake_teleop.logs.read.rotations import WIDTHS, rotation_matrices
+from drake_teleop.logs.read.streams import Orientations
 
 VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 1, (50, 3))])
 
@@ -18,7 +18,7 @@ VECTORS = np.vstack([np.zeros((1, 3)), 3 * np.random.default_rng(2).uniform(-1, 
 @pytest.mark.parametrize(
     "form", ["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
 )
-def test_a_rotation_is_the_same_in_every_form(form: str) -> None:
+def test_all_rotation_forms_give_the_same_matrix(form: str) -> None:
     R = Rotation.from_rotvec(VECTORS)
     columns = {
         "matrix": R.as_matrix().reshape(-1, 9),
@@ -29,17 +29,17 @@ def test_a_rotation_is_the_same_in_every_form(form: str) -> None:
     np.testing.assert_allclose(rotation_matrices(columns[form], form), R.as_matrix(), atol=1e-12)
 
 
-def test_what_leaves_no_residual_at_all_is_solved() -> None:
+def test_solve_handles_a_zero_residual() -> None:
     exact = np.array([0.3, -2.0])
     x, deviations = solve(lambda x: np.outer(np.arange(60.0), [1, 1, 1]) * (x - exact).sum(), exact)
     np.testing.assert_array_equal(x, exact)
-    assert np.isinf(deviations).all()  # the sum alone is determined
+    assert np.isinf(deviations).all()  # only the sum is determined
     noise = np.random.default_rng(3).normal(size=(200, 3))
     x, _ = solve(lambda x: np.hstack([x[:1] - noise, np.full((200, 3), x[1])]), np.ones(2))
-    np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # half leaves nothing
+    np.testing.assert_allclose(x, [noise.mean(), 0.0], atol=1e-9)  # one half has a zero residual
 
 
-def test_what_is_linear_needs_no_differences() -> None:
+def test_solve_uses_given_linear_derivatives() -> None:
     rng, calls = np.random.default_rng(4), []
     maps, readings = rng.normal(size=(200, 6, 5)), rng.normal(size=(200, 6))
 
@@ -55,7 +55,7 @@ def test_what_is_linear_needs_no_differences() -> None:
 
 @pytest.mark.parametrize("inverse", [False, True])
 @pytest.mark.parametrize("form", WIDTHS)
-def test_some_rows_in_any_form_and_their_inverses(form: str, inverse: bool) -> None:
+def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: bool) -> None:
     turns = Rotation.from_rotvec(VECTORS[:5])
     columns = {
         "matrix": turns.as_matrix().reshape(-1, 9),

@@ -1,4 +1,4 @@
-"""The JSON schema of log descriptions that is shipped is the one that the code follows."""
+"""The shipped JSON schema of log descriptions matches the code."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from drake_teleop.logs.read.description import Description, json_schema
 SHIPPED = Path(__file__).parents[2] / "docs" / "log-description.schema.json"
 
 
-def test_the_shipped_schema_is_that_of_the_code() -> None:
+def test_shipped_schema_matches_the_code() -> None:
     assert json.loads(SHIPPED.read_text(encoding="utf-8")) == json.loads(json_schema())
 
 
-def test_the_schema_knows_every_field_and_all_forms_of_gravity() -> None:
+def test_schema_contains_every_field_and_all_forms_of_gravity() -> None:
     schema = json.loads(json_schema())
     assert set(schema["properties"]) == set(Description.model_fields)
     assert schema["additionalProperties"] is False

@@ -24,7 +24,7 @@ def write(path: Path, text: str) -> Path:
     return path
 
 
-def test_csv_and_parquet_hold_the_same(tmp_path: Path) -> None:
+def test_csv_and_parquet_give_the_same_table(tmp_path: Path) -> None:
     frame = pl.DataFrame({"a": [1.0, 2.5], "b": [3, 4]})
     frame.write_csv(tmp_path / "x.csv")
     frame.write_parquet(tmp_path / "x.parquet")
@@ -42,7 +42,7 @@ def test_npz_array_counts_as_several_columns(tmp_path: Path) -> None:
     assert parts.tolist() == [[5.0, 0.0], [14.0, 9.0]]
 
 
-def test_csv_without_header_is_addressed_by_number(tmp_path: Path) -> None:
+def test_columns_of_csv_without_header_are_named_by_number(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "1,2,3\n4,5,6\n"), header=False)
     assert table.numbers([2, 0], 2, "here").tolist() == [[3.0, 1.0], [6.0, 4.0]]
 
@@ -76,8 +76,8 @@ def test_errors_name_file_and_remedy(
 
 @pytest.mark.parametrize("row", [0, 2500])
 @pytest.mark.parametrize("cell", ["2.5", "1e3", " 3", "+5", "nan", "", "Infinity", "9" * 25])
-def test_a_cell_is_the_same_number_in_any_row(tmp_path: Path, row: int, cell: str) -> None:
-    """Types are told by the first rows, if they can be; the others are of whole numbers here."""
+def test_column_types_do_not_depend_on_the_first_rows(tmp_path: Path, row: int, cell: str) -> None:
+    """The first rows contain only integers here."""
     cells = [str(k) for k in range(3000)]
     cells[row] = cell
     table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
@@ -88,7 +88,9 @@ def test_a_cell_is_the_same_number_in_any_row(tmp_path: Path, row: int, cell: st
 
 @pytest.mark.parametrize("row", [1, 2500])
 @pytest.mark.parametrize("cell", ["x7", "2020-01-01", "true", "0x10"])
-def test_a_cell_that_is_no_number_is_named_in_any_row(tmp_path: Path, row: int, cell: str) -> None:
+def test_error_names_the_row_of_a_cell_without_a_number(
+    tmp_path: Path, row: int, cell: str
+) -> None:
     cells = ["1.5"] * 3000
     cells[row] = cell
     table = read_table(write(tmp_path / "x.csv", "\n".join(["a,b", *(f"{c},7" for c in cells)])))
@@ -96,12 +98,12 @@ def test_a_cell_that_is_no_number_is_named_in_any_row(tmp_path: Path, row: int, 
         table.raw("a", "here")
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file_raises_error(tmp_path: Path) -> None:
     with pytest.raises(DrakeTeleopError, match=r"none\.csv: no such file"):
         read_table(tmp_path / "none.csv")
 
 
-def test_columns_of_different_length(tmp_path: Path) -> None:
+def test_columns_of_different_length_raise_error(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", a=np.zeros(3), b=np.zeros(4))
     with pytest.raises(DrakeTeleopError, match=r"'b' of x\.npz has 4 rows where 3 are needed"):
         read_table(tmp_path / "x.npz").numbers(["a", "b"], 2, "here")
@@ -112,10 +114,10 @@ def test_columns_of_different_length(tmp_path: Path) -> None:
     [(pl.exceptions.PanicException("a bug\nof theirs"), DrakeTeleopError),
      (MemoryError(), DrakeTeleopError), (KeyboardInterrupt(), KeyboardInterrupt)],
 )  # fmt: skip
-def test_a_panic_in_polars_is_one_line_and_ctrl_c_is_none(
+def test_panic_in_polars_is_an_error_but_ctrl_c_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, raised: type
 ) -> None:
-    """A panic is no Exception."""
+    """A panic is no subclass of Exception."""
 
     def fail(*_: object, **__: object) -> None:
         raise error
@@ -134,18 +136,20 @@ LAB = "t,f\n0.5,1.25\n1.5,-2.0\n"
 @pytest.mark.parametrize(
     "text",
     [
-        LAB.replace(",", ";").replace(".", ","),  # as a spreadsheet on the continent
+        LAB.replace(",", ";").replace(".", ","),  # spreadsheet with decimal commas
         LAB.replace(",", "\t"),
         "# recorder 3, 500 Hz\n\n" + LAB,
         "# " + LAB.replace(",", " "),  # numpy.savetxt
-        "   t         f\n  0.5    1.25\n  1.5   -2.0\n",  # in columns for the eye
+        "   t         f\n  0.5    1.25\n  1.5   -2.0\n",  # aligned columns
         "# t    f\n   5.0e-01   1.25e+00\n   1.5e+00  -2.0e+00 \n",
         '"t";"f, in N"\n0,5;1,25\n1,5;-2,0\n'.replace("f, in N", "f"),
     ],
 )
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize("suffix", ["csv", "txt"])
-def test_text_of_other_programs(tmp_path: Path, text: str, encoding: str, suffix: str) -> None:
+def test_text_of_other_programs_is_read(
+    tmp_path: Path, text: str, encoding: str, suffix: str
+) -> None:
     path = tmp_path / f"x.{suffix}"
     path.write_bytes(text.encode(encoding))
     found = read_table(path).numbers(["t", "f"], 2, "here")
@@ -153,11 +157,11 @@ def test_text_of_other_programs(tmp_path: Path, text: str, encoding: str, suffix
 
 
 @pytest.mark.parametrize("form", ["4", "5"])
-def test_matlab_s_variables_and_fields_are_columns(tmp_path: Path, form: str) -> None:
+def test_matlab_variables_and_fields_are_columns(tmp_path: Path, form: str) -> None:
     t, force, turned = np.arange(4.0), np.arange(12.0).reshape(4, 3), np.arange(36.0)
     variables = {"t": t, "force": force, "rate": 500.0, "empty": np.zeros((0, 3))}
     if form == "5":
-        pages = turned.reshape(4, 3, 3).transpose(1, 2, 0)  # as rotm2quat takes them
+        pages = turned.reshape(4, 3, 3).transpose(1, 2, 0)  # order of rotm2quat
         variables["tool"] = {"R": pages, "name": "gripper", "imu": {"gyro": 2 * force}}
         structures = np.array([[(t,), (2 * t,)]], [("a", object)])
         cells = np.array([t, "x"], object)
@@ -178,10 +182,10 @@ def test_matlab_s_variables_and_fields_are_columns(tmp_path: Path, form: str) ->
     [
         (b"no mat", "cannot be read"),
         (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n", "'-v7'"),
-        (None, "save as arrays"),
+        (None, "save tables and timeseries"),
     ],
 )
-def test_a_mat_file_without_arrays_says_how_to_save_them(
+def test_error_of_a_mat_file_without_arrays_has_a_remedy(
     tmp_path: Path, content: bytes | None, words: str
 ) -> None:
     path = tmp_path / "x.mat"
@@ -193,30 +197,29 @@ def test_a_mat_file_without_arrays_says_how_to_save_them(
         read_table(path)
 
 
-def test_what_matlab_keeps_of_a_table_is_no_column(tmp_path: Path) -> None:
-    """An array without a name."""
+def test_unnamed_array_of_a_matlab_table_is_ignored(tmp_path: Path) -> None:
     savemat(path := tmp_path / "x.mat", {"t": np.arange(40.0)})
     data = bytearray(path.read_bytes())
     assert data[168:173] == b"\x01\0\x01\0t"
     data[168:176] = b"\x01" + bytes(7)
     path.write_bytes(data)
-    with pytest.raises(DrakeTeleopError, match="save as arrays"):
+    with pytest.raises(DrakeTeleopError, match="save tables and timeseries"):
         read_table(path)
 
 
-def test_types_and_byte_order_of_mat_files_are_their_own(tmp_path: Path) -> None:
+def test_types_and_byte_order_of_mat_files_are_respected(tmp_path: Path) -> None:
     numbers = np.arange(-3, 4)
     kinds = ["i1", "i2", "i4", "i8", "f4", "f8"]
     savemat(tmp_path / "x.mat", {kind: numbers.astype(kind) for kind in kinds})
     table = read_table(tmp_path / "x.mat")
     for kind in kinds:
         assert table.single(kind, "here").tolist() == numbers.tolist()
-    # As an old workstation writes it: big end first.
+    # Big-endian, as written by old workstations.
     tag = partial(struct.pack, ">II")
     content = tag(6, 8) + struct.pack(">II", 6, 0) + tag(5, 8) + struct.pack(">ii", 3, 1)
     content += tag(1, 1) + b"t".ljust(8, b"\0") + tag(9, 24) + struct.pack(">3d", 0.5, 1.0, -2.0)
     head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
-    # And before it an object, a string or a table, as MATLAB keeps them.
+    # An object, a string or a table before it, as MATLAB stores them.
     kept = tag(6, 8) + struct.pack(">II", 17, 0)
     for word in (b"s", b"MCOS", b"string"):
         kept += tag(1, len(word)) + word.ljust(8, b"\0")
@@ -230,12 +233,12 @@ def test_types_and_byte_order_of_mat_files_are_their_own(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize(("place", "value"), [(48, 0x77), (17, 0x0E), (53, 0x33), (-60, None)])
-def test_a_broken_mat_file_does_not_end_the_process(
+def test_damaged_mat_file_raises_error(
     tmp_path: Path, place: int, value: int | None, compressed: bool
 ) -> None:
-    """An unknown kind, an imaginary part that is not there, a wrong size, the end cut off.
+    """Unknown type, missing imaginary part, wrong size and truncation.
 
-    SciPy's own reader would, of the first two.
+    SciPy's reader crashes on the first two.
     """
     savemat(path := tmp_path / "x.mat", {"t": np.arange(40.0)})
     head, body = path.read_bytes()[:128], bytearray(path.read_bytes()[128:])
@@ -247,7 +250,7 @@ def test_a_broken_mat_file_does_not_end_the_process(
         packed = zlib.compress(bytes(body))
         body = bytearray(struct.pack("<II", 15, len(packed)) + packed)
     path.write_bytes(head + bytes(body))
-    with pytest.raises(DrakeTeleopError, match=r"it is broken, or not all|it has no arrays"):
+    with pytest.raises(DrakeTeleopError, match=r"it is damaged or incomplete|it has no arrays"):
         read_table(path)
 
 
@@ -256,7 +259,7 @@ def test_a_comma_between_whole_numbers_separates(tmp_path: Path) -> None:
     assert table.numbers(["0", "1"], 2, "here").tolist() == [[1.0, 2.0], [3.0, 4.0]]
 
 
-def test_rows_after_comments_are_counted_from_the_file_s_first(tmp_path: Path) -> None:
+def test_row_numbers_in_errors_include_comment_lines(tmp_path: Path) -> None:
     table = read_table(write(tmp_path / "x.csv", "# a\n# b\nt,f\n0,1\n1,oops\n"))
     with pytest.raises(DrakeTeleopError, match="'oops' in row 5"):
         table.raw("f", "here")
@@ -291,7 +294,9 @@ def test_dates_and_times_of_day_are_seconds(tmp_path: Path, stamps: list[str]) -
         ([0.0, 0.7, 5.0], 0.1),
     ],
 )
-def test_step_of_printed_decimals(values: list[float], step: float) -> None:
+def test_decimal_step_is_the_quantization_of_printed_numbers(
+    values: list[float], step: float
+) -> None:
     assert decimal_step(np.array(values)) == pytest.approx(step)
 
 
@@ -315,7 +320,7 @@ SPELLINGS = {
 
 
 @pytest.mark.parametrize("name", SPELLINGS)
-def test_text_of_spreadsheets_is_the_same_table(tmp_path: Path, name: str) -> None:
+def test_spreadsheet_formats_give_the_same_table(tmp_path: Path, name: str) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(SPELLINGS[name].encode())
     table = read_table(path)
@@ -323,15 +328,15 @@ def test_text_of_spreadsheets_is_the_same_table(tmp_path: Path, name: str) -> No
 
 
 @pytest.mark.parametrize("cell", ["1_000", '"1,500"', "1_0.5", "_1", "1__0", "0x10", "\u0663"])
-def test_a_cell_that_may_be_another_number_is_refused(tmp_path: Path, cell: str) -> None:
+def test_ambiguous_number_raises_error(tmp_path: Path, cell: str) -> None:
     for text in (f"t,a\n0,{cell}\n1,2.5\n", f"t,a\n0,2.5\n1,{cell}\n", f"t,a\n0,{cell}\n"):
         with pytest.raises(DrakeTeleopError):
             read_table(write(tmp_path / "x.csv", text)).numbers(["a"], 1, "here")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_canonical_log_in_capitals_has_all_of_its_columns(tmp_path: Path, suffix: str) -> None:
-    """None of them is left out without a word, such as the angular acceleration."""
+def test_canonical_columns_in_capitals_are_found(tmp_path: Path, suffix: str) -> None:
+    """Optional columns such as the angular acceleration are included."""
     log = sample_motion()
     path = tmp_path / f"x{suffix}"
     write_log(log, path)
@@ -349,7 +354,7 @@ def sample_motion() -> Log:
     return Log(t, *groups, np.cos(np.outer(t, np.arange(1.0, 4.0))))
 
 
-def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
+def test_empty_array_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "x.npz"
     np.savez(path, t=np.arange(2.0), none=np.zeros(0), nothing=np.zeros((0, 3)))
     table = read_table(path)
@@ -362,7 +367,7 @@ def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 2)])
-def test_complex_arrays_of_files_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+def test_complex_array_raises_error(tmp_path: Path, shape: tuple[int, ...]) -> None:
     np.savez(tmp_path / "x.npz", a=np.ones(shape) + 1j)
     with pytest.raises(DrakeTeleopError, match="is not a number"):
         read_table(tmp_path / "x.npz").raw("a", "here")
@@ -387,7 +392,7 @@ with multiprocessing.get_context("fork").Pool(1) as pool:
 
 
 @pytest.mark.slow
-def test_a_process_that_is_forked_after_a_log_was_read_says_so(tmp_path: Path) -> None:
+def test_reading_in_a_forked_process_raises_error(tmp_path: Path) -> None:
     path = write(tmp_path / "x.csv", PLAIN)
     for when, says in (("before", "True"), ("after", "forked after tables were read")):
         done = subprocess.run(

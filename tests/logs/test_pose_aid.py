@@ -1,4 +1,4 @@
-"""An IMU beside noisy poses: splines of both, and when it is not heard."""
+"""IMU beside noisy poses: common splines, and rejection of the IMU."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ import yaml
 from posed_record import GRAVITY_W, LATE, PHI, SECONDS, TRUTH, Kind, motion_at, record
 from scipy.interpolate import BSpline
 
-from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
-from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.imu_rows import compare_imu
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, signal_spectrum
-from drake_teleop.logs.pose_motion.splines import DEGREE, Choice, PoseSplines, _normal_of_rates
+from drake_teleop.logs.pose_motion.spectra import (
+    Grid,
+    bands,
+    end_taper,
+    noise_moments,
+    signal_spectrum,
+)
+from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, SplineCache, _normal_of_rates
 from drake_teleop.logs.processing import identify_log
 
 RATE, NOISE = 250.0, (0.03, 2e-3)
@@ -28,8 +33,8 @@ BIAS, MATRIX = (
 ROUGH = Kind(place=1e-3, turn=1e-3, rate=50.0, seed=4)
 
 
-def sensed(seed: int, later: float = 0.0) -> Inertial:
-    """An IMU on the clock of the poses but for `later`, with a bias and wrong gains and axes."""
+def imu_data(seed: int, later: float = 0.0) -> Inertial:
+    """Return an IMU with bias, gain and axis errors, on the clock of the poses plus `later`."""
     rng, t = np.random.default_rng([seed, 5]), np.arange(0.05, SECONDS - 0.05, 1 / RATE)
     at = motion_at(t - LATE - later)
     s, omega = (
@@ -44,9 +49,9 @@ def poses_of(kind: Kind) -> tuple[np.ndarray, np.ndarray, Poses]:
     return t, wrench, poses.continued()
 
 
-def test_poses_tell_bias_axes_clock_and_noise_of_an_imu():
+def test_poses_determine_bias_axes_clock_and_noise_of_an_imu():
     splines = PoseSplines(poses_of(Kind(seed=4))[2], 0.07)
-    aid = aid_of(splines, sensed(4, later=0.008), GRAVITY_W)
+    aid = compare_imu(splines, imu_data(4, later=0.008), GRAVITY_W)
     assert aid is not None
     truth = motion_at(aid.t - LATE)
     acceleration = np.einsum("nij,nj->ni", truth.R_WS, truth.specific_force) + GRAVITY_W
@@ -71,8 +76,8 @@ def test_derivatives_enter_the_normal_equations_as_rows():
         np.testing.assert_allclose(right, rows.T @ x, atol=1e-9 * np.abs(right).max())
 
 
-def test_the_noise_that_splines_of_both_leave_is_as_said():
-    """Means of 6 records, of acceleration and angular acceleration, 2 to 6 Hz."""
+def test_noise_of_splines_of_poses_and_imu_is_predicted():
+    """Means over 6 records, of acceleration and angular acceleration, 2 to 6 Hz."""
     exact = poses_of(replace(ROUGH, place=0.0, turn=0.0))[2]
     t = np.arange(0.0, SECONDS, 0.01)
     grid, taper = Grid(t, np.zeros((len(t), 6)), 1), end_taper(t, 1.0, SECONDS - 1.0)
@@ -82,12 +87,12 @@ def test_the_noise_that_splines_of_both_leave_is_as_said():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         moved = exact.position + ROUGH.place * rng.normal(size=exact.position.shape)
-        # Half an angle in each part of the quaternion.
+        # The quaternion contains half the angle.
         q = exact.quaternion + 0.5 * ROUGH.turn * rng.normal(size=exact.quaternion.shape)
         noisy = Poses(exact.t, moved, q / np.linalg.norm(q, axis=1, keepdims=True))
-        aid = aid_of(PoseSplines(noisy, 0.1), sensed(seed), GRAVITY_W)
+        aid = compare_imu(PoseSplines(noisy, 0.1), imu_data(seed), GRAVITY_W)
         assert aid is not None
-        splines = Choice(noisy, aid).at(0.05)
+        splines = SplineCache(noisy, aid).at(0.05)
         error = splines.signals(t, GRAVITY_W) - clean
         power = of.sums(np.abs(signal_spectrum(grid, taper, error, len(of.frequency))) ** 2)
         Q = noise_moments(splines, grid, taper, clean, of, splines.noise())
@@ -98,28 +103,28 @@ def test_the_noise_that_splines_of_both_leave_is_as_said():
     np.testing.assert_allclose(said / sums, 1.0, atol=0.2)
 
 
-def test_an_imu_makes_a_load_of_rough_poses_surer():
+def test_imu_reduces_the_deviations_with_noisy_poses():
     t, wrench, poses = poses_of(ROUGH)
     alone = estimate_from_poses(t, wrench, poses, GRAVITY_W)
-    both = estimate_from_poses(t, wrench, poses, GRAVITY_W, imu=sensed(4))
-    assert both.splines.aid is not None
+    both = estimate_from_poses(t, wrench, poses, GRAVITY_W, imu=imu_data(4))
+    assert both.splines.imu_rows is not None
     deviations = np.sqrt(np.diag(both.covariance))
     assert np.abs((both.theta - TRUTH) / deviations).max() < 3.5
     inertia = deviations[10:] / np.sqrt(np.diag(alone.covariance))[10:]
     assert inertia.mean() < 0.8
 
 
-def test_an_imu_of_other_axes_is_not_heard():
-    splines, imu = PoseSplines(poses_of(Kind(seed=4))[2], 0.07), sensed(4)
+def test_imu_with_other_axes_is_rejected():
+    splines, imu = PoseSplines(poses_of(Kind(seed=4))[2], 0.07), imu_data(4)
     assert imu.specific_force is not None
     other = replace(imu, specific_force=imu.specific_force[:, [1, 0, 2]])
-    assert aid_of(splines, other, GRAVITY_W) is None
+    assert compare_imu(splines, other, GRAVITY_W) is None
 
 
 @pytest.mark.slow  # two loads from files of 20 s
-def test_identify_hears_both_but_the_imu_alone_if_the_poses_are_of_another_frame(tmp_path):
+def test_identify_uses_both_but_only_the_imu_if_the_pose_frame_is_wrong(tmp_path):
     kinds = Kind(seed=4), Kind(seed=4, p_SoPo_S=(0.0, 0.0, 0.1))
-    own, tcp = (identify_log(written(tmp_path / str(k), kind)) for k, kind in enumerate(kinds))
+    own, tcp = (identify_log(write_record(tmp_path / str(k), kind)) for k, kind in enumerate(kinds))
     assert not own.findings
     assert [finding.name for finding in tcp.findings] == ["pose frame"]
     of_splines, of_imu = (
@@ -132,11 +137,11 @@ def test_identify_hears_both_but_the_imu_alone_if_the_poses_are_of_another_frame
     assert tcp.identification.mass == pytest.approx(PHI[0], rel=0.03)
 
 
-def written(folder: Path, kind: Kind) -> Path:
-    """The files of a record with an IMU, and their description."""
+def write_record(folder: Path, kind: Kind) -> Path:
+    """Write the files of a record with an IMU and their description."""
     folder.mkdir()
     t, wrench, poses = record(kind)
-    imu = sensed(4)
+    imu = imu_data(4)
     np.savez(folder / "wrench.npz", t=t, f=wrench[:, :3], tau=wrench[:, 3:])
     np.savez(folder / "pose.npz", t=poses.t, q=poses.quaternion, p=poses.position)
     np.savez(folder / "imu.npz", t=imu.t, s=imu.specific_force, omega=imu.angular_velocity)

@@ -1,4 +1,4 @@
-"""Load, delay and frame from a wrench and noisy poses, against a motion in closed form."""
+"""Load, delay and frame from a wrench and noisy poses, for a motion in closed form."""
 
 from __future__ import annotations
 
@@ -28,29 +28,40 @@ from posed_record import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate, estimate_from_poses
-from drake_teleop.logs.pose_motion.levels import Levels
-from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.linear_model import (
+    Window,
+    best_delay,
+    fit_levels,
+    fit_linear_model,
+)
 from drake_teleop.logs.pose_motion.poses import Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
 from drake_teleop.logs.pose_motion.rigid import (
     State,
+    _apply_step,
     _columns,
     _gain_effects,
-    _moved,
     _Record,
     _solve,
     fit_rigid,
     motion_map,
 )
-from drake_teleop.logs.pose_motion.saturated import best_delay, saturated, spectra_of, wandering
-from drake_teleop.logs.pose_motion.spectra import Grid, bands, end_taper, moments, signal_spectrum
-from drake_teleop.logs.pose_motion.spectra import without as taper_without
-from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _sparser
+from drake_teleop.logs.pose_motion.spectra import (
+    Grid,
+    Levels,
+    bands,
+    end_taper,
+    moments,
+    noise_moments,
+    signal_spectrum,
+)
+from drake_teleop.logs.pose_motion.spectra import exclude as exclude_from_taper
+from drake_teleop.logs.pose_motion.splines import DEGREE, PoseSplines, _knots, _thin_knots
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 
 @cache
-def estimated(kind: Kind) -> PoseEstimate:
+def estimate(kind: Kind) -> PoseEstimate:
     return estimate_from_poses(*record(kind), GRAVITY_W)
 
 
@@ -58,7 +69,7 @@ def deviations(found: PoseEstimate) -> np.ndarray:
     return (found.theta - TRUTH) / np.sqrt(np.diag(found.covariance))
 
 
-def test_signals_are_those_of_the_motion_on_stamps_that_jitter_and_over_a_gap():
+def test_signals_match_the_motion_with_jitter_and_a_gap():
     t, _, poses = record(Kind(place=0.0, turn=0.0))
     far = (poses.t < 9.0) | (poses.t > 9.6)
     poses = Poses(poses.t[far], poses.position[far], poses.quaternion[far]).continued()
@@ -79,15 +90,15 @@ def test_signals_are_those_of_the_motion_on_stamps_that_jitter_and_over_a_gap():
     assert error[:, 10:].max() < 1e-3
 
 
-def test_where_one_pose_to_a_knot_is_too_little_there_are_fewer_knots():
-    """As a busy machine records: gaps of all lengths. The whole spline would not be determined."""
+def test_knots_are_thinned_where_poses_are_too_few():
+    """Gaps of all lengths, as on a busy computer, would make the spline undetermined."""
     t = np.cumsum(np.random.default_rng(1).exponential(0.0125, 200))
-    knots = _sparser(_knots(t, 0.0125), t)
+    knots = _thin_knots(_knots(t, 0.0125), t)
     assert np.diff(np.searchsorted(t, knots[DEGREE:-DEGREE])).min() >= 2 and len(knots) > 80
     assert knots[0] == t[0] and knots[-1] == t[-1]
 
 
-def test_quaternions_need_not_stay_of_unit_length():
+def test_quaternions_of_other_length_give_the_same_motion():
     t, _, poses = record(Kind(place=0.0, turn=0.0))
     poses = poses.continued()
     longer = poses.quaternion * (1.0 + 0.1 * np.sin(3.0 * poses.t))[:, None]
@@ -99,15 +110,15 @@ def test_quaternions_need_not_stay_of_unit_length():
     np.testing.assert_allclose(same, signals, atol=0.01)  # of alpha, 25 rad/s^2
 
 
-def test_the_residual_of_the_splines_tells_the_noise():
+def test_noise_is_estimated_from_the_residual_of_the_splines():
     poses = record(Kind(place=3e-4, turn=7e-4))[2].continued()
     place, turn = PoseSplines(poses, 0.05).noise()
     assert place == pytest.approx(3e-4, rel=0.08)
     assert turn == pytest.approx(7e-4, rel=0.08)
 
 
-def test_noise_of_poses_adds_to_the_moments_what_is_said():
-    """Differences of signals with and without noise, 12 records."""
+def test_noise_moments_predict_the_effect_of_noise():
+    """Differences of signals with and without noise, over 12 records."""
     kind = Kind(place=0.0, turn=0.0)
     t, wrench, clean = record(kind)
     grid = Grid.of(t, wrench)
@@ -127,7 +138,7 @@ def test_noise_of_poses_adds_to_the_moments_what_is_said():
         error = PoseSplines(noisy, 0.07).signals(grid.t, GRAVITY_W) - zeta
         spectrum = signal_spectrum(grid, taper, error, len(of.frequency))
         sums += moments(spectrum, none, of, rates * spectrum) / 12
-    # Below 2 Hz what is faster and turned into it by the motion is more than what is said.
+    # Below 2 Hz the motion modulates additional noise from higher frequencies.
     whole = Levels.flat(of).grouped
     well = whole(of.sums(of.frequency)) / whole(of.sizes) > 2.0
     sums, Q = whole(sums), whole(Q)
@@ -145,7 +156,7 @@ vector = st.tuples(finite, finite, finite).map(np.array)
 
 
 @given(vector, vector, vector, vector, vector, vector)
-def test_the_map_is_that_of_rigid_bodies(rho, r, a, minus_g, alpha, w):
+def test_motion_map_is_that_of_a_rigid_body(rho, r, a, minus_g, alpha, w):
     R = rotation_matrices(rho[None], "rotation_vector")[0]
     zeta = np.concatenate(
         [[1.0], a, minus_g, alpha, w * w, [w[0] * w[1], w[0] * w[2], w[1] * w[2]]]
@@ -164,7 +175,7 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
     state = State(TRUTH, 1e-3, r, R)
     step = np.zeros(23)
     step[k] = 1e-5
-    ahead, behind = (_columns(_moved(state, x))[1] for x in (step, -step))
+    ahead, behind = (_columns(_apply_step(state, x))[1] for x in (step, -step))
     derivative = (ahead - behind) / 2e-5
     np.testing.assert_allclose(_columns(state)[0][:, k], -derivative, atol=1e-6)
 
@@ -177,8 +188,8 @@ def test_columns_are_derivatives_of_the_residual(rho, r, k):
         Kind(rate=500.0, place=5e-5, turn=1e-4, colour=0.9, seed=3),
     ],
 )
-def test_load_delay_and_frame_are_right_within_what_is_said(kind):
-    found = estimated(kind)
+def test_load_delay_and_frame_are_within_their_deviations(kind):
+    found = estimate(kind)
     assert np.abs(deviations(found)).max() < 3.5
     assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
     assert found.fit.rigid and found.rejected.mean() < 0.03 and found.note == ""
@@ -188,9 +199,9 @@ def test_load_delay_and_frame_are_right_within_what_is_said(kind):
     assert np.sqrt(found.covariance[6, 6]) < 1e-3
 
 
-def test_a_pose_of_another_frame_is_named_and_its_transform_found():
+def test_wrong_pose_frame_is_detected_and_estimated():
     kind = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
-    found = estimated(kind)
+    found = estimate(kind)
     frame = found.frame
     assert frame.shifted and frame.turned
     np.testing.assert_allclose(frame.p_SoPo_S, SHIFT, atol=5 * frame.position_deviations.max())
@@ -200,13 +211,13 @@ def test_a_pose_of_another_frame_is_named_and_its_transform_found():
     assert not found.fit.rigid and found.fit.inflation > 5.0
 
 
-def test_deviations_of_the_frame_are_those_of_what_was_estimated():
-    found = estimated(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
+def test_deviations_of_the_frame_match_the_scatter():
+    found = estimate(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
     place = np.empty((3, 6))
     for k in range(6):
         step = np.zeros(23)
         step[17 + k] = 1e-6
-        states = [_moved(found.free.state, x) for x in (step, -step)]
+        states = [_apply_step(found.free.state, x) for x in (step, -step)]
         ahead, behind = (-state.R.T @ state.r for state in states)
         place[:, k] = (ahead - behind) / 2e-6
     covariance = place @ found.free.covariance[17:, 17:] @ place.T
@@ -215,12 +226,12 @@ def test_deviations_of_the_frame_are_those_of_what_was_estimated():
     )
 
 
-def test_noise_in_the_signals_makes_no_load_lighter():
-    """Knots much too fine, so that accelerations are half noise."""
+def test_noise_of_poses_does_not_bias_the_load():
+    """The knots are much too fine, so that accelerations are half noise."""
     t, wrench, poses = record(Kind(place=6e-4, turn=6e-4, seed=11))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.035)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 12.0)
+    spectra = Window(grid, taper, GRAVITY_W, 12.0).spectra(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     free, start = np.arange(23) < 17, State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
@@ -236,7 +247,7 @@ def test_noise_in_the_signals_makes_no_load_lighter():
 
 
 @pytest.mark.slow
-def test_a_frame_that_is_declared_or_left_to_the_data_gives_the_load():
+def test_described_or_estimated_frame_gives_the_load():
     arrays = record(Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4))
     declared = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=SHIFT, R_SP=TURN)
     left = estimate_from_poses(*arrays, GRAVITY_W, p_SoPo_S=None, R_SP=None)
@@ -247,7 +258,7 @@ def test_a_frame_that_is_declared_or_left_to_the_data_gives_the_load():
     np.testing.assert_allclose(left.frame.p_SoPo_S, SHIFT, atol=1e-3)
 
 
-def test_a_contact_and_a_knock_are_left_out():
+def test_contact_and_impact_are_rejected():
     t, wrench, poses = record(Kind(seed=5))
     touched = wrench.copy()
     push = (t > 7.0) & (t < 9.5)
@@ -255,14 +266,14 @@ def test_a_contact_and_a_knock_are_left_out():
     touched[(t > 15.0) & (t < 15.02)] += 40.0
     found = estimate_from_poses(t, touched, poses, GRAVITY_W)
     inside = (found.t > 7.1) & (found.t < 9.4)
-    assert found.rejected[inside].mean() > 0.8  # where the sine is zero nothing acts
+    assert found.rejected[inside].mean() > 0.8  # no disturbance where the sine is zero
     assert found.rejected[(found.t > 15.0) & (found.t < 15.02)].all()
     assert found.rejected.mean() < 0.2
     assert np.abs(deviations(found)).max() < 3.5
 
 
-def test_two_fifths_of_the_record_are_lost():
-    """In ten pieces of 0.8 s, so that the taper has twenty edges: they must not hold the delay."""
+def test_load_is_estimated_with_40_percent_of_the_record_excluded():
+    """Ten pieces of 0.8 s give twenty edges, which must not bias the delay."""
     t, wrench, poses = record(Kind(seed=13))
     found = estimate_from_poses(t, wrench, poses, GRAVITY_W, lost=(t % 2.0) < 0.8)
     assert found.delay_s == pytest.approx(LATE, abs=5 * found.delay_deviation)
@@ -271,12 +282,13 @@ def test_two_fifths_of_the_record_are_lost():
     assert np.sqrt(found.covariance[6, 6]) < 2e-3
 
 
-def test_signals_move_behind_a_chopped_taper_and_their_rates_are_theirs():
+def test_fixed_taper_keeps_its_place_when_the_delay_changes():
     t, wrench, poses = record(Kind(seed=1))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
-    taper = taper_without(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
+    taper = exclude_from_taper(end_taper(grid.t, 0.3, SECONDS - 0.3), (grid.t % 2.0) < 0.8, grid.dt)
     spectra, there = (
-        spectra_of(splines, grid, taper, GRAVITY_W, delay, 20.0) for delay in (LATE, LATE + 0.03)
+        Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, delay)
+        for delay in (LATE, LATE + 0.03)
     )
     moved, slight = spectra.at(LATE + 0.03), spectra.at(LATE + 1e-5)
     size = np.abs(spectra.signals).max(axis=0)
@@ -284,16 +296,16 @@ def test_signals_move_behind_a_chopped_taper_and_their_rates_are_theirs():
     rates = (slight.signals - spectra.signals) / 1e-5
     expected = moments(spectra.signals, spectra.wrench, spectra.of, rates)
     scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
-    scale[:, 22], scale[:, :, 22] = np.inf, np.inf  # the constant has no rate
+    scale[:, 22], scale[:, :, 22] = np.inf, np.inf  # the constant has zero derivative
     np.testing.assert_allclose(spectra.moments() / scale, expected / scale, atol=2e-3)
 
 
-def test_weights_of_a_poor_start_do_not_stay():
-    """With 1 mm and 1 mrad the upper bands are all noise: from zero they would keep all weight."""
+def test_weights_recover_from_a_poor_start():
+    """With 1 mm and 1 mrad the upper bands contain only noise."""
     t, wrench, poses = record(Kind(place=1e-3, turn=1e-3, seed=1))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
     zeta = splines.signals(grid.t + LATE, GRAVITY_W)
     Q = noise_moments(splines, grid, taper, zeta, spectra.of, splines.noise())
     start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
@@ -304,67 +316,67 @@ def test_weights_of_a_poor_start_do_not_stay():
     assert np.abs(fit.state.theta[6] - PHI[0]) < 4 * np.sqrt(fit.covariance[6, 6]) < 0.01
 
 
-def test_coloured_noise_does_not_choose_the_finest_knots():
+def test_coloured_noise_does_not_select_the_finest_knots():
     kind = Kind(place=3e-4, turn=6e-4, rate=250.0, colour=0.95, seed=6)
-    assert estimated(kind).spacing >= 0.05
+    assert estimate(kind).spacing >= 0.05
 
 
-def seen_in(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> ReadOff:
+def figures_of(wrench_of_S: np.ndarray, poses: Poses, t: np.ndarray) -> ReadOff:
     grid, splines = Grid.of(t, wrench_of_S), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    return read_off(spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0).fit())
+    return read_off(Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE).fit())
 
 
 def test_units_axes_and_sign_are_read_off():
     t, wrench, poses = record(Kind(seed=7))
-    seen = seen_in(wrench, replace(poses, position=1000.0 * poses.position), t)
+    seen = figures_of(wrench, replace(poses, position=1000.0 * poses.position), t)
     assert seen.kappa == pytest.approx(1e-3, abs=5 * seen.kappa_deviation)
     assert seen.kappa_deviation < 2e-5
     np.testing.assert_allclose(seen.masses, 1.7, atol=5 * seen.deviation)
-    seen = seen_in(wrench[:, [1, 0, 2, 4, 3, 5]], poses, t)
+    seen = figures_of(wrench[:, [1, 0, 2, 4, 3, 5]], poses, t)
     assert seen.usable and seen.mirrored and seen.oblique_deg < 0.5
     np.testing.assert_array_equal(seen.permutation, [[0, 1, 0], [1, 0, 0], [0, 0, 1]])
     assert seen.kappa == pytest.approx(1.0, abs=5 * seen.kappa_deviation)
-    np.testing.assert_array_equal(seen_in(-wrench, poses, t).permutation, -np.eye(3))
+    np.testing.assert_array_equal(figures_of(-wrench, poses, t).permutation, -np.eye(3))
 
 
-def test_gravity_that_stays_in_a_plane_is_no_use_for_axes_but_for_the_unit():
-    """The known motion turns about z and x only, so that S has no gravity along x."""
+def test_planar_gravity_determines_the_unit_but_not_the_axes():
+    """The known motion rotates about z and x only, so that gravity in S has no x component."""
     t, _, poses = record(Kind(seed=7))
     true = motion_at(t)
     s = true.specific_force + np.einsum("nji,j->ni", true.R_WS, GRAVITY_W - DOWN)
     noise = 0.01 * np.random.default_rng(7).normal(size=(len(t), 6))
     grid = Grid.of(t, non_contact_wrench(s, true.omega, true.alpha, PHI) + noise)
     splines, taper = PoseSplines(poses.continued(), 0.1), end_taper(t[::2], 0.3, SECONDS - 0.3)
-    seen = read_off(spectra_of(splines, grid, taper, DOWN, LATE, 20.0).fit())
+    seen = read_off(Window(grid, taper, DOWN, 20.0).spectra(splines, LATE).fit())
     assert not seen.usable
     assert seen.kappa == pytest.approx(1.0, abs=0.02)
 
 
-def test_gains_that_are_wrong_are_a_misfit_and_those_stated_are_in_the_deviations():
+def test_gain_errors_cause_a_misfit_unless_they_are_stated():
     found = estimate_from_poses(*record(Kind(gain=0.01, seed=8)), GRAVITY_W, gain=0.01)
     assert not found.fit.rigid and found.fit.one_weight
     assert np.abs(deviations(found)).max() < 4.0
     assert np.sqrt(found.covariance[6, 6]) == pytest.approx(0.02, rel=0.5)
-    # What is stated is in the deviations once: it does not enlarge those by noise as well.
+    # Stated gain errors enter the deviations only once.
     assert found.fit.explained and found.fit.inflation == 1.0
     assert replace(found.fit, misfit_of_gains=0.0).inflation > 3.0
 
 
 @pytest.mark.slow
-def test_gains_explain_no_more_than_is_stated():
+def test_stated_gains_explain_only_their_share():
     kind = Kind(gain=0.01, seed=8)
     assert not estimate_from_poses(*record(kind), GRAVITY_W, gain=0.001).fit.explained
     turned = Kind(p_SoPo_S=tuple(SHIFT), turned=True, seed=4)
     assert not estimate_from_poses(*record(turned), GRAVITY_W, gain=0.01).fit.explained
 
 
-def test_gains_enter_as_they_move_the_estimate():
-    """One gain that is wrong moves what is estimated by a column of what enters the covariance."""
+def test_gain_effects_predict_the_change_of_the_estimate():
+    """One gain error changes the estimate by one column of the effects."""
     t, wrench, poses = record(Kind(seed=9))
     grid, splines = Grid.of(t, wrench), PoseSplines(poses.continued(), 0.1)
     taper = end_taper(grid.t, 0.3, SECONDS - 0.3)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
     Z, levels, free = spectra.moments(), Levels.flat(spectra.of), np.ones(23, bool)
     none, start = np.zeros_like(Z), State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
     power = spectra.fit().power
@@ -379,27 +391,27 @@ def test_gains_enter_as_they_move_the_estimate():
         np.testing.assert_allclose(moved / size[:16], effects[:16, d, k] / size[:16], atol=0.1)
 
 
-def test_channels_that_wander_are_told_and_weigh_less_where_they_do():
-    """Two of six, as random walks whose power is that of the white noise at 1.6 Hz."""
+def test_wandering_channels_are_found_and_get_less_weight():
+    """Two of six channels are random walks that equal the white noise at 1.6 Hz."""
     t, wrench, poses = record(Kind(seed=12))
     walk = np.cumsum(np.random.default_rng(12).normal(size=(len(t), 6)), axis=0)
     both, step = np.repeat([0.1, 0.004], 3), 2.0 * np.pi * 1.6 / 200.0
     wrench = wrench + walk * both * step * np.array([0, 0, 1, 1, 0, 0])
     grid, taper = Grid.of(t, wrench), end_taper(t[::2], 0.3, SECONDS - 0.3)
     splines = PoseSplines(poses.continued(), 0.1)
-    spectra = spectra_of(splines, grid, taper, GRAVITY_W, LATE, 20.0)
-    levels = wandering(spectra.moments(), spectra.of)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(splines, LATE)
+    levels = fit_levels(spectra.moments(), spectra.of)
     at = spectra.of.sums(spectra.of.frequency) / spectra.of.sizes
     corner = np.sqrt(levels.shape - 1.0)[5] * at[5]
     assert (corner[[2, 3]] > 0.7).all() and (corner[[2, 3]] < 3.3).all()
     np.testing.assert_array_equal(corner[[0, 1, 4, 5]], 0.0)
-    power = saturated(spectra.moments(), levels).power
+    power = fit_linear_model(spectra.moments(), levels).power
     assert (power[0, 2:4] > 30.0 * power[-1, 2:4]).all()
     assert (np.diff(power[levels.group == 0, 2]) < 0.0).all()
 
 
-def test_deviations_count_that_the_weights_are_estimated():
-    """One offset in white noise in four groups of alike weight: Meier's factor in closed form."""
+def test_deviations_include_estimated_weights():
+    """One offset in white noise in four groups of similar weight: Meier's factor in closed form."""
     n, power = 10.0, 0.3
     levels = Levels(np.full(4, n), np.arange(4), np.ones((4, 6)))
     Z = np.zeros((4, 38, 38))
@@ -407,7 +419,7 @@ def test_deviations_count_that_the_weights_are_estimated():
     for c in range(6):
         Z[:, 16 + c, 16 + c] = n * power
     start = State(np.zeros(16), 0.0, np.zeros(3), np.eye(3))
-    best = saturated(Z, levels)
+    best = fit_linear_model(Z, levels)
     fit = fit_rigid(Z, np.zeros_like(Z), levels, start, np.arange(23) == 0, best)
     level = power * n / (n - 0.5 / 4)
     variance = level / (2 * 4 * n) * (1 + 4 * 4 * (1 / 4) * (3 / 4) / (2 * n))
@@ -415,11 +427,11 @@ def test_deviations_count_that_the_weights_are_estimated():
 
 
 @pytest.mark.slow
-def test_a_clock_that_runs_away_costs_nothing():
-    """By 0.2 ms a second, over 20 s; the delay is that in the middle."""
+def test_clock_rate_of_the_poses_is_corrected():
+    """The clock drifts by 0.2 ms/s over 20 s; the delay is that at mid-record."""
     t, wrench, poses = record(Kind())
     late = Poses(1.0002 * (poses.t + 50.0) - 50.0, poses.position, poses.quaternion)
-    found, plain = estimate_from_poses(t, wrench, late, GRAVITY_W), estimated(Kind())
+    found, plain = estimate_from_poses(t, wrench, late, GRAVITY_W), estimate(Kind())
     assert plain.clock_rate == 0.0
     assert found.clock_rate == pytest.approx(2e-4, abs=1e-5)
     assert found.delay_s == pytest.approx(LATE + 2e-4 * (50.0 + 10.0), abs=2e-4)
@@ -427,43 +439,47 @@ def test_a_clock_that_runs_away_costs_nothing():
     assert np.abs(deviations(found)).max() < 3.5
 
 
-def test_a_delay_that_is_given_stays():
+def test_given_delay_is_kept():
     found = estimate_from_poses(*record(Kind(seed=1)), GRAVITY_W, delay=LATE)
     assert found.delay_s == LATE
     assert found.delay_deviation == 0.0
 
 
-def test_best_delay_is_found_from_afar():
+def test_best_delay_is_found_from_a_distant_start():
     t, wrench, poses = record(Kind(seed=10))
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.05, 20.0)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
+        PoseSplines(poses.continued(), 0.07), -0.05
+    )
     assert best_delay(spectra, 0.1)[0] == pytest.approx(LATE, abs=2e-3)
 
 
 @pytest.mark.parametrize("chopped", [False, True])
-def test_delays_are_tried_together_as_one_by_one(chopped):
+def test_costs_of_many_delays_equal_single_costs(chopped):
     t, wrench, poses = record(Kind(seed=10))
     grid = Grid.of(t, wrench)
     taper = end_taper(grid.t, 0.5, SECONDS - 0.5)
-    taper = taper_without(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
-    spectra = spectra_of(PoseSplines(poses.continued(), 0.07), grid, taper, GRAVITY_W, -0.02, 20.0)
-    assert spectra.chopped is chopped
+    taper = exclude_from_taper(taper, chopped & (np.abs(grid.t - 5.0) < 0.3), grid.dt)
+    spectra = Window(grid, taper, GRAVITY_W, 20.0).spectra(
+        PoseSplines(poses.continued(), 0.07), -0.02
+    )
+    assert spectra.taper_fixed is chopped
     delays = np.array([-0.05, -0.02, LATE])
     alone = [spectra.at(delay).fit().cost for delay in delays]
     np.testing.assert_allclose(spectra.costs(delays), alone, rtol=1e-9)
 
 
-def test_a_taper_is_zero_where_lost_and_has_edges():
+def test_exclude_sets_the_taper_to_zero_with_edges():
     taper = end_taper(np.arange(1000) / 100, 0.0, 10.0)
     lost = np.zeros(1000, bool)
     lost[500] = True
-    cut = taper_without(taper, lost, 0.01)
+    cut = exclude_from_taper(taper, lost, 0.01)
     assert cut[500] == 0.0 and cut[490] == pytest.approx(0.5, abs=0.01) and cut[475] == 1.0
     assert taper[0] == 0.0 and taper[500] == 1.0
 
 
-def test_too_little_in_common_is_an_error():
+def test_too_little_overlap_raises_error():
     t, wrench, poses = record(Kind(seed=1))
     with pytest.raises(DrakeTeleopError, match="too little in common"):
         estimate_from_poses(t + 100.0, wrench, poses, GRAVITY_W)

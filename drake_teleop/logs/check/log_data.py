@@ -14,7 +14,8 @@ from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread
 from drake_teleop.logs.read.description import Description, Time
-from drake_teleop.logs.read.reading import MINIMUM_SAMPLES, read_description
+from drake_teleop.logs.read.reading import read_description
+from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
 _RATE = 100.0

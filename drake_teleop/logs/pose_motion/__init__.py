@@ -1,1 +1,1 @@
-"""The load from a wrench and the poses of a frame near the sensor, which may be noisy."""
+"""Load, delay and pose frame from a wrench and noisy poses (docs/theory.md)."""

@@ -1,15 +1,8 @@
-"""The load, the delay and the pose's frame from a wrench and poses: the whole estimate.
+"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md).
 
-1. Splines with knots of a middle distance; a first delay; stretches in which something else acts;
-   the rate of the poses' clock (`clock_rate`).
-2. Distance of the knots, delay, and whether an IMU is asked too (`aid`), by the wrench
-   (`saturated`), then splines of all poses.
-3. What the saturated model says (`read_off`), and a rigid load twice: with the frame as described,
-   and with the transform between pose and sensor free (`rigid`).
-
-A record longer than `SEARCHED` is searched in its liveliest part only, and fitted as a whole.
-Where the load is known (`motion_of_load`) the wrench that it explains best takes the saturated
-model's place: short records and slow motions do, which do not show 16 coefficients.
+1. Initial knots and delay, disturbances and clock rate, from at most `SEARCHED_S` seconds.
+2. Knot distance, delay and use of an IMU with the least cost.
+3. Rigid load, with the frame as described and with the frame free.
 """
 
 from __future__ import annotations
@@ -24,12 +17,22 @@ from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.logs.pose_motion.aid import aid_of
 from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
-from drake_teleop.logs.pose_motion.noise import noise_moments
+from drake_teleop.logs.pose_motion.imu_rows import compare_imu
+from drake_teleop.logs.pose_motion.linear_model import (
+    MAX_DELAY_CHANGE_S,
+    Spectra,
+    Window,
+    averaged_splines,
+    choose_spacing,
+    delay_deviation,
+    fit_levels,
+    fit_linear_model,
+    guess_spacing,
+)
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.pose_motion.read_off import ReadOff, read_off
-from drake_teleop.logs.pose_motion.rejection import disturbed
+from drake_teleop.logs.pose_motion.rejection import find_disturbances
 from drake_teleop.logs.pose_motion.rigid import (
     LEVER,
     LOAD,
@@ -39,79 +42,71 @@ from drake_teleop.logs.pose_motion.rigid import (
     State,
     fit_rigid,
 )
-from drake_teleop.logs.pose_motion.saturated import (
-    REACH,
-    Spectra,
-    best_spacing,
-    delay_deviation,
-    first_guess,
-    for_search,
-    saturated,
-    spectra_of,
-    wandering,
+from drake_teleop.logs.pose_motion.spectra import (
+    MAX_FREQUENCY_HZ,
+    Grid,
+    end_taper,
+    exclude,
+    noise_moments,
 )
-from drake_teleop.logs.pose_motion.spectra import TOP, Grid, end_taper, without
-from drake_teleop.logs.pose_motion.splines import Choice, PoseSplines
+from drake_teleop.logs.pose_motion.splines import PoseSplines, SplineCache
 
-SEARCHED = 120.0
-"""Longer records are searched in a part of this length [s]."""
-SHIFT, SHIFT_KNOWN = 0.01, 0.02
-"""A lever arm is told from 10 mm on, and known if its deviation is below 20 mm [m]."""
-TURNED_DEG, TURN_KNOWN_DEG = 5.0, 1.0
-"""The same of a turn [deg]."""
-_WALD, _DEVIATIONS = 50.0, 5.0
+SEARCHED_S = 120.0
+"""Length of the searched part of a record [s]."""
+MIN_SHIFT, MAX_SHIFT_DEVIATION = 0.01, 0.02
+"""Least shift that is reported, and largest standard deviation of a known one [m]."""
+MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG = 5.0, 1.0
+"""The same of a rotation [deg]."""
+_MIN_WALD, _MIN_DEVIATIONS = 50.0, 5.0
 _SHARE_OF_RATE = 0.45
-# Gaps of the poses that splines cannot bridge, and how far from them accelerations are wrong [s].
-_GAP, _BESIDE = 0.1, 0.4
-_FEWEST, _FEWEST_OF_LOAD = 100, 32
-_NOTHING = 1e-3
-_UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+# Least gap that splines cannot bridge, and excluded margin beside it [s].
+_MIN_GAP_S, _GAP_MARGIN_S = 0.1, 0.4
+_MIN_INSTANTS, _MIN_INSTANTS_OF_LOAD = 100, 32
+_NEGLIGIBLE = 1e-3
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where the frame P of the poses is, from S, as far as the data tell.
+    """Estimated pose frame P relative to S.
 
     Attributes:
-        p_SoPo_S: (3,) its origin [m].
-        R_SP: (3, 3) its rotation.
-        position_deviations: (3,) standard deviations [m]; inf where nothing tells.
-        turn_deviations_deg: (3,) of a turn about the axes of S [deg].
-        wald: of the shift and turn from what was described; chi-square of 6 if there are none.
-        shifted: whether the origin is elsewhere than described.
-        turned: whether the axes are.
+        p_SoPo_S: (3,) origin [m].
+        R_SP: (3, 3) rotation.
+        position_deviations: (3,) standard deviations [m]; inf if undetermined.
+        turn_deviations_deg: (3,) about the axes of S [deg].
+        shifted: whether the origin differs from the description.
+        turned: whether the axes differ.
     """
 
     p_SoPo_S: Array
     R_SP: Array
     position_deviations: Array
     turn_deviations_deg: Array
-    wald: float
     shifted: bool
     turned: bool
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """(3,) whether each coordinate is observable."""
-        return np.asarray(self.position_deviations < SHIFT_KNOWN)
+        """(3,) whether each coordinate is determined."""
+        return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
-        """(3,) whether the turn about each axis of S is."""
-        return np.asarray(self.turn_deviations_deg < TURN_KNOWN_DEG)
+        """(3,) whether the rotation about each axis of S is determined."""
+        return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """The motion of poses, with the knots and the delay that suit a wrench best.
+    """Motion of poses, with knots and delay fitted to a wrench.
 
     Attributes:
-        splines: of the poses.
+        splines: of the poses, on the wrench's clock.
         delay_s: of the motion behind the wrench [s].
-        delay_deviation: its standard deviation [s]; inf if the record does not determine it.
-        clock_rate: by how much the poses' clock is faster than the wrench's, such as 5e-5, if that
-            shows and the delay was not given; the splines are on the clock of the wrench.
-        imu_agrees: whether an IMU beside the poses tells the same; True without one.
+        delay_deviation: standard deviation [s]; inf if undetermined.
+        clock_rate: relative rate of the poses' clock, such as 5e-5; 0 if insignificant.
+        imu_agrees: whether an IMU agrees; True without one.
     """
 
     splines: PoseSplines
@@ -122,22 +117,21 @@ class PoseMotion:
 
     @property
     def spacing(self) -> float:
-        """Distance of the knots [s]."""
         return self.splines.spacing
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate(PoseMotion):
-    """What a wrench and poses say.
+    """Load, delay and frame from a wrench and poses.
 
     Attributes:
-        fit: the load with the frame as described, or as estimated if it was left to the data.
-        frame: of the poses, from the fit in which it is free.
-        free: that fit.
-        seen: what the saturated model says.
-        t: (M,) about 100 Hz [s].
-        rejected: (M,) where something else acts than the load.
-        note: what a user has to know; mostly empty.
+        fit: load with the frame as described or estimated.
+        frame: of `free`.
+        free: fit with a free frame.
+        seen: figures of the linear model.
+        t: (M,) [s].
+        rejected: (M,) disturbed instants.
+        note: for the user; usually empty.
     """
 
     fit: RigidFit
@@ -166,69 +160,66 @@ def estimate_from_poses(
     gravity_W: ArrayLike,
     *,
     p_SoPo_S: ArrayLike | None = (0.0, 0.0, 0.0),
-    R_SP: ArrayLike | None = _UNTURNED,
+    R_SP: ArrayLike | None = _IDENTITY,
     delay: float | None = None,
     near: float = 0.0,
     gain: float = 0.0,
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Load and offsets, delay, and the frame of the poses.
+    """Estimate load, offsets, delay and pose frame.
 
     Args:
         t: (N,) evenly spaced [s].
-        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        poses: of the frame P, on the same clock but for a delay.
-        gravity_W: (3,) in the world [m/s^2].
-        p_SoPo_S: (3,) where Po is in S [m]; None: the data tell.
-        R_SP: (3, 3) how P is turned; None: the data tell.
-        delay: of the poses behind the wrench, if known [s]; None: found.
-        near: a delay that is found is within 0.25 s of this one, and a tenth of the record [s].
-        gain: standard deviation of the sensor's gains, such as 0.01; it enters the covariance.
-        lost: (N,) samples that do not count, such as bridged gaps.
-        imu: what an IMU beside the poses tells of the frame of S; taken if the wrench likes the
-            motion better with it (`aid`).
+        wrench: (N, 6) [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        poses: of P, on the same clock except for a delay.
+        gravity_W: (3,) [m/s^2].
+        p_SoPo_S: (3,) [m], or None to estimate it.
+        R_SP: (3, 3), or None to estimate it.
+        delay: of the poses behind the wrench [s], or None to estimate it.
+        near: centre of the delays searched [s].
+        gain: standard deviation of the sensor gains, such as 0.01.
+        lost: (N,) excluded samples.
+        imu: IMU data of S, used if they lower the cost.
 
     Raises:
-        DrakeTeleopError: for arrays of another shape, or if fewer than 100 instants remain.
+        DrakeTeleopError: for wrong shapes, or if fewer than 100 instants remain.
     """
     with one_blas_thread():
-        grid, poses, gravity, top = _prepared(
-            t, wrench, poses, gravity_W, near if delay is None else delay, lost, _FEWEST
+        found = _find_motion(
+            *(t, wrench, poses, gravity_W, near, delay, lost, imu), fewest=_MIN_INSTANTS
         )
-        guess = near if delay is None else delay
-        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
-        splines, late = chosen.splines, chosen.last.delay
-        base = _base_taper(grid, splines.poses, lost, late)
-        spectra = spectra_of(splines, grid, base, gravity, late, top)
-        rejected, note = disturbed(spectra, grid, base, splines.spacing)
-        taper = without(base, rejected, grid.dt)
-        spectra = spectra_of(splines, grid, taper, gravity, late, top)
+        splines, late, grid = found.splines, found.last.delay, found.window.grid
+        window = replace(found.window, taper=_base_taper(grid, splines.poses, lost, late))
+        spectra = window.spectra(splines, late)
+        rejected, note = find_disturbances(spectra, splines.spacing)
+        window = replace(window, taper=exclude(window.taper, rejected, grid.dt))
+        spectra = window.spectra(splines, late)
         Z = spectra.moments()
         Q = noise_moments(splines, grid, spectra.taper, spectra.zeta, spectra.of, splines.noise())
-        levels = wandering(Z, spectra.of)
-        best = saturated(Z, levels)
+        levels = fit_levels(Z, spectra.of)
+        best = fit_linear_model(Z, levels)
 
         def fitted(start: State, free: NDArray[np.bool_]) -> RigidFit:
             return fit_rigid(Z, Q, levels, start, free, best, gain=gain)
 
         seen = read_off(best)
         start = _start(p_SoPo_S, R_SP, seen)
-        fixed = np.ones(PARAMETERS, bool)
-        fixed[16] = delay is None
-        fixed[LEVER], fixed[TURN] = p_SoPo_S is None, R_SP is None
-        fit = fitted(start, fixed)
-        everything = np.ones(PARAMETERS, bool)
-        everything[16] = delay is None
-        free = fit if (fixed == everything).all() else fitted(_freed(fit, start, seen), everything)
+        fit_free = np.ones(PARAMETERS, bool)
+        fit_free[16] = delay is None
+        fit_free[LEVER], fit_free[TURN] = p_SoPo_S is None, R_SP is None
+        fit = free = fitted(start, fit_free)
+        if p_SoPo_S is not None or R_SP is not None:
+            with_frame = fit_free | (np.arange(PARAMETERS) > 16)
+            free = fitted(_free_start(fit, start, seen), with_frame)
         return PoseEstimate(
             splines=splines,
             delay_s=spectra.delay + fit.state.tau,
             delay_deviation=float(np.sqrt(min(x.covariance[16, 16] for x in (fit, free)))),
-            clock_rate=chosen.rate,
-            imu_agrees=chosen.agrees,
+            clock_rate=found.rate,
+            imu_agrees=found.agrees,
             fit=fit,
-            frame=_frame(free, start),
+            frame=_estimate_frame(free, start),
             free=free,
             seen=seen,
             t=grid.t,
@@ -248,116 +239,98 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """The motion with which an identified load explains a wrench best, contacts left out.
+    """Return the motion with which a load (6, 16) of `load_coefficients` fits a wrench best.
 
-    Args:
-        t, wrench, poses, gravity_W, delay, lost, imu: as of `estimate_from_poses`, P being S.
-        load: (6, 16) as of `load_coefficients`.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape, or if fewer than 32 instants remain.
+    Other arguments are those of `estimate_from_poses`, for P = S. Raises an error for wrong shapes,
+    or if fewer than 32 instants remain.
     """
     with one_blas_thread():
-        guess = 0.0 if delay is None else delay
-        prepared = _prepared(t, wrench, poses, gravity_W, guess, lost, _FEWEST_OF_LOAD, load)
-        grid, poses, gravity, top = prepared
-        chosen = _chosen(grid, poses, lost, gravity, guess, top, known=delay is not None, imu=imu)
+        found = _find_motion(
+            *(t, wrench, poses, gravity_W, 0.0, delay, lost, imu),
+            fewest=_MIN_INSTANTS_OF_LOAD,
+            load=load,
+        )
         return PoseMotion(
-            splines=chosen.splines,
-            delay_s=chosen.last.delay,
-            delay_deviation=0.0 if delay is not None else delay_deviation(chosen.last),
-            clock_rate=chosen.rate,
-            imu_agrees=chosen.agrees,
+            splines=found.splines,
+            delay_s=found.last.delay,
+            delay_deviation=0.0 if delay is not None else delay_deviation(found.last),
+            clock_rate=found.rate,
+            imu_agrees=found.agrees,
         )
-
-
-def _prepared(
-    t: ArrayLike,
-    wrench: ArrayLike,
-    poses: Poses,
-    gravity_W: ArrayLike,
-    delay: float,
-    lost: NDArray[np.bool_] | None,
-    fewest: int,
-    load: Array | None = None,
-) -> tuple[Grid, Poses, Array, float]:
-    """The grid, the poses with continuous signs, gravity (3,) and the highest frequency [Hz]."""
-    t = checked("t", t, np.size(t))
-    wrench = checked("wrench", wrench, len(t), 6)
-    gravity = checked("gravity_W", gravity_W, 3)
-    grid, poses = Grid.of(t, wrench, load), poses.continued()
-    if (_base_taper(grid, poses, lost, delay) > 0.5).sum() < fewest:
-        raise DrakeTeleopError(
-            "wrench and poses have too little in common",
-            remedy="record longer, without interruptions",
-        )
-    top = min(TOP, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
-    return grid, poses, gravity, top
 
 
 @dataclass(frozen=True, eq=False)
-class _Chosen:
-    """Splines of all poses; spectra of the part that was searched, with the delay; the rate of the
-    poses' clock; and whether an IMU agrees."""
+class _FoundMotion:
+    """Splines of all poses, and the spectra and window of the record that determined them."""
 
     splines: PoseSplines
     last: Spectra
+    window: Window
     rate: float
     agrees: bool
 
 
-def _chosen(
-    grid: Grid,
+def _find_motion(
+    t: ArrayLike,
+    wrench: ArrayLike,
     poses: Poses,
+    gravity_W: ArrayLike,
+    near: float,
+    delay: float | None,
     lost: NDArray[np.bool_] | None,
-    gravity: Array,
-    delay: float,
-    top: float,
+    imu: Inertial | None,
     *,
-    known: bool,
-    imu: Inertial | None = None,
-) -> _Chosen:
-    """Splines with the knots, and spectra with the delay, that are used."""
-    part = _liveliest(grid)
-    some = replace(grid, t=grid.t[part], wrench=_rows(grid, part))
-    near = _within(poses, some)
-    few = for_search(near)
-    taper = _base_taper(grid, poses, lost, delay)[part] * end_taper(some.t, some.t[0], some.t[-1])
-    spacing, late = first_guess(few, some, taper, gravity, delay, top, known=known)
-    first = spectra_of(PoseSplines(near, spacing), some, taper, gravity, late, top)
-    clear = without(taper, disturbed(first, some, taper, spacing)[0], grid.dt)
-    rate = 0.0
-    if not known:
-        rate = clock_rate(few, some, clear, gravity, late, top, spacing)
+    fewest: int,
+    load: Array | None = None,
+) -> _FoundMotion:
+    t = checked("t", t, np.size(t))
+    wrench = checked("wrench", wrench, len(t), 6)
+    gravity = checked("gravity_W", gravity_W, 3)
+    grid, poses = Grid.of(t, wrench, load), poses.continued()
+    known, guess = delay is not None, near if delay is None else delay
+    taper = _base_taper(grid, poses, lost, guess)
+    if (taper > 0.5).sum() < fewest:
+        raise DrakeTeleopError(
+            "wrench and poses have too little in common",
+            remedy="record longer, without interruptions",
+        )
+    top = min(MAX_FREQUENCY_HZ, _SHARE_OF_RATE * poses.rate, _SHARE_OF_RATE * grid.stride / grid.dt)
+    whole = Window(grid, taper, gravity, top)
+    rows = _most_varied_part(grid)
+    part = whole.part(rows)
+    near_poses = _poses_near(poses, part.grid)
+    cache = averaged_splines(near_poses)
+    spacing, late = guess_spacing(part, cache, guess, known=known)
+    first = part.spectra(PoseSplines(near_poses, spacing), late)
+    disturbed = find_disturbances(first, spacing)[0]
+    part = replace(part, taper=exclude(part.taper, disturbed, grid.dt))
+    rate = 0.0 if known else clock_rate(part, cache, late, spacing)
     if rate:
-        near, poses = (at_rate(x, rate, some, late) for x in (near, poses))
-        few = for_search(near)
-    first_spacing, agrees = spacing, True
-    choices = [few]
+        near_poses, poses = (at_rate(x, rate, part.grid, late) for x in (near_poses, poses))
+        cache = averaged_splines(near_poses)
+    choices, agrees, imu_spacing = [cache], True, spacing
     if imu is not None:
-        aid = aid_of(PoseSplines(near, first_spacing), imu, gravity)
-        agrees = aid is not None
-        choices += [] if aid is None else [Choice(few.poses, aid)]
-    chosen, spacing, late = best_spacing(choices, some, clear, gravity, late, top, known=known)
-    aid = chosen.aid
-    if aid is not None and imu is not None and len(near.t) < len(poses.t):
-        aid = aid_of(PoseSplines(poses, first_spacing), imu, gravity)  # of the whole record
-    last = spectra_of(chosen.at(spacing), some, clear, gravity, late, top)
-    return _Chosen(PoseSplines(poses, spacing, aid), last, rate, agrees)
+        imu_rows = compare_imu(PoseSplines(near_poses, imu_spacing), imu, gravity)
+        agrees = imu_rows is not None
+        choices += [] if imu_rows is None else [SplineCache(cache.poses, imu_rows)]
+    chosen, spacing, late = choose_spacing(part, choices, late, known=known)
+    imu_rows = chosen.imu_rows
+    if imu_rows is not None and imu is not None and len(near_poses.t) < len(poses.t):
+        imu_rows = compare_imu(PoseSplines(poses, imu_spacing), imu, gravity)
+    last = part.spectra(chosen.at(spacing), late)
+    return _FoundMotion(PoseSplines(poses, spacing, imu_rows), last, whole, rate, agrees)
 
 
-def _rows(grid: Grid, part: slice) -> Array:
-    return grid.wrench[part.start * grid.stride : part.stop * grid.stride]
-
-
-def _within(poses: Poses, grid: Grid) -> Poses:
-    inside = (poses.t >= grid.t[0] - 2 * REACH) & (poses.t <= grid.t[-1] + 2 * REACH)
+def _poses_near(poses: Poses, grid: Grid) -> Poses:
+    inside = (poses.t >= grid.t[0] - 2 * MAX_DELAY_CHANGE_S) & (
+        poses.t <= grid.t[-1] + 2 * MAX_DELAY_CHANGE_S
+    )
     return Poses(poses.t[inside], poses.position[inside], poses.quaternion[inside])
 
 
-def _liveliest(grid: Grid) -> slice:
-    """The part of the record in which the wrench changes most."""
-    rows, length = len(grid.t), round(SEARCHED / grid.dt)
+def _most_varied_part(grid: Grid) -> slice:
+    """Return the part of the record in which the force changes most."""
+    rows, length = len(grid.t), round(SEARCHED_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
     starts = range(0, rows - length, length // 2)
@@ -368,7 +341,7 @@ def _liveliest(grid: Grid) -> slice:
 
 
 def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float) -> Array:
-    """(M,) without the ends, gaps of the poses, and what the caller takes away."""
+    """Return the (M,) taper without ends, gaps and `lost` samples."""
     stamps = poses.t - delay
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
@@ -378,9 +351,9 @@ def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay:
     if lost is not None:
         rows = len(grid.t) * grid.stride
         bad |= lost[:rows].reshape(-1, grid.stride).any(axis=1)
-    for k in np.flatnonzero(np.diff(stamps) > _GAP):
-        bad |= (grid.t > stamps[k] - _BESIDE) & (grid.t < stamps[k + 1] + _BESIDE)
-    return without(taper, bad, grid.dt, grid.dt)
+    for k in np.flatnonzero(np.diff(stamps) > _MIN_GAP_S):
+        bad |= (grid.t > stamps[k] - _GAP_MARGIN_S) & (grid.t < stamps[k + 1] + _GAP_MARGIN_S)
+    return exclude(taper, bad, grid.dt, grid.dt)
 
 
 def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) -> State:
@@ -391,8 +364,8 @@ def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) ->
     return State(np.zeros(16), 0.0, -R @ p, R)
 
 
-def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
-    """Where to start with the transform free: far from the described one, if the data say so."""
+def _free_start(fit: RigidFit, start: State, seen: ReadOff) -> State:
+    """Return the described frame, or that of the linear model if it differs."""
     turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
         return fit.state
@@ -400,41 +373,41 @@ def _freed(fit: RigidFit, start: State, seen: ReadOff) -> State:
     return State(np.zeros(16), fit.state.tau, R @ start.R.T @ start.r, R)
 
 
-def _frame(free: RigidFit, start: State) -> Frame:
+def _estimate_frame(free: RigidFit, start: State) -> Frame:
     R_SP, r = free.state.R.T, free.state.r
-    place = -R_SP @ r
+    origin = -R_SP @ r
     covariance = free.covariance[17:, 17:]
-    # p = -R^T r, and R exp(rho x) instead of R makes it p - rho x p.
-    jacobian = np.hstack([-R_SP, cross_matrix(place)])
+    # p = -R^T r, and R exp([rho x]) changes it to p - rho x p.
+    jacobian = np.hstack([-R_SP, cross_matrix(origin)])
     known = np.isfinite(np.diag(covariance))
     finite = np.where(known[:, None] & known, covariance, 0.0)
     deviations = np.sqrt(np.diag(jacobian @ finite @ jacobian.T))
     if not known.all():
-        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NOTHING
+        lost = np.abs(jacobian[:, ~known]).max(axis=1) > _NEGLIGIBLE
         deviations = np.where(lost, np.inf, deviations)
     moved = free.state.r - start.r
     turned = Rotation.from_matrix(start.R.T @ free.state.R).as_rotvec()
     change = np.concatenate([moved, turned])[known]
     wald = float(change @ np.linalg.solve(covariance[np.ix_(known, known)], change))
-    along, about = _along(moved, covariance[:3, :3]), _along(turned, covariance[3:, 3:])
-    shift, angle = np.linalg.norm(moved), np.linalg.norm(turned)
-    limit, sure = np.radians([TURNED_DEG, TURN_KNOWN_DEG])
-    shifted = shift > max(SHIFT, _DEVIATIONS * along) and along < SHIFT_KNOWN
-    tilted = angle > max(limit, _DEVIATIONS * about) and about < sure
+    limits = np.radians([MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG])
+    shifted = _is_significant(moved, covariance[:3, :3], MIN_SHIFT, MAX_SHIFT_DEVIATION)
+    tilted = _is_significant(turned, covariance[3:, 3:], *limits)
     return Frame(
-        p_SoPo_S=place,
+        p_SoPo_S=origin,
         R_SP=R_SP,
         position_deviations=deviations,
         turn_deviations_deg=np.degrees(np.sqrt(np.diag(covariance)[3:])),
-        wald=wald,
-        shifted=bool(wald > _WALD and shifted),
-        turned=bool(wald > _WALD and tilted),
+        shifted=bool(wald > _MIN_WALD and shifted),
+        turned=bool(wald > _MIN_WALD and tilted),
     )
 
 
-def _along(x: Array, covariance: Array) -> float:
-    """Standard deviation of the length of x; inf if a part of it is unknown."""
+def _is_significant(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
+    """Return whether the length of x is determined, and larger than `least` and its noise."""
     if not np.isfinite(np.diag(covariance)).all():
-        return np.inf
-    direction = x / (np.linalg.norm(x) + 1e-300)
-    return float(np.sqrt(direction @ covariance @ direction))
+        return False
+    length = np.linalg.norm(x)
+    direction = x / (length + 1e-300)
+    deviation = float(np.sqrt(direction @ covariance @ direction))
+    significant = length > max(least, _MIN_DEVIATIONS * deviation)
+    return bool(significant and deviation < largest_deviation)

@@ -1,4 +1,4 @@
-"""Poses of a frame in the world, as they were recorded."""
+"""Recorded poses and IMU data."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Poses:
     """Poses of a frame P in the world.
 
     Attributes:
-        t: (K,) increasing stamps [s], uneven as they may be.
+        t: (K,) increasing stamps [s], possibly uneven.
         position: (K, 3) p_WoPo_W [m].
-        quaternion: (K, 4) [w, x, y, z] of R_WP, of unit length, either sign.
+        quaternion: (K, 4) [w, x, y, z] of R_WP, unit length.
     """
 
     t: Array
@@ -29,7 +29,7 @@ class Poses:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def continued(self) -> Poses:
-        """The same with the quaternions' signs such that none turns round."""
+        """Return the poses with quaternion signs that are continuous."""
         products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
         if (products >= 0.0).all():
             return self
@@ -37,7 +37,7 @@ class Poses:
         return Poses(self.t, self.position, self.quaternion * sign[:, None])
 
     def averaged(self, count: int) -> Poses:
-        """Means of `count` poses, signs being continuous: as good for the search of the knots."""
+        """Return means of `count` poses with continuous signs, for a faster search."""
         rows = len(self.t) // count * count
         t, p, q = (
             x[:rows].reshape(-1, count, *x.shape[1:]).mean(axis=1)
@@ -48,10 +48,10 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """What an IMU tells of the same frame, at So and in its axes.
+    """IMU data of S at So, in the axes of S.
 
     Attributes:
-        t: (K,) evenly spaced but for gaps [s].
+        t: (K,) evenly spaced except for gaps [s].
         specific_force: (K, 3) [m/s^2], or None.
         angular_velocity: (K, 3) [rad/s], or None.
     """
@@ -62,11 +62,11 @@ class Inertial:
 
     @property
     def rate(self) -> float:
-        """Without the gaps [Hz]."""
+        """Rate outside of gaps [Hz]."""
         return float(1.0 / np.median(np.diff(self.t)))
 
     def averaged(self, fastest: float) -> Inertial:
-        """Means of as many rows that the rate is not below `fastest` [Hz]; none over a gap."""
+        """Return means of rows at a rate of at least `fastest` [Hz], without gaps."""
         count = max(1, int(self.rate / fastest))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
@@ -81,14 +81,14 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """The poses of a log and what else is described of them.
+    """Poses of a log with their description.
 
     Attributes:
-        poses: of the sensor's frame S, as far as the description is right.
-        gravity_W: (3,) in the world [m/s^2].
-        p_SoPo_S: (3,) where the recorded frame was said to be [m].
-        R_SP: (3, 3) how it was said to be turned.
-        imu: what an IMU beside them tells.
+        poses: of S, if the description is right.
+        gravity_W: (3,) [m/s^2].
+        p_SoPo_S: (3,) described origin of P [m].
+        R_SP: (3, 3) described rotation.
+        imu: IMU data, or None.
     """
 
     poses: Poses
@@ -98,6 +98,6 @@ class Posed:
     imu: Inertial | None = None
 
     def earlier(self, start: float) -> Posed:
-        """The same with the times since `start` [s]."""
+        """Return the record with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

@@ -1,10 +1,4 @@
-"""What the saturated model says of units, axes and frames, before any load is assumed.
-
-Force over acceleration, M_a, and over minus gravity, M_g, are both the mass times the rotation from
-P to S, if all is as described. Their ratio is the unit of the positions; the polar factor of M_g is
-R_SP, mirrored if axes are; and its singular values are the mass three times, whose spread is an
-error of gains.
-"""
+"""Units, axes and masses from the coefficients of the linear model, before any load is assumed."""
 
 from __future__ import annotations
 
@@ -13,30 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.saturated import Saturated
+from drake_teleop.logs.pose_motion.linear_model import LinearFit
 
-_ROUNDS = 5
+_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ReadOff:
-    """Figures of the saturated model.
+    """Figures of the linear model.
 
     Attributes:
-        kappa: force over acceleration, by force over gravity: 1 where the positions are in the unit
-            that is described; 1e-3 where they are in mm and said to be in m.
-        kappa_deviation: its standard deviation; inf if nothing accelerates or turns.
+        kappa: unit error of position; 1e-3 for mm described as m.
+        kappa_deviation: its standard deviation; inf if undetermined.
         gravity_force: (3, 3) M_g [kg].
-        deviation: the largest standard deviation of its entries [kg]; inf if the orientation does
-            not change enough.
-        R_SP: (3, 3) its polar factor; of determinant -1 where an axis is mirrored, or the sign.
-        masses: (3,) its singular values [kg].
-        permutation: (3, 3) its nearest matrix of one 1 or -1 in each row and column.
-        oblique_deg: the angle between `R_SP` and `permutation` [deg].
-        gravity_torque: (3, 3) torque over minus gravity [kg m], [h]x R_SP with h = m c.
-        turning_force: (3, 3) force over minus angular acceleration, the same if the origin of P is
-            that of S, and the units are right.
-        moment_deviations: of the lengths of the last and the one before; inf if not determined.
+        deviation: largest standard deviation of M_g [kg].
+        R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
+        masses: (3,) singular values of M_g [kg].
+        permutation: (3, 3) signed permutation nearest to R_SP.
+        oblique_deg: angle between the two [deg].
+        gravity_torque: (3, 3) torque over minus gravity [kg m].
+        turning_force: (3, 3) force over minus angular acceleration [kg m]; equal if Po is So.
+        moment_deviations: of the norms of the last and of the one before.
     """
 
     kappa: float
@@ -53,7 +44,7 @@ class ReadOff:
 
     @property
     def usable(self) -> bool:
-        """Whether the orientation changed enough for M_g to mean something: 5 % of the mass."""
+        """Whether M_g is known to 5 % of the mass."""
         return bool(self.deviation < 0.05 * self.masses.mean())
 
     @property
@@ -62,12 +53,12 @@ class ReadOff:
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
-def read_off(fit: Saturated) -> ReadOff:
-    """The figures of a fit."""
+def read_off(fit: LinearFit) -> ReadOff:
+    """Return the figures of a fit."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
-    shown = bool((variances[:3, 4:7] > 0.0).all())
+    determined = bool((variances[:3, 4:7] > 0.0).all())
     U, masses, Vt = np.linalg.svd(M_g)
     R_SP = U @ Vt
     permutation = nearest_permutation(R_SP)
@@ -76,42 +67,42 @@ def read_off(fit: Saturated) -> ReadOff:
         kappa=kappa,
         kappa_deviation=deviation,
         gravity_force=M_g,
-        deviation=float(np.sqrt(variances[:3, 4:7].max())) if shown else np.inf,
+        deviation=float(np.sqrt(variances[:3, 4:7].max())) if determined else np.inf,
         R_SP=R_SP,
         masses=masses,
         permutation=permutation,
         oblique_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
         gravity_torque=C[3:, 4:7],
         turning_force=-C[:3, 7:10],
-        moment_deviations=(_length(variances[:3, 7:10]), _length(variances[3:, 4:7])),
+        moment_deviations=(
+            _norm_deviation(variances[:3, 7:10]),
+            _norm_deviation(variances[3:, 4:7]),
+        ),
     )
 
 
-def _length(variances: Array) -> float:
+def _norm_deviation(variances: Array) -> float:
     return float(np.sqrt(variances.sum())) if (variances > 0.0).all() else np.inf
 
 
 def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[float, float]:
-    """kappa of a = kappa g, (3, 3) both, and its standard deviation.
-
-    Entries weigh as they are known: gravity that stays in a plane says nothing of one column.
-    """
+    """Return kappa of a = kappa g, both (3, 3), weighted by variance, and its deviation."""
     known = (variances_a > 0.0) & (variances_g > 0.0)
     if not known.any():
         return np.nan, np.inf
     a, g, v_a, v_g = (x[known] for x in (a, g, variances_a, variances_g))
     kappa = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         weight = 1.0 / (v_a + kappa**2 * v_g)
         information = float(weight @ np.maximum(g * g - v_g, 0.0))
-        if not information > 0.0:  # gravity is not seen
+        if not information > 0.0:  # gravity is not observable
             return np.nan, np.inf
         kappa = float(weight @ (a * g)) / information
     return kappa, information**-0.5
 
 
 def nearest_permutation(R: Array) -> Array:
-    """Of the 48 matrices with one 1 or -1 in each row and column, that with the largest trace."""
+    """Return the signed permutation matrix (3, 3) with the largest trace with R."""
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(-np.abs(R))

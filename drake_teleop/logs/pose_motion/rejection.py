@@ -1,12 +1,4 @@
-"""Stretches of a record in which something else than the load acts: contacts, knocks, saturation.
-
-The saturated model (`saturated`) is fitted sample by sample, below the frequencies at which the
-splines begin to miss the motion (a move that starts with a jerk is no knock), first with Huber's
-weights, then without what is more than 4.5 robust standard deviations away in some channel, until
-the same samples are left, as the robust method of `load.batch.methods` does with a load. It has no
-opinion on frames, units or axes: a wrong description is not taken for a contact. What is left out
-is widened to stretches, and the taper falls to zero beside them.
-"""
+"""Detection of disturbances: contacts, impacts and saturation (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -14,78 +6,71 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.saturated import ROUNDING, Spectra
+from drake_teleop.logs.pose_motion.linear_model import ROUNDING, Spectra
 from drake_teleop.logs.pose_motion.spectra import Grid, distance
-from drake_teleop.logs.pose_motion.splines import ACCELERATED
+from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS
 
 NOTHING_REJECTED = (
-    "the residual is large where the load moves and small where it rests, so that disturbances"
-    " cannot be told from errors of the motion: no sample was rejected"
+    "the residual is large where the load moves and small where it rests, so disturbances"
+    " cannot be distinguished from errors of the motion: no sample was rejected"
 )
-_HUBER, _REJECT, _FITS = 3.0, 4.5, 30
+_HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS = 3.0, 4.5, 30
 _NORMAL_MAD = 1.4826
-_MOST_LOSS = 2.5
-_PASSED = 0.3
-_MARGIN = 0.1
-"""On either side of what is rejected, or the knots' distance [s]."""
+_MAX_LOSS = 2.5
+_PASSED_SHARE = 0.3
+_MIN_MARGIN_S = 0.1
+"""Least margin of a rejected stretch [s]."""
 
 
-def disturbed(
-    spectra: Spectra, grid: Grid, taper: Array, spacing: float
-) -> tuple[NDArray[np.bool_], str]:
-    """(M,) where something else acts, and what a user has to know of it.
+def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
+    """Return (M,) flags of disturbed instants, and a note for the user.
 
-    Nothing is rejected if that raises some standard deviation of the coefficients 2.5 times as much
-    as the loss of as many samples at random would: then it is the motion that is rejected. Of an
-    identified load only the offsets are fitted, and its inertial force takes the coefficients'
-    place in this.
-
-    Args:
-        spectra: of the record with this taper, which knows nothing of disturbances.
-        grid, taper: as in `spectra_of`.
-        spacing: distance of the splines' knots [s].
+    For an identified load only the offsets are fitted.
     """
-    # Half of the amplitude passes at this share of 1 / h; a Gauss curve does not ring.
-    gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED) ** 2)
+    # A Gaussian gain, one half at `_PASSED_SHARE` / h, does not ring.
+    gain = 0.5 ** ((spectra.of.frequency * spacing / _PASSED_SHARE) ** 2)
+    grid = spectra.grid
     x, y = (_in_time(s * gain[:, None], grid) for s in (spectra.signals, spectra.wrench))
-    inside = taper > 0.5
+    inside = spectra.taper > 0.5
     size = np.sqrt(np.mean(x**2, axis=0))
     used = size > 1e-9 * size[0]
     if grid.load is None:
-        x = moving = x[:, used] / size[used]
+        x = test_signals = x[:, used] / size[used]
     else:
-        y, moving = y - x @ grid.load.T, x[:, ACCELERATED] @ grid.load[:3, ACCELERATED].T
-        x, moving = x[:, :1] / size[0], np.linalg.norm(moving, axis=1, keepdims=True)
+        y, test_signals = (
+            y - x @ grid.load.T,
+            x[:, MOTION_COLUMNS] @ grid.load[:3, MOTION_COLUMNS].T,
+        )
+        x, test_signals = x[:, :1] / size[0], np.linalg.norm(test_signals, axis=1, keepdims=True)
     weights = inside.astype(float)
-    for _ in range(_FITS):
+    for _ in range(_MAX_FITS):
         before = weights
         distances = _distances(x, y, weights, inside)
-        weights = inside * np.minimum(1.0, _HUBER / np.maximum(distances, _HUBER))
+        weights = inside * np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
         if np.abs(weights - before).max() < 0.01:
             break
     rejected = np.zeros(len(x), bool)
-    for _ in range(_FITS):
-        last, rejected = rejected, _distances(x, y, weights, inside) > _REJECT
+    for _ in range(_MAX_FITS):
+        last, rejected = rejected, _distances(x, y, weights, inside) > _REJECTION_LIMIT
         weights = (inside & ~rejected).astype(float)
         if (rejected == last).all() or weights.sum() < 2 * x.shape[1]:
             break
     if not rejected.any():
         return rejected, ""
-    rejected = distance(rejected) * grid.dt <= max(_MARGIN, spacing)
-    if _loss(moving, inside, inside & ~rejected) > _MOST_LOSS:
+    rejected = distance(rejected) * grid.dt <= max(_MIN_MARGIN_S, spacing)
+    if _information_loss(test_signals, inside, inside & ~rejected) > _MAX_LOSS:
         return np.zeros(len(x), bool), NOTHING_REJECTED
     return rejected, ""
 
 
 def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
-    """(M, k) of spectra (K, k), what is above them left out."""
     full = np.zeros((grid.length // 2 + 1, spectrum.shape[1]), np.complex128)
     full[: len(spectrum)] = spectrum
     return np.asarray(np.fft.irfft(full, grid.length, axis=0)[: len(grid.t)])
 
 
 def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
-    """(M,) largest residual of a sample's channels over the channel's robust deviation."""
+    """Return (M,) largest ratio of residual to robust deviation over the channels."""
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
@@ -94,8 +79,8 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
     return np.asarray((residual / np.maximum(scale, ROUNDING * rms + 1e-30)).max(axis=1))
 
 
-def _loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    """By how much more the deviation of some coefficient grows than by fewer samples alone."""
+def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
+    """Return the largest growth of a deviation, relative to random loss of as many samples."""
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     every, some = (

@@ -1,32 +1,6 @@
-"""A rigid load, the delay and the transform between the pose's frame and the sensor's, at once.
+"""Rigid load, delay and transform between pose frame and sensor, Eqs. (T78) to (T81).
 
-The frame P of the poses and S of the sensor are fixed to each other. With R = R_PS, r = p_PoSo_P,
-and A r = alpha x r + omega x (omega x r), the sensor's motion is
-
-    s = R^T (a_P - g_P + A r),   alpha = R^T alpha_P,   omega omega^T = R^T (omega omega^T)_P R,
-
-so that z of `load.batch.moments` is linear in the signals of P, z = M(R, r) y, and moments of y are
-all that is needed: the residual of the wrench is e = L(theta) M(R, r) y. Unknown are theta =
-[offsets; phi] (16), the delay tau, r, and a small turn rho of R. Gauss-Newton with the columns
-
-    de/dtheta_j = -T_j M y,   de/dr_i = L dM/dr_i y,   de/drho_i = L dM/drho_i y,
-    de/dtau = L M dy/dt,
-
-on moments that are compensated for the noise Q of the poses (`noise`), which leaves the errors of
-the wrench alone: errors in variables, band by band. The weights are the inverse of
-
-    R_b = P_b + diag(power of the residual's rest, at least 10 % of all),   P_b = L M Q_b (L M)^T,
-
-renewed in every step: P_b is known band by band, the rest has a level for each group of bands
-(`levels`), from the powers of its numbers less the parameters that they pay for. Why r and R can
-be told: the torque at rest gives m c about So, the force in motion m (r + R c) about Po; and
-f = m R^T s shows R by gravity.
-
-The covariance counts that the weights are estimated and what a stated error of the sensor's gains
-would do. It is enlarged by what no rigid load explains: twice the difference of the log likelihoods
-to the saturated model is a chi-square with as many degrees of freedom as that has more parameters,
-if the model holds. If it is far from it the higher bands, which rest on accelerations, must not
-decide: one weight for all bands.
+Gauss-Newton on second moments that are compensated for noise of the poses.
 """
 
 from __future__ import annotations
@@ -41,25 +15,24 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.batch.covariance import ARM, gain_effects
 from drake_teleop.load.batch.moments import coefficients
-from drake_teleop.logs.pose_motion.levels import Levels
-from drake_teleop.logs.pose_motion.saturated import Saturated, least_power
-from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH
-from drake_teleop.logs.pose_motion.splines import GRAVITY, SIGNALS
+from drake_teleop.logs.pose_motion.linear_model import LinearFit, least_power
+from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
+from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
 
 PARAMETERS = 23
 """[offsets; phi] (16), tau, r (3), rho (3)."""
 LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
 _STEPS, _CONVERGED = 40, 1e-4
-_RIGID, _BY_GAINS, _NOISE = 4.0, 1.5, 1.5
-_LIMITS = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
-_LEAST_SHARE = 0.1
-_SMALL = 1e-4  # rad, of a numerical derivative
-_RANK = 1e-12
+_MAX_RIGID_RATIO, _GAIN_ALLOWANCE, _NOISE_RATIO = 4.0, 1.5, 1.5
+_MAX_STEP = np.repeat([np.inf, 0.03, 0.3, 0.6], [16, 1, 3, 3])
+_MIN_REST_SHARE = 0.1
+_ROTATION_STEP = 1e-4  # rad, step of a numerical derivative
+_RANK_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is estimated: theta (16), tau [s], r (3) [m], R_PS (3, 3)."""
+    """Parameters: theta (16), tau [s], r = p_PoSo (3) [m], R_PS (3, 3)."""
 
     theta: Array
     tau: float
@@ -69,16 +42,16 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """A fit and how good it is.
+    """Fit of a rigid load.
 
     Attributes:
-        state: the estimate; its tau is on top of the delay that the moments were made with.
-        covariance: (23, 23) of [theta, tau, r, rho], rho in the axes of S; inf on the diagonal, 0
-            beside it, of what is undetermined; 0 of what was not free.
-        misfit: twice the log likelihood ratio to the saturated model.
-        degrees: what it would be for a rigid load.
-        misfit_of_gains: what errors of gains as large as stated would add to that.
-        one_weight: whether all bands had the same.
+        state: estimate; tau is relative to the delay of the moments.
+        covariance: (23, 23) of [theta, tau, r, rho], rho in the axes of S; inf on the diagonal if
+            undetermined, 0 if not free.
+        misfit: log likelihood ratio to the linear model (times 2).
+        degrees: expected misfit.
+        misfit_of_gains: expected increase by stated gain errors.
+        one_weight: whether all bands had one weight.
     """
 
     state: State
@@ -90,26 +63,25 @@ class RigidFit:
 
     @property
     def rigid(self) -> bool:
-        """Whether a rigid load explains the wrench: the misfit is below four times its degrees."""
-        return self.misfit < _RIGID * self.degrees
+        """Whether the misfit is below four times its degrees of freedom."""
+        return self.misfit < _MAX_RIGID_RATIO * self.degrees
 
     @property
     def explained(self) -> bool:
-        """Whether a rigid load and gains as wrong as stated do."""
-        return self.misfit < _RIGID * self.degrees + _BY_GAINS * self.misfit_of_gains
+        """Whether a rigid load with the stated gain errors explains the wrench."""
+        return (
+            self.misfit < _MAX_RIGID_RATIO * self.degrees + _GAIN_ALLOWANCE * self.misfit_of_gains
+        )
 
     @property
     def inflation(self) -> float:
-        """By which deviations are larger than noise alone makes them; 1 if stated gains explain it.
-
-        Noise alone has a misfit of up to 1.5 times its degrees, because bands hold few numbers.
-        """
-        left = self.misfit - _BY_GAINS * self.misfit_of_gains
-        return float(np.sqrt(max(1.0, left / (_NOISE * self.degrees))))
+        """Factor on standard deviations; noise alone causes 1.5 times the degrees."""
+        left = self.misfit - _GAIN_ALLOWANCE * self.misfit_of_gains
+        return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
-    """(19, 22) M with z = M [zeta; F], see the module docstring."""
+    """Return (19, 22) M of z = M [zeta; F], Eq. (T79)."""
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, SIGNALS:] = np.eye(6)
@@ -117,36 +89,28 @@ def motion_map(R: Array, r: Array) -> Array:
     M[7:10, 7:10] = -R.T @ cross_matrix(r)
     M[7:10, 10:16] = R.T @ _centripetal(r)
     M[10:13, 7:10] = R.T
-    M[13:19, 10:16] = _turned_products(R)
+    M[13:19, 10:16] = _rotated_products(R)
     return M
 
 
 def _centripetal(r: Array) -> Array:
-    """(3, 6) with omega x (omega x r) of the products of omega."""
+    """Return (3, 6) map from products of omega to omega x (omega x r)."""
     x, y, z = r
-    return np.array(
-        [
-            [0.0, -x, -x, y, z, 0.0],
-            [-y, 0.0, -y, x, 0.0, z],
-            [-z, -z, 0.0, 0.0, x, y],
-        ]
-    )
+    return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
-    """(6, 16) coefficients of the signals of P in the wrench of a load, if P is S.
+    """Return (6, 16) coefficients C of a load for P = S, Eq. (T73).
 
-    Args:
-        phi: (10,) the load.
-        removed_weight: (4,) mass and first moment whose weight the wrench does not contain.
+    `phi` is (10,). `removed_weight` (4,) is [m, m c] of a weight that the wrench does not contain.
     """
     C = _coefficients_of(phi)
     if removed_weight is not None:
         weight = _coefficients_of(np.concatenate([removed_weight, np.zeros(6)]))
-        C[:, GRAVITY] -= weight[:, GRAVITY]
+        C[:, GRAVITY_COLUMNS] -= weight[:, GRAVITY_COLUMNS]
     return C
 
 
@@ -156,11 +120,11 @@ def _coefficients_of(phi: Array) -> Array:
     return np.asarray(np.einsum("cjk,j->ck", coefficients(), theta) @ M)
 
 
-def _turned_products(R: Array) -> Array:
-    """(6, 6) products of R^T omega of those of omega."""
+def _rotated_products(R: Array) -> Array:
+    """Return (6, 6) map from products of omega to those of R^T omega."""
     out = np.empty((6, 6))
-    for row, (i, j) in enumerate(_PAIRS):
-        for column, (k, m) in enumerate(_PAIRS):
+    for row, (i, j) in enumerate(_PRODUCT_PAIRS):
+        for column, (k, m) in enumerate(_PRODUCT_PAIRS):
             out[row, column] = R[k, i] * R[m, j] + (k != m) * R[m, i] * R[k, j]
     return out
 
@@ -171,33 +135,31 @@ def fit_rigid(
     levels: Levels,
     start: State,
     free: NDArray[np.bool_],
-    saturated: Saturated,
+    linear: LinearFit,
     *,
     gain: float = 0.0,
 ) -> RigidFit:
-    """The fit, with one weight for all bands where no rigid load explains the wrench.
+    """Fit a rigid load; use one weight for all bands if no rigid load explains the wrench.
 
     Args:
         Z: (bands, 38, 38) `spectra.moments`.
-        Q: (bands, 38, 38) `noise.noise_moments`.
-        levels: of the bands' noise.
-        start: where to start.
-        free: (23,) which parameters are estimated.
-        saturated: of the same moments: its residual gives the weights of the first step. With those
-            of a poor start the bands that are all noise could decide, and keep their say.
-        gain: standard deviation of each entry of the sensor's matrix of gains, of a torque's as at
-            `ARM`; 0 for an exact sensor.
+        Q: (bands, 38, 38) `spectra.noise_moments`.
+        levels: noise of the bands.
+        start: initial state.
+        free: (23,) estimated parameters.
+        linear: linear model, whose residual gives the first weights.
+        gain: standard deviation of the sensor gains.
     """
-    record = _Record(Z, Q, levels, free, saturated.power)
+    record = _Record(Z, Q, levels, free, linear.power)
     solution = _solve(record, start)
-    # The saturated model is not compensated: nor must be what is compared with it.
+    # The linear model is not compensated for noise, so the compared fit must not be either.
     plain = _solve(replace(record, Q=np.zeros_like(Q)), solution.state)
     least = least_power(record.Z, levels.sizes)
-    power = np.maximum(levels.power(_sums(record, plain.state)), least)
+    power = np.maximum(levels.power(_residual_sums(record, plain.state)), least)
     fit = RigidFit(
         solution.state,
         covariance=np.zeros((0, 0)),
-        misfit=2.0 * (float(levels.costs(power).sum()) - saturated.cost),
+        misfit=2.0 * (float(levels.costs(power).sum()) - linear.cost),
         degrees=6.0 * SIGNALS - float(free.sum()),
         misfit_of_gains=_misfit_of_gains(record, plain, gain),
     )
@@ -209,9 +171,6 @@ def fit_rigid(
 
 @dataclass(frozen=True, eq=False)
 class _Record:
-    """Moments, those of the noise, its levels, and what is free, as in `fit_rigid`; and (bands, 6)
-    powers to begin with."""
-
     Z: Array
     Q: Array
     levels: Levels
@@ -221,19 +180,17 @@ class _Record:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """A state, and of the last step columns B (6, 23, 38), weights (bands, 6, 6), the inverse gram
-    (23, 23), the residual's covariance (bands, 6, 6) and (23,) what nothing determines."""
+    """State, last columns B (6, 23, 38), weights W and residual covariances R (bands, 6, 6)."""
 
     state: State
     B: Array
     W: Array
     inverse: Array
     R: Array
-    lost: NDArray[np.bool_]
+    undetermined: NDArray[np.bool_]
 
 
 def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solution:
-    """Gauss-Newton."""
     sizes, clean = record.levels.sizes, record.Z - record.Q
     R = _residual_covariances(record, state, record.power * sizes[:, None])
     for _ in range(_STEPS):
@@ -242,27 +199,24 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
             W[:] = np.linalg.inv(np.einsum("b,bcd->cd", sizes / sizes.sum(), R))
         B, Le = _columns(state)
         gram, right = _normal(B, Le, clean, W)
-        inverse, lost = _inverse(gram, record.free)
+        inverse, undetermined = _inverse(gram, record.free)
         step = inverse @ right
         size = np.sqrt(np.maximum(np.diag(inverse), 0.0)) + 1e-300
-        step *= min(1.0, float(np.min(_LIMITS / np.maximum(np.abs(step), 1e-300))))
-        state = _moved(state, step)
-        taken = _shares(B, record.Z, W, inverse)
-        R = _residual_covariances(record, state, _sums(record, state), taken)
+        step *= min(1.0, float(np.min(_MAX_STEP / np.maximum(np.abs(step), 1e-300))))
+        state = _apply_step(state, step)
+        used = _used_freedom(B, record.Z, W, inverse)
+        R = _residual_covariances(record, state, _residual_sums(record, state), used)
         if np.max(np.abs(step) / size) < _CONVERGED:
             break
-    return _Solution(state, B, W, inverse, R, lost)
+    return _Solution(state, B, W, inverse, R, undetermined)
 
 
 def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
-    """(23, 23) by the noise of wrench and poses, and by errors of gains if some are stated.
-
-    Where they are not, the misfit says how much larger the errors are than by noise.
-    """
-    B, W, inverse, lost = solution.B, solution.W, solution.inverse, solution.lost
+    """Return the (23, 23) covariance by noise, gain errors and misfit."""
+    B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
     middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
-    covariance *= np.outer(*2 * [_by_weights(record, solution)])
+    covariance *= np.outer(*2 * [_weight_estimation_factors(record, solution)])
     larger = covariance * inflation**2
     if gain:
         effects = gain * _gain_effects(B, record.Z - record.Q, W, inverse)
@@ -270,19 +224,13 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
         ratio = np.diag(larger) / np.maximum(np.diag(covariance), 1e-300)
         scale = np.sqrt(np.maximum(1.0, ratio))
         larger = covariance * np.outer(scale, scale)
-    larger[lost], larger[:, lost] = 0.0, 0.0
-    larger[lost, lost] = np.inf
+    larger[undetermined], larger[:, undetermined] = 0.0, 0.0
+    larger[undetermined, undetermined] = np.inf
     return larger
 
 
-def _by_weights(record: _Record, solution: _Solution) -> Array:
-    """(23,) factors on deviations because the weights are estimated too.
-
-    For a mean of groups weighted by their own scatter, the g-th having the share p_g of the weight
-    and nu_g degrees of freedom, the variance is 1 + 4 sum of p_g (1 - p_g) / nu_g times as large as
-    with known weights (P. Meier, Variance of a weighted mean, Biometrics 9, 1953). Groups here are
-    those of the levels in each channel, shares those of each parameter's variance.
-    """
+def _weight_estimation_factors(record: _Record, solution: _Solution) -> Array:
+    """Return (23,) factors on deviations by estimated weights, Eq. (T81)."""
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
     weight = np.diagonal(solution.W, axis1=1, axis2=2)
@@ -294,20 +242,18 @@ def _by_weights(record: _Record, solution: _Solution) -> Array:
 
 
 def _map(state: State) -> Array:
-    """(19, 38) with z = map y, the delay's first order in it."""
     M = motion_map(state.R, state.r)
     return np.hstack([M, state.tau * M[:, :SIGNALS]])
 
 
 def _residual_map(state: State) -> Array:
-    """(6, 19) L with e = L z."""
     L = -np.einsum("cjk,j->ck", coefficients(), state.theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     return L
 
 
 def _columns(state: State) -> tuple[Array, Array]:
-    """(6, 23, 38) B = -de/dx of the residual e, and (6, 38) of e itself, as functions of y."""
+    """Return (6, 23, 38) B = -de/dx and (6, 38) e, as functions of y."""
     L, M = _residual_map(state), _map(state)
     B = np.zeros((6, PARAMETERS, WIDTH))
     B[:, LOAD] = coefficients() @ M
@@ -315,15 +261,15 @@ def _columns(state: State) -> tuple[Array, Array]:
     for i, unit in enumerate(np.eye(3)):
         lever = _map(replace(state, r=state.r + unit)) - M
         ahead, behind = (
-            _map(replace(state, R=_turned(state.R, x * unit))) for x in (_SMALL, -_SMALL)
+            _map(replace(state, R=_rotate(state.R, x * unit)))
+            for x in (_ROTATION_STEP, -_ROTATION_STEP)
         )
         B[:, 17 + i] = -L @ lever
-        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _SMALL)
+        B[:, 20 + i] = -L @ (ahead - behind) / (2.0 * _ROTATION_STEP)
     return B, L @ M
 
 
 def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
-    """Gram (23, 23) and right-hand side (23,) of a step."""
     columns = B.reshape(-1, WIDTH)
     BZ = (columns @ Z).reshape(len(Z), 6, PARAMETERS, WIDTH)
     WB = np.einsum("bcd,bcjk->dbjk", W, BZ, optimize=True)
@@ -332,44 +278,42 @@ def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """(23, 23) pseudo-inverse of what is free, and (23,) what nothing determines."""
+    """Return the (23, 23) pseudo-inverse and (23,) flags of undetermined parameters."""
     diagonal = np.diag(gram)
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = values > _RANK * values[-1]
+    kept = values > _RANK_TOLERANCE * values[-1]
     basis = scale[:, None] * vectors[:, kept]
     null = np.sum(vectors[:, ~kept] ** 2, axis=1) > 1e-6
     return (basis / values[kept]) @ basis.T, free & (~used | null)
 
 
 def _residual_powers(Z: Array, state: State) -> Array:
-    """(bands, 6, 6) of e, of the moments or of their noise."""
     Le = _residual_map(state) @ _map(state)
     return np.asarray(Le @ Z @ Le.T)
 
 
-def _sums(record: _Record, state: State) -> Array:
-    """(bands, 6) powers of the residual, summed over each band."""
+def _residual_sums(record: _Record, state: State) -> Array:
     return np.asarray(np.diagonal(_residual_powers(record.Z, state), axis1=1, axis2=2))
 
 
 def _residual_covariances(
-    record: _Record, state: State, sums: Array, taken: Array | None = None
+    record: _Record, state: State, sums: Array, used: Array | None = None
 ) -> Array:
-    """(bands, 6, 6) R_b of a number, from the residual's powers and what the fit took of them."""
+    """Return (bands, 6, 6) R_b of Eq. (T80)."""
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
-    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if taken is None else sizes - 0.5 * taken)
+    own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
     least = np.maximum(
-        _LEAST_SHARE * levels.power(sums, taken), least_power(record.Z, levels.sizes)
+        _MIN_REST_SHARE * levels.power(sums, used), least_power(record.Z, levels.sizes)
     )
-    rest = np.maximum(levels.power(sums - own, taken), least)
+    rest = np.maximum(levels.power(sums - own, used), least)
     return np.asarray(P + rest[:, :, None] * np.eye(6))
 
 
-def _shares(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    """(bands, 6) parameters that each channel of each band pays for."""
+def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
+    """Return (bands, 6) degrees of freedom that parameters use."""
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
     gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
@@ -377,13 +321,12 @@ def _shares(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
 
 
 def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    """(23, 36) what an error of 1 in each of the sensor's gains does, of a torque's as at `ARM`."""
+    """Return (23, 36) effects of unit gain errors on the parameters."""
     BF = (B.reshape(-1, WIDTH) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
     return gain_effects(BF, W, inverse)
 
 
 def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float:
-    """That errors of gains of this standard deviation add, about; 0 for an exact sensor."""
     if gain == 0.0:
         return 0.0
     B, levels = solution.B, record.levels
@@ -399,14 +342,14 @@ def _misfit_of_gains(record: _Record, solution: _Solution, gain: float) -> float
     return 2.0 * float(levels.costs(1.0 + more).sum())
 
 
-def _moved(state: State, step: Array) -> State:
+def _apply_step(state: State, step: Array) -> State:
     return State(
         state.theta + step[LOAD],
         state.tau + float(step[16]),
         state.r + step[LEVER],
-        Rotation.from_matrix(_turned(state.R, step[TURN])).as_matrix(),
+        Rotation.from_matrix(_rotate(state.R, step[TURN])).as_matrix(),
     )
 
 
-def _turned(R: Array, rho: Array) -> Array:
+def _rotate(R: Array, rho: Array) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(rho).as_matrix())

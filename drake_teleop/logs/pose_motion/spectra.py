@@ -1,15 +1,7 @@
-"""Second moments of a wrench and the signals of its motion, band by band of frequency.
+"""Spectra, second moments and noise of wrench and signals in bands (docs/theory.md).
 
-Wrench F and signals zeta (`splines.PoseSplines.signals`) are multiplied by the same taper w(t), 0
-where a sample is not to count, and transformed. What is linear at every instant stays so at every
-frequency, the tapered constant included; and noise that is coloured is nearly white within a group
-of bands. Noise that wanders is not: the bands of a group are narrow at low frequencies, so that it
-may rise there (`levels`). Above `TOP` nothing is used. The wrench is transformed at its full rate,
-the signals at about 100 Hz over the same span, so that the frequencies are the same.
-
-White noise of variance v has the power v sum(w^2) in each frequency. Neighbours of a tapered record
-are alike, so that they count less: as many as (sum w^2)^2 / sum w^4 samples give. A complex number
-is two, but for that of frequency zero.
+The signals have about 100 Hz, the wrench its own rate over the same span, so that their frequencies
+agree.
 """
 
 from __future__ import annotations
@@ -22,37 +14,37 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.pose_motion.splines import SIGNALS
+from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.logs.pose_motion.splines import SIGNALS, PoseSplines, passed
 
 Complex = NDArray[np.complex128]
 
-TOP = 25.0
-"""Frequencies above are not used [Hz]."""
-RAMP = 1.0
-"""Length of the taper's rise at the ends of the record [s]."""
-EDGE = 0.2
-"""Length of its rise beside samples that do not count [s]."""
-_GRID = 100.0
-_EDGES = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, TOP)
-_FEWEST_IN_GROUP = 8.0
-# Bands below this frequency [Hz] are at most so wide, as a ratio of their ends.
-_NARROW, _RATIO = 3.0, 4.0 / 3.0
+MAX_FREQUENCY_HZ = 25.0
+"""Highest frequency that is used [Hz]."""
+RAMP_S = 1.0
+"""Length of the taper's ramps at the ends of the record [s]."""
+EDGE_S = 0.2
+"""Length of its ramps beside excluded samples [s]."""
+_GRID_RATE_HZ = 100.0
+_GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
+_MIN_GROUP_SIZE = 8.0
+# Largest ratio of the ends of a band below this frequency [Hz].
+_NARROW_BELOW_HZ, _MAX_BAND_RATIO = 3.0, 4.0 / 3.0
 FORCES = slice(SIGNALS, SIGNALS + 6)
-"""Where the wrench stands in the moments, and the signals' derivatives."""
+"""Columns of the wrench and of the signals' derivatives in the moments."""
 RATES = slice(SIGNALS + 6, 2 * SIGNALS + 6)
 WIDTH = 2 * SIGNALS + 6
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Instants of the signals, and the wrench between them.
+    """Instants of the signals and samples of the wrench.
 
     Attributes:
         t: (M,) evenly spaced, about 100 Hz [s].
-        wrench: (N, 6), every `stride`th at an instant of `t`, N = M stride.
-        stride: samples of the wrench from one instant to the next.
-        load: (6, 16) coefficients of the signals in the wrench of an identified load; None if the
-            load is unknown.
+        wrench: (N, 6) with N = M stride.
+        stride: wrench samples per instant.
+        load: (6, 16) coefficients of an identified load, or None.
     """
 
     t: Array
@@ -62,25 +54,24 @@ class Grid:
 
     @classmethod
     def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
-        """From evenly spaced samples (N,), (N, 6)."""
+        """Return the grid of evenly spaced samples (N,), (N, 6)."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
-        stride = max(1, int(1.0 / (_GRID * dt) + 1e-6))
+        stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
         return cls(t[0] + stride * dt * np.arange(rows), wrench[: rows * stride], stride, load)
 
     @property
     def dt(self) -> float:
-        """Time from one instant to the next [s]."""
+        """Spacing of the instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
     def length(self) -> int:
-        """Of the transforms, in instants."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
     def frequency(self) -> Array:
-        """(L,) all frequencies of the transforms [Hz]."""
+        """(L,) frequencies of the transforms [Hz]."""
         return np.asarray(np.fft.rfftfreq(self.length, self.dt), np.float64)
 
 
@@ -89,10 +80,10 @@ class Bands:
     """Bands of frequency.
 
     Attributes:
-        frequency: (K,) those that are used [Hz].
-        band: (K,) number of the band of each.
-        weight: (K,) how many numbers each is worth, over two.
-        group: (count,) number of the group of each band.
+        frequency: (K,) used frequencies [Hz].
+        band: (K,) band of each.
+        weight: (K,) half the independent numbers of each.
+        group: (count,) group of each band.
     """
 
     frequency: Array
@@ -102,55 +93,56 @@ class Bands:
 
     @property
     def count(self) -> int:
-        """How many bands there are."""
         return int(self.band[-1]) + 1
 
     @cached_property
     def sizes(self) -> Array:
-        """(count,) of the bands: half as many independent numbers as each has."""
+        """(count,) half the independent numbers of each band."""
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums(self, values: Array) -> Array:
-        """(count, ...) sums of (K, ...) over each band, weighted."""
+        """Return (count, ...) weighted sums of (K, ...)."""
         flat = values.reshape(len(values), -1) * self.weight[:, None]
         starts = np.searchsorted(self.band, np.arange(self.count))
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
 
 
 def bands(grid: Grid, taper: Array, top: float) -> Bands:
-    """Of a grid and its taper (M,), up to a frequency; groups of too few are one with the next."""
+    """Return bands up to `top` [Hz]; groups with few numbers join the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
     weight = np.full(len(frequency), worth)
     weight[0] *= 0.5
-    group = np.searchsorted(np.array(_EDGES[1:]), frequency, side="right")
-    for k in range(len(_EDGES)):
-        if 0.0 < weight[group == k].sum() < _FEWEST_IN_GROUP:
+    group = np.searchsorted(np.array(_GROUP_EDGES_HZ[1:]), frequency, side="right")
+    for k in range(len(_GROUP_EDGES_HZ)):
+        if 0.0 < weight[group == k].sum() < _MIN_GROUP_SIZE:
             group[group == k] = k + 1
     last = group == group[-1]
-    if weight[last].sum() < _FEWEST_IN_GROUP and not last.all():
+    if weight[last].sum() < _MIN_GROUP_SIZE and not last.all():
         group[last] = group[~last][-1]
-    narrow = np.log(np.clip(frequency, frequency[1], _NARROW) / frequency[1]) // np.log(_RATIO)
+    narrow = np.log(np.clip(frequency, frequency[1], _NARROW_BELOW_HZ) / frequency[1]) // np.log(
+        _MAX_BAND_RATIO
+    )
     first = np.concatenate([[True], (np.diff(group) > 0) | (np.diff(narrow) > 0)])
     group = np.unique(group[first], return_inverse=True)[1]
     return Bands(frequency, np.cumsum(first) - 1, weight, group)
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
-    """(M,) 1 inside of start ... stop, with cosine ramps; 0 outside."""
-    ramp = min(RAMP, 0.1 * (stop - start))
+    """Return (M,) 1 between start and stop, with cosine ramps, and 0 outside."""
+    ramp = min(RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
-def without(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
-    """The taper, 0 where `lost` (M,) and within `margin` [s] of it, with cosine edges beside."""
-    edge = np.clip((distance(lost) * dt - margin) / EDGE, 0.0, 1.0)
+def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
+    """Return the taper, 0 within `margin` [s] of `lost` (M,), with cosine edges."""
+    edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
 def distance(flags: NDArray[np.bool_]) -> Array:
-    """(M,) how many instants away the nearest flag of (M,) is; inf without any."""
+    """Return (M,) instants to the nearest flag of (M,); inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
     after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
@@ -158,7 +150,7 @@ def distance(flags: NDArray[np.bool_]) -> Array:
 
 
 def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
-    """(count, 6) of the tapered wrench, in the units of transforms of `grid.t`."""
+    """Return (count, 6) of the tapered wrench, scaled as spectra of the signals."""
     fine = np.zeros(grid.length * grid.stride)
     n = len(grid.wrench)
     full = np.interp(np.arange(n) / grid.stride, np.arange(len(taper)), taper)
@@ -170,7 +162,7 @@ def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
 
 
 def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Complex:
-    """(count, 16) of the tapered signals (M, 16)."""
+    """Return (count, 16) of the tapered signals (M, 16)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
         out[:, c] = np.fft.rfft(column * taper, grid.length)[:count]
@@ -178,38 +170,162 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
 
 
 def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
-    """Signals (K, 16) later by `shift` [s]; the constant stays. The taper moves with them."""
+    """Return spectra (K, 16) of signals and taper `shift` [s] later; the constant stays."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
 
 
-def later(grid: Grid, taper: Array, shift: float) -> Array:
-    """(M,) the taper moved by `shift` [s]."""
-    return _passed_through(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
+def shift_taper(grid: Grid, taper: Array, shift: float) -> Array:
+    """Return the (M,) taper moved by `shift` [s]."""
+    return _filter(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
 
 
-def slope(grid: Grid, taper: Array) -> Array:
-    """(M,) its derivative [1/s]."""
-    return _passed_through(grid, taper, 2j * np.pi * grid.frequency)
+def taper_derivative(grid: Grid, taper: Array) -> Array:
+    """Return the (M,) derivative of the taper [1/s]."""
+    return _filter(grid, taper, 2j * np.pi * grid.frequency)
 
 
-def _passed_through(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
+def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Array:
     return np.asarray(np.fft.irfft(np.fft.rfft(x, grid.length) * response, grid.length)[: len(x)])
 
 
 def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
-    """(bands, 38, 38) sums of Re y* y^T over each band, y = [zeta (16), F (6), d zeta/dt (16)].
+    """Return (bands, 38, 38) sums of Re y* y^T, y = [zeta (16), F (6), d zeta/dt (16)].
 
-    Without rates (bands, 22, 22).
+    Without rates the result is (bands, 22, 22).
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
     y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
     starts = np.searchsorted(of.band, np.arange(of.count + 1))
     out = np.empty((of.count, y.shape[1], y.shape[1]))
     for k in range(of.count):
-        # Real and imaginary parts as rows: one product of real matrices for each band.
+        # Real and imaginary parts as rows need only one real product per band.
         part = y[starts[k] : starts[k + 1]].view(np.float64).reshape(-1, y.shape[1], 2)
         part = part.transpose(0, 2, 1).reshape(-1, y.shape[1])
         out[k] = part.T @ part
     return out
+
+
+_MIN_REMAINING_SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Noise with one level for each group of bands and channel.
+
+    Attributes:
+        sizes: (bands,) half the number of independent numbers.
+        group: (bands,) number of the group.
+        shape: (bands, 6) relative power.
+    """
+
+    sizes: Array
+    group: NDArray[np.intp]
+    shape: Array
+
+    @classmethod
+    def flat(cls, of: Bands) -> Levels:
+        """Return white noise within each group."""
+        return cls(of.sizes, of.group, np.ones((of.count, 6)))
+
+    def power(self, sums: Array, used: Array | None = None) -> Array:
+        """Return (..., bands, 6) mean power of residual power `sums` (..., bands, 6).
+
+        `used` (bands, 6) are degrees of freedom used by parameters.
+        """
+        remaining = self._numbers
+        if used is not None:
+            remaining = np.maximum(
+                remaining - 0.5 * self.grouped(used), _MIN_REMAINING_SHARE * remaining
+            )
+        level = np.add.reduceat(sums / self.shape, self._starts, axis=-2) / remaining
+        return np.asarray(level[..., self.group, :] * self.shape)
+
+    def grouped(self, x: Array) -> Array:
+        """Return (groups, ...) sums of (bands, ...)."""
+        return np.asarray(np.add.reduceat(x, self._starts, axis=0))
+
+    @cached_property
+    def _starts(self) -> NDArray[np.intp]:
+        return np.flatnonzero(np.diff(self.group, prepend=-1))
+
+    @cached_property
+    def _numbers(self) -> Array:
+        return self.grouped(self.sizes)[:, None]
+
+    def costs(self, power: Array) -> Array:
+        """Return (..., 6) costs (T75) of powers (..., bands, 6)."""
+        return np.asarray(self.sizes @ np.log(power))
+
+
+def random_walk_shape(of: Bands, corner: float) -> Array:
+    """Return (bands,) means of 1 + (corner / f)^2, Eq. (T74)."""
+    f = np.maximum(of.frequency, of.frequency[1])
+    return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)
+
+
+PRODUCTS = np.array([[10, 13, 14], [13, 11, 15], [14, 15, 12]])
+"""(3, 3) indices of the products of angular velocity among the signals."""
+_A, _G, _ALPHA = slice(1, 4), slice(4, 7), slice(7, 10)
+
+
+def noise_moments(
+    splines: PoseSplines,
+    grid: Grid,
+    taper: Array,
+    zeta: Array,
+    of: Bands,
+    noise: tuple[float, float],
+) -> Array:
+    """Return (bands, 38, 38) Q that noise of the poses adds to `spectra.moments`.
+
+    `zeta` (M, 16) are the signals, `noise` standard deviations of position [m] and rotation [rad].
+    """
+    w2 = (2.0 * np.pi * of.frequency) ** 2
+    per_number = np.sum(taper**2) / (grid.dt * splines.rate)
+    share = per_number * passed(of.frequency, splines.spacing)
+    position_power, rotation_power = (std**2 * share for std in noise)
+    if splines.imu_rows is not None:
+        left = splines.imu_rows.share(of.frequency)
+        position_power, rotation_power = position_power * left[0], rotation_power * left[1]
+    weight = taper**2 / np.sum(taper**2)
+    still, first, second, third = _rotation_covariances(zeta, weight)
+    eye = np.zeros((SIGNALS, SIGNALS))
+    eye[_A, _A] = np.eye(3)
+    parts = [
+        (position_power * w2**2, eye),
+        (rotation_power, still),
+        (rotation_power * w2, first + second),
+    ]
+    parts.append((rotation_power * w2**2, third))
+    Q = np.zeros((of.count, WIDTH, WIDTH))
+    for power, shape in parts:
+        Q[:, :SIGNALS, :SIGNALS] += of.sums(power)[:, None, None] * shape
+        Q[:, RATES, RATES] += of.sums(power * w2)[:, None, None] * shape
+    return Q
+
+
+def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
+    """Return covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
+    still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
+    mean = weight @ zeta
+    for left in (_A, _G):
+        for right in (_A, _G):
+            # Mean of (x x d)(y x d)^T for a rotation d of unit covariance.
+            both = (weight[:, None] * zeta[:, left]).T @ zeta[:, right]
+            still[left, right] = np.trace(both) * np.eye(3) - both.T
+    for where in (_A, _G):
+        cross[where, _ALPHA] = -cross_matrix(mean[where])
+        cross[_ALPHA, where] = cross[where, _ALPHA].T
+    jacobian = np.zeros(
+        (3, 3, SIGNALS)
+    )  # derivative of the signals by omega_j, coefficient of omega_i
+    for i in range(3):
+        for j in range(3):
+            jacobian[j, i, PRODUCTS[i, j]] += 1.0 + (i == j)
+    ww = mean[PRODUCTS]
+    for k in range(3):
+        products += jacobian[k].T @ ww @ jacobian[k]
+    alpha[_ALPHA, _ALPHA] = np.eye(3)
+    return still, cross, products, alpha

@@ -1,17 +1,4 @@
-"""Motion from poses: splines of position and quaternion, and the signals that a wrench hangs on.
-
-Every column of position p and quaternion q is a least-squares spline of degree 5 with uniform
-knots. It takes uneven stamps as they are, and its fifth degree leaves accelerations smooth. With
-n = q . q, which noise and the fit keep from 1, and products of quaternions,
-
-    omega = 2 vec(q* qdot) / n,   alpha = 2 vec(q* qddot) / n - 2 omega (q . qdot) / n,
-
-in the axes of the posed frame P. Of white noise at frequency f the splines pass the share
-
-    g(f) = 1 / (1 + (f h / (1 - f h))^12)   below 1 / h
-
-of the power, h the distance of the knots: nearly all up to 0.3 / h, nearly nothing from 0.7 / h on.
-"""
+"""Motion from poses by splines of position and quaternion, Eqs. (T71), (T72)."""
 
 from __future__ import annotations
 
@@ -19,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.sparse import diags_array, eye_array
@@ -28,28 +14,28 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.logs.pose_motion.poses import Poses
 
 DEGREE = 5
-FEWEST_PER_KNOT = 2.0
-"""Poses between two knots, at least, on average."""
+MIN_POSES_PER_KNOT = 2.0
+"""Least average number of poses between two knots."""
 SIGNALS = 16
-"""Columns of `PoseSplines.signals`."""
-GRAVITY, ACCELERATED = slice(4, 7), [1, 2, 3, *range(7, 16)]
-"""Which of them are gravity, and which are zero at rest."""
-# Frequencies times h between which the residual shows the noise: above what the splines pass.
+"""Number of columns of `PoseSplines.signals`."""
+GRAVITY_COLUMNS, MOTION_COLUMNS = slice(4, 7), [1, 2, 3, *range(7, 16)]
+"""Columns of gravity, and columns that are zero at rest."""
+# Frequency times h where the residual is noise: just above the passed frequencies.
 _NOISE_BAND = (0.7, 1.5)
-_CHUNK = 2**17
+_CHUNK_ROWS = 2**17
 
 
 @dataclass(frozen=True, eq=False)
-class Aid:
-    """What an IMU adds to the splines (`aid`), its axes, biases and clock being those of the poses.
+class ImuRows:
+    """IMU data that refine the splines, corrected to the axes, clock and zero bias of the poses.
 
     Attributes:
         t: (K,) [s].
-        rate: of them [Hz].
-        acceleration_W: (K, 3) of So in the world [m/s^2], or None.
-        quaternion_rate: (K, 4) derivatives [1/s], or None.
-        pose_powers: of white noise of position [m^2/Hz] and turn [rad^2/Hz].
-        own_powers: likewise of acceleration and angular velocity.
+        rate: [Hz].
+        acceleration_W: (K, 3) of So [m/s^2], or None.
+        quaternion_rate: (K, 4) [1/s], or None.
+        pose_powers: power densities of position [m^2/Hz] and rotation [rad^2/Hz].
+        own_powers: of acceleration and angular velocity.
     """
 
     t: Array
@@ -71,8 +57,8 @@ class Aid:
         rate: float,
         pose_powers: tuple[float, float],
         own_powers: tuple[float, float],
-    ) -> Aid:
-        """From specific force and angular velocity (K, 3), with the orientation of splines."""
+    ) -> ImuRows:
+        """Return the rows of s and omega (K, 3), with the orientation of `splines`."""
         q = splines.quaternion(t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -85,7 +71,7 @@ class Aid:
         return cls(t, rate, acceleration, rates, pose_powers, own_powers)
 
     def share(self, frequency: Array) -> tuple[Array, Array]:
-        """Of the poses' noise in position and turn that is left at frequencies (K,) [Hz]."""
+        """Return the remaining shares of the poses' noise at frequencies (K,), Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -101,63 +87,63 @@ class Aid:
 
 
 class PoseSplines:
-    """Splines of poses.
+    """Least-squares splines of poses.
 
     Attributes:
-        poses: what they were fitted to, signs continuous.
-        spacing: h of the knots [s].
+        poses: fitted poses with continuous signs.
+        spacing: knot distance [s].
         rate: of the poses [Hz].
-        aid: what else, or None.
+        imu_rows: IMU data, or None.
     """
 
-    def __init__(self, poses: Poses, spacing: float, aid: Aid | None = None) -> None:
-        """Fits them; `poses` with continuous signs, see `Poses.continued`."""
-        self.poses, self.spacing, self.rate, self.aid = poses, spacing, poses.rate, aid
+    def __init__(self, poses: Poses, spacing: float, imu_rows: ImuRows | None = None) -> None:
+        self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
         self._start = float(poses.t[0])
         t = poses.t - self._start
-        self._parts, knots = _parts(len(t)), _knots(t, spacing, aided=aid is not None)
+        self._blocks = _row_blocks(len(t))
+        knots = _knots(t, spacing, with_imu=imu_rows is not None)
         try:
-            self._spline = self._fitted(t, knots)
-        except np.linalg.LinAlgError:  # between gaps one pose to a knot is too little
-            self._spline = self._fitted(t, _sparser(knots, t))
+            self._spline = self._fit(t, knots)
+        except np.linalg.LinAlgError:  # too few poses per knot between gaps
+            self._spline = self._fit(t, _thin_knots(knots, t))
 
-    def _fitted(self, t: Array, knots: Array) -> BSpline:
-        """By banded normal equations.
+    def _fit(self, t: Array, knots: Array) -> BSpline:
+        """Solve banded normal equations.
 
-        `scipy.interpolate.make_lsq_spline` takes QR now, which is five times slower; with two poses
-        to a knot they lose no digit that a pose has.
+        They are five times faster than `scipy.interpolate.make_lsq_spline` and sufficiently
+        accurate.
         """
-        poses, aid = self.poses, self.aid
-        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._parts)
-        times = (t[x] for x in self._parts)
+        poses, imu_rows = self.poses, self.imu_rows
+        values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
+        times = (t[x] for x in self._blocks)
         gram, right = _normal(zip(times, values, strict=True), knots, DEGREE, 7)
-        if aid is None:
+        if imu_rows is None:
             return BSpline(knots, solveh_banded(gram, right), DEGREE)
         columns = []
-        later = aid.t - self._start
-        inside = (later >= knots[0]) & (later <= knots[-1])
+        shifted_t = imu_rows.t - self._start
+        inside = (shifted_t >= knots[0]) & (shifted_t <= knots[-1])
         for part, order, rows, pose, own in zip(
             (slice(0, 3), slice(3, 7)),
             (2, 1),
-            (aid.acceleration_W, aid.quaternion_rate),
-            aid.pose_powers,
-            aid.own_powers,
+            (imu_rows.acceleration_W, imu_rows.quaternion_rate),
+            imu_rows.pose_powers,
+            imu_rows.own_powers,
             strict=True,
         ):
             band, side = gram, right[:, part]
             if rows is not None:
-                weight = pose * self.rate / (own * aid.rate)
-                more, other = _normal_of_rates(later[inside], rows[inside], knots, order)
+                weight = pose * self.rate / (own * imu_rows.rate)
+                more, other = _normal_of_rates(shifted_t[inside], rows[inside], knots, order)
                 band, side = gram + weight * more, side + weight * other
             columns.append(solveh_banded(band, side))
         return BSpline(knots, np.hstack(columns), DEGREE)
 
     def quaternion(self, t: Array) -> Array:
-        """(N, 4) at times t, nearly of unit length."""
+        """Return (N, 4) at times t, nearly of unit length."""
         return np.asarray(self._at(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
-        """(N, 3) at times t [m]."""
+        """Return (N, 3) at times t [m]."""
         return np.asarray(self._at(t, 0)[:, :3])
 
     def _at(self, t: Array, order: int) -> Array:
@@ -165,17 +151,9 @@ class PoseSplines:
         return np.asarray(self._spline(at, order))
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
-        """(N, 16) signals of P at times t, in the axes of P; outside of the poses those of the end.
+        """Return (N, 16) signals zeta of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        zeta = [1, a (3), -g (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]
-
-        with the acceleration a of Po [m/s^2], gravity g, the angular acceleration alpha and the
-        products of angular velocity. Whatever frame, units and axes the sensor has, the wrench of a
-        rigid load is linear in them.
-
-        Args:
-            t: (N,) [s].
-            gravity_W: (3,) in the world [m/s^2].
+        Outside of the poses, the signals of the ends are held.
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))
@@ -187,23 +165,23 @@ class PoseSplines:
         return zeta
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """(N, 3) specific force of Po, angular velocity and acceleration of P, in its axes."""
+        """Return (N, 3) specific force of Po, omega and alpha of P, in its axes."""
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """(N, 3) gravity in the axes of P at times t [m/s^2]."""
+        """Return (N, 3) gravity in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
-        for part in _parts(len(t)):
+        for part in _row_blocks(len(t)):
             q = self.quaternion(t[part])
-            down = np.broadcast_to(gravity_W, out[part].shape)
-            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), down)
+            gravity_rows = np.broadcast_to(gravity_W, out[part].shape)
+            out[part] = _in_P(q, np.sum(q * q, axis=1, keepdims=True), gravity_rows)
         return out
 
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        """(N, 3) a, -g, omega and alpha."""
+        """Return (N, 3) a, -g, omega and alpha."""
         out = np.empty((4, len(t), 3))
-        for part in _parts(len(t)):
+        for part in _row_blocks(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
         return out[0], out[1], out[2], out[3]
 
@@ -211,32 +189,35 @@ class PoseSplines:
         x, first, second = (self._at(t, order) for order in range(3))
         q, qd, qdd = x[:, 3:], first[:, 3:], second[:, 3:]
         n = np.sum(q * q, axis=1, keepdims=True)
-        omega = 2.0 * _vector(q, qd) / n
-        alpha = 2.0 * _vector(q, qdd) / n - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
-        down = np.broadcast_to(-gravity_W, (len(t), 3))
-        return _in_P(q, n, second[:, :3]), _in_P(q, n, down), omega, alpha
+        omega = 2.0 * _relative_vector(q, qd) / n
+        alpha = (
+            2.0 * _relative_vector(q, qdd) / n
+            - 2.0 * omega * np.sum(q * qd, axis=1, keepdims=True) / n
+        )
+        gravity_rows = np.broadcast_to(-gravity_W, (len(t), 3))
+        return _in_P(q, n, second[:, :3]), _in_P(q, n, gravity_rows), omega, alpha
 
     def noise(self) -> tuple[float, float]:
-        """Standard deviations per axis of position [m] and turn [rad], as if they were white.
+        """Return standard deviations per axis of position [m] and rotation [rad].
 
-        From what the splines leave just above the frequencies that they pass: coloured noise has
-        more there than at higher ones. With an aid it is known from splines without.
+        They come from residuals just above the passed frequencies, because noise can be coloured.
         """
-        if self.aid is not None:
-            place_power, turn_power = self.aid.pose_powers
-            return float(np.sqrt(place_power * self.rate)), float(np.sqrt(turn_power * self.rate))
+        if self.imu_rows is not None:
+            position_power, rotation_power = self.imu_rows.pose_powers
+            return float(np.sqrt(position_power * self.rate)), float(
+                np.sqrt(rotation_power * self.rate)
+            )
         sums, count = np.zeros(2), 0
-        for part in self._parts:
+        for part in self._blocks:
             fitted = self._spline(self.poses.t[part] - self._start)
             position = self.poses.position[part] - fitted[:, :3]
-            turn = 2.0 * _vector(fitted[:, 3:], self.poses.quaternion[part])
-            powers = self._powers(position), self._powers(turn)
+            turn = 2.0 * _relative_vector(fitted[:, 3:], self.poses.quaternion[part])
+            powers = self._noise_powers(position), self._noise_powers(turn)
             sums, count = sums + np.sum(powers, axis=(1, 2)), count + np.size(powers[0])
-        place_std, turn_std = np.sqrt(sums / count)
-        return float(place_std), float(turn_std)
+        position_std, rotation_std = np.sqrt(sums / count)
+        return float(position_std), float(rotation_std)
 
-    def _powers(self, residual: Array) -> Array:
-        """(3, m) powers of (K, 3) residuals at the frequencies that show the noise."""
+    def _noise_powers(self, residual: Array) -> Array:
         n = len(residual)
         frequency = np.fft.rfftfreq(n, 1.0 / self.rate)
         low, high = (share / self.spacing for share in _NOISE_BAND)
@@ -244,37 +225,36 @@ class PoseSplines:
         return np.array([np.abs(np.fft.rfft(x)[inside]) ** 2 / n for x in residual.T])
 
 
-class Choice:
-    """Splines of the same poses with knots of several distances, each fitted once."""
+class SplineCache:
+    """Splines of the same poses with several knot distances, each fitted once."""
 
-    def __init__(self, poses: Poses, aid: Aid | None = None) -> None:
-        """`poses` with continuous signs."""
-        self.poses, self.aid = poses, aid
-        self._fitted: dict[float, PoseSplines] = {}
+    def __init__(self, poses: Poses, imu_rows: ImuRows | None = None) -> None:
+        self.poses, self.imu_rows = poses, imu_rows
+        self._fit: dict[float, PoseSplines] = {}
 
     @property
     def rate(self) -> float:
-        """Of what they are fitted to [Hz]."""
-        return self.poses.rate + (0.0 if self.aid is None else self.aid.rate)
+        """Rate of the fitted rows [Hz]."""
+        return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
-        """Those with knots at this distance [s]."""
-        if spacing not in self._fitted:
-            self._fitted[spacing] = PoseSplines(self.poses, spacing, self.aid)
-        return self._fitted[spacing]
+        """Return the splines with this knot distance [s]."""
+        if spacing not in self._fit:
+            self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
+        return self._fit[spacing]
 
 
 def passed(frequency: Array, spacing: float) -> Array:
-    """Share of white noise's power that splines pass (module docstring)."""
+    """Return the share of white noise's power that splines pass, Eq. (T72)."""
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
 
 
-def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
-    """Uniform ones, without those that no sample stands before: over a gap goes one polynomial."""
+def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
+    """Return uniform knots, without those in gaps of the samples."""
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
-    if aided:
+    if with_imu:
         return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
     before = np.searchsorted(t, inner)
     first = np.unique(before, return_index=True)[1]
@@ -283,33 +263,30 @@ def _knots(t: Array, spacing: float, *, aided: bool = False) -> Array:
     return np.concatenate([ends[: DEGREE + 1], inner, ends[DEGREE + 1 :]])
 
 
-def _sparser(knots: Array, t: Array) -> Array:
-    """Those with `FEWEST_PER_KNOT` samples between any two."""
+def _thin_knots(knots: Array, t: Array) -> Array:
+    """Return knots with at least `MIN_POSES_PER_KNOT` samples between them."""
     inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
-        if min(before - last, len(t) - before) >= FEWEST_PER_KNOT:
+        if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:
             kept.append(knot)
             last = before
     return np.concatenate([knots[: DEGREE + 1], kept, knots[-DEGREE - 1 :]])
 
 
-def _parts(count: int) -> list[slice]:
-    return [slice(k, k + _CHUNK) for k in range(0, count, _CHUNK)]
+def _row_blocks(count: int) -> list[slice]:
+    return [slice(k, k + _CHUNK_ROWS) for k in range(0, count, _CHUNK_ROWS)]
 
 
 def _normal(
     parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
-    """Upper band (degree + 1, n) and right-hand side (n, width) of the normal equations.
-
-    Of splines next to values (k, width) at times (k,), part after part.
-    """
+    """Return band (degree + 1, n) and right side (n, width) of the normal equations."""
     size, order = len(knots) - degree - 1, degree + 1
     band, right = np.zeros((order, size)), np.zeros((size, width))
     for t, x in parts:
         A = BSpline.design_matrix(t, knots, degree)
         basis, first = A.data.reshape(-1, order), A.indices[::order]
-        starts = np.flatnonzero(np.diff(first, prepend=-1))  # of the rows between two knots
+        starts = np.flatnonzero(np.diff(first, prepend=-1))  # first row after each knot
         columns = np.hstack([basis, x])
         for i in range(order):
             sums = np.add.reduceat(basis[:, i : i + 1] * columns[:, i:], starts)
@@ -321,15 +298,15 @@ def _normal(
 
 
 def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    """`_normal` of values x (k, width) that the derivatives of this order are next to."""
+    """Return the same for values of a derivative of the spline."""
     change = eye_array(len(knots) - DEGREE - 1, format="csr")
-    for k in range(order):  # coefficients of a derivative, from those of what it is one of
+    for k in range(order):  # maps coefficients of a spline to those of its derivative
         inner, degree = knots[k : len(knots) - k], DEGREE - k
         span = inner[degree + 1 : -1] - inner[1 : -degree - 1]
         n = len(span)
         step = diags_array([-degree / span, degree / span], offsets=[0, 1], shape=(n, n + 1))
         change = step @ change
-    degree, parts = DEGREE - order, _parts(len(t))
+    degree, parts = DEGREE - order, _row_blocks(len(t))
     inner = knots[order : len(knots) - order]
     band, right = _normal(((t[p], x[p]) for p in parts), inner, degree, x.shape[1])
     upper = diags_array(
@@ -342,15 +319,15 @@ def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Arra
     return out, change.T @ right
 
 
-def _vector(q: Array, p: Array) -> Array:
-    """(N, 3) vector part of q* p."""
+def _relative_vector(q: Array, p: Array) -> Array:
+    """Return (N, 3) vector part of q* p."""
     v, w = q[:, 1:], p[:, 1:]
     out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
     return out
 
 
-def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
-    """(N, 3) vectors in the axes of P, of such in the world."""
+def _in_P(q: Array, n: Array, x: Array) -> Array:
+    """Return (N, 3) world vectors in the axes of P."""
     v = -q[:, 1:]
     once = _cross(v, x)
     out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
@@ -358,7 +335,7 @@ def _in_P(q: Array, n: Array, x: NDArray[np.float64]) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """(N, 3) in a fifth of the time that numpy takes."""
+    """Return (N, 3) cross products, five times faster than NumPy."""
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

@@ -1,4 +1,4 @@
-"""Signals on one clock: resampling, low-pass, differentiation, moving the motion in time."""
+"""Resampling, zero-phase low-pass, differentiation and time shift of signals."""
 
 from __future__ import annotations
 
@@ -9,28 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 
-_FEWEST = 8
-_CHUNK = 2**18
-_SMOOTHER_SAMPLES = 9
-_SMOOTHER_DEGREE = 5
+_MIN_SAMPLES = 8
+_CHUNK_ROWS = 2**18
+_MIN_WINDOW_SAMPLES = 9
+_POLYNOMIAL_DEGREE = 5
 SMOOTHER_WINDOW = 1.8
-"""Length of the smoother's window [s] times the bandwidth [Hz]."""
+"""Window length [s] of the smoother times its bandwidth [Hz]."""
 
 
-def spacing(t: NDArray[np.float64]) -> float:
-    """Mean step of (N,) times."""
+def spacing(t: Array) -> float:
+    """Return the mean step of (N,) times."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
-def uniform_times(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Equidistant times over the same span at the median rate; `t` itself if it is so already.
-
-    Args:
-        t: (N,) increasing times.
-    """
+def uniform_times(t: Array) -> Array:
+    """Return equidistant times over the span of `t` (N,) at its median rate, or `t` itself."""
     even = np.linspace(t[0], t[-1], len(t))
     if np.abs(t - even).max() < 1e-3 * spacing(t):
         return t
@@ -38,23 +35,19 @@ def uniform_times(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return t[0] + dt * np.arange(int((t[-1] - t[0]) / dt + 1e-6) + 1)
 
 
-def resample(
-    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Linear interpolation of (N, ...) signals at the times `t` to `t_new`; ends are held."""
+def resample(t_new: Array, t: Array, x: Array) -> Array:
+    """Interpolate (N, ...) samples linearly at `t_new`; hold the end values."""
     if np.array_equal(t_new, t):
         return x
     out = np.empty((len(t_new), *x.shape[1:]))
-    for start in range(0, len(t_new), _CHUNK):  # so that temporaries stay small
-        part = slice(start, start + _CHUNK)
-        out[part] = _interpolated(t_new[part], t, x)
+    for start in range(0, len(t_new), _CHUNK_ROWS):  # limits the memory of temporaries
+        part = slice(start, start + _CHUNK_ROWS)
+        out[part] = _interpolate(t_new[part], t, x)
     return out
 
 
-def _interpolated(
-    t_new: NDArray[np.float64], t: NDArray[np.float64], x: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    # One search serves all columns; np.interp would search, and copy, for each.
+def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
+    # A single search for all columns is faster than np.interp for each.
     before = np.searchsorted(t[1:-1], t_new, side="right")
     start, end = t[before], t[before + 1]
     share = np.minimum(np.maximum((t_new - start) / (end - start), 0.0), 1.0)
@@ -63,25 +56,18 @@ def _interpolated(
     return first + share * (x.take(before + 1, axis=0) - first)
 
 
-def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDArray[np.float64]:
-    """Zero-phase low-pass along the first axis, done in the frequency domain.
+def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
+    """Filter (N, ...) samples of spacing `dt` [s] without phase shift, Eq. (T10).
 
-    The gain is 1 / (1 + (f / cutoff)^4): a second-order Butterworth filter run forward and
-    backward, half the amplitude at `cutoff_hz`. The ends are continued by point reflection
-    (2 x_0 - x_k), which keeps value and slope. Filters in time (`scipy.signal.sosfiltfilt`) have
-    this gain only far below the Nyquist rate, where the bilinear transform does not bend it.
-
-    Args:
-        x: (N, ...) samples.
-        dt: their spacing [s].
-        cutoff_hz: None, or anything above the Nyquist rate, leaves `x` as it is.
+    The ends are continued by point reflection. A cut-off of None or above the Nyquist rate changes
+    nothing. `scipy.signal.sosfiltfilt` has another gain near that rate.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
     n = len(x)
     pad = min(n - 1, math.ceil(3 / (cutoff_hz * dt)))
-    # A length without large prime factors is several times faster. What it takes more than the
-    # record and its continuations leads from the one's end to the other's start.
+    # A length without large prime factors is several times faster. The additional samples
+    # connect the two continuations by a straight line.
     length = next_fast_len(n + 2 * pad, real=True)
     gain = 1 / (1 + (np.fft.rfftfreq(length, dt) / cutoff_hz) ** 4)
     out, padded = np.empty((n, x.size // n)), np.empty(length)
@@ -97,27 +83,12 @@ def low_pass(x: NDArray[np.float64], dt: float, cutoff_hz: float | None) -> NDAr
 
 
 def smooth_derivatives(
-    x: NDArray[np.float64], dt: float, bandwidth_hz: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Signals and their first two derivatives, by sliding least-squares fits of quintics.
+    x: Array, dt: float, bandwidth_hz: float | None
+) -> tuple[Array, Array, Array]:
+    """Return x, dx/dt and d^2x/dt^2 of (N, ...) samples by sliding polynomials of degree 5.
 
-    The smoother of Savitzky and Golay (1964): around each sample a polynomial of degree 5 is
-    fitted to a window of 1.8 / `bandwidth_hz`, at least 9 samples; at the ends the outermost
-    polynomials are continued. White noise of standard deviation sigma comes out, away from the
-    ends, as sigma * `noise_gain`.
-
-    `scipy.signal.savgol_filter` fits the same polynomials, but in powers of the sample's number:
-    within 2e-13 of these for a window of 19 samples, 3e-7 for 721, and wrong by more than the
-    signal for 1441 (8 kHz, 10 Hz), where it takes powers for rounding. It is also half as fast.
-
-    Args:
-        x: (N, ...) equidistant samples, N >= 9.
-        dt: their spacing [s].
-        bandwidth_hz: where the gain of the second derivative has fallen to 0.43 (it is 0.985 at a
-            third of that; the lower derivatives are wider); None for the shortest window.
-
-    Returns:
-        x, dx/dt, d^2x/dt^2, each shaped as `x`.
+    This is the filter of Savitzky and Golay (1964). The window is 1.8 / `bandwidth_hz` [s], at
+    least 9 samples. `scipy.signal.savgol_filter` is inaccurate above 700 samples.
     """
     n = len(x)
     weights = smoother(n, dt, bandwidth_hz)
@@ -130,37 +101,29 @@ def smooth_derivatives(
     tau = dt * np.arange(1, half + 1)
     derivatives = []
     for order in range(3):
-        before = _polynomial([c[0] for c in inner], -tau[::-1], order)
-        after = _polynomial([c[-1] for c in inner], tau, order)
+        before = _differentiate_polynomials([c[0] for c in inner], -tau[::-1], order)
+        after = _differentiate_polynomials([c[-1] for c in inner], tau, order)
         middle = math.factorial(order) * inner[order]
         derivatives.append(np.concatenate([before, middle, after]).reshape(x.shape))
     return derivatives[0], derivatives[1], derivatives[2]
 
 
-def noise_gain(dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
-    """(3,) white-noise gains of `smooth_derivatives`: of x [1], dx/dt [1/s], d^2x/dt^2 [1/s^2]."""
+def noise_gain(dt: float, bandwidth_hz: float | None) -> Array:
+    """Return (3,) white-noise gains of `smooth_derivatives`: [1], [1/s], [1/s^2]."""
     weights = smoother(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
-def smoother(n: int, dt: float, bandwidth_hz: float | None) -> NDArray[np.float64]:
-    """(6, w) weights of a window's samples in the coefficients of its polynomial.
-
-    Args:
-        n: samples that there are; the window is not longer.
-        dt, bandwidth_hz: see `smooth_derivatives`.
-    """
+def smoother(n: int, dt: float, bandwidth_hz: float | None) -> Array:
+    """Return (6, w) weights from the samples of a window to polynomial coefficients; w <= n."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
-    half = max(_SMOOTHER_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
-    powers = np.vander(np.arange(-half, half + 1) / half, _SMOOTHER_DEGREE + 1, increasing=True)
-    # Fitted on -1 ... 1, where the powers are of one size, then scaled to seconds.
-    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_SMOOTHER_DEGREE + 1)[:, None]
+    half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
+    powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
+    # The interval -1 ... 1 makes the fit well-conditioned; then scale to seconds.
+    return np.linalg.pinv(powers) / (half * dt) ** np.arange(_POLYNOMIAL_DEGREE + 1)[:, None]
 
 
-def _polynomial(
-    coefficients: list[NDArray[np.float64]], tau: NDArray[np.float64], order: int
-) -> NDArray[np.float64]:
-    """(len(tau), k) derivative of the polynomials with coefficients (k,), lowest power first."""
+def _differentiate_polynomials(coefficients: list[Array], tau: Array, order: int) -> Array:
     terms = [
         math.perm(power, order) * np.outer(tau ** (power - order), c)
         for power, c in enumerate(coefficients)
@@ -169,36 +132,24 @@ def _polynomial(
     return np.sum(terms, axis=0)
 
 
-def angular_motion(
-    R_WS: NDArray[np.float64], dt: float, bandwidth_hz: float | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Angular velocity and acceleration in S from equidistant orientations.
+def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[Array, Array]:
+    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3).
 
-    omega is the skew part of R' dR/dt. As its derivative, R' d^2R/dt^2 + (dR/dt)' dR/dt, has a
-    symmetric second term, alpha is the skew part of R' d^2R/dt^2. Derivatives as in
-    `smooth_derivatives`.
-
-    Args:
-        R_WS: (N, 3, 3) rotations.
-        dt: their spacing [s].
-        bandwidth_hz: of the smoother.
-
-    Returns:
-        omega_WS_S (N, 3) [rad/s], alpha_WS_S (N, 3) [rad/s^2].
+    They are the skew parts of R^T dR/dt and R^T d^2R/dt^2.
     """
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
     return _skew_part(R_SW @ first), _skew_part(R_SW @ second)
 
 
-def _skew_part(A: NDArray[np.float64]) -> NDArray[np.float64]:
+def _skew_part(A: Array) -> Array:
     return 0.5 * np.stack(
         [A[:, 2, 1] - A[:, 1, 2], A[:, 0, 2] - A[:, 2, 0], A[:, 1, 0] - A[:, 0, 1]], axis=1
     )
 
 
 def low_passed(log: Log, cutoff_hz: float | None) -> Log:
-    """The log with wrench and motion through the same zero-phase `low_pass`; poses untouched."""
+    """Return the log with wrench and motion filtered by `low_pass`."""
     if log.static:
         return log
     return replace(
@@ -211,21 +162,15 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def undelayed(log: Log, delay_s: float) -> Log:
-    """The log with its motion moved forward in time by `delay_s`, at the instants of the wrench.
+    """Return the log with its motion advanced by its lag `delay_s` behind the wrench.
 
-    Args:
-        log: the log.
-        delay_s: how far the motion lags behind the wrench [s]; negative if it leads. The samples
-            whose motion is then unknown (one end of the record) are dropped.
-
-    Raises:
-        DrakeTeleopError: if hardly any samples are left.
+    Samples without motion are removed; an error is raised if fewer than 8 remain.
     """
     if log.static or delay_s == 0:
         return log
     at = log.t + delay_s
     known = (at >= log.t[0]) & (at <= log.t[-1])
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_SAMPLES:
         raise DrakeTeleopError(
             f"a delay of {delay_s:g} s leaves {known.sum()} of {len(log)} samples",
             where=log.source,
@@ -237,7 +182,7 @@ def undelayed(log: Log, delay_s: float) -> Log:
     )
     bridged = None
     if log.bridged is not None:
-        # A gap may be one of the wrench or one of the motion: where either would now be.
+        # A gap can belong to the wrench or to the motion, so both positions are flagged.
         moved = resample(at[known], log.t, log.bridged.astype(float)) > 0
         bridged = log.bridged[known] | moved
     return replace(
@@ -252,30 +197,14 @@ def undelayed(log: Log, delay_s: float) -> Log:
 
 
 def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """(N,) samples that owe nothing to a bridged gap, even after `low_pass`.
-
-    Two periods of the cut-off beside a gap are left out as well: beyond them its impulse response
-    has fallen to 1e-4 of its peak.
-
-    Args:
-        log: the log.
-        cutoff_hz: of the low-pass; None for none.
-    """
+    """Return (N,) flags of samples that no gap affects, even after a low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
 
 
 def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """(N,) samples within `length_s`, or a period of a low-pass, of either end of the record.
-
-    At most a quarter of the samples at either end; none of static poses.
-
-    Args:
-        log: the log.
-        length_s: [s].
-        cutoff_hz: of the low-pass; None for none.
-    """
+    """Return (N,) flags of samples within `length_s`, or a low-pass period, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out
@@ -287,7 +216,7 @@ def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_
 
 
 def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """`flags` (N,), true also where one within `by` samples is."""
+    """Return the (N,) flags, also set within `by` samples of a set flag."""
     count = np.concatenate([[0], np.cumsum(flags)])
     at = np.arange(len(flags))
     return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]

@@ -1,25 +1,8 @@
-"""ROS bags and MCAP files: a topic becomes a table whose columns are the messages' fields.
+"""ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
-A bag is a folder with metadata.yaml (sqlite3 or mcap storage), a lone .mcap or .db3 file, or a .bag
-of ROS 1. Message types are read from the bag itself, so that anybody's own will do; only bags
-without definitions (sqlite3 before ROS 2 Iron) have to do with the standard types. It takes the
-library rosbags, extra `ros`, but no ROS.
-
-Columns of a topic's table:
-
-==================== =============================================================================
-wrench.force.x       a number, by the path of its field
-covariance, data.0   an array of up to 64 numbers as a whole, and each of them
-force.x              short for a path that ends so, if only one does; of the standard groups force,
-                     torque, linear_acceleration, angular_velocity, orientation (also for a
-                     transform's rotation) and position (also for its translation)
-received             s, when the recorder received the message
-header.stamp         s, the stamp of its sender, unless all are zero; so any other time
-stamp                header.stamp, or received where there is none
-==================== =============================================================================
-
-Fields whose covariance begins with -1 in every message are not there: that is how ROS says that
-a sensor does not have them. Messages that hold `transforms` (TF) are taken apart.
+Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
+(`force.x`), `received`, `header.stamp` [s], and `stamp`, the latter if present. Groups with
+covariance -1 are absent, as in ROS.
 """
 
 from __future__ import annotations
@@ -47,13 +30,16 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 SUFFIXES = (".mcap", ".db3", ".bag")
-_LONGEST_ARRAY = 64
-_BLOCK, _RECEIVED = 10_000, "received at"
-# Of MCAP: what a chunk is, and how much larger than the file all of them may be [bytes].
-_CHUNK, _MOST_RATIO, _MOST_UNPACKED = 6, 200, 100_000_000
-_MOST_MEMORY = 1_500_000_000  # bytes
-_TOO_LARGE, _CUT = "unpacks to more than can be read", "cut it, or write the topics one by one"
-_GROUPS = {
+_MAX_ARRAY_LENGTH = 64
+_BLOCK_MESSAGES, _RECEIVED = 10_000, "received at"
+# MCAP: opcode of a chunk; limits of the total uncompressed size: ratio to the file, bytes.
+_CHUNK_OPCODE, _MAX_UNPACK_RATIO, _MAX_UNPACKED_BYTES = 6, 200, 100_000_000
+_MAX_MEMORY_BYTES = 1_500_000_000  # bytes
+_TOO_LARGE, _CUT_REMEDY = (
+    "its uncompressed size is too large",
+    "cut it, or write the topics one by one",
+)
+_GROUP_NAMES = {
     "force": "force",
     "torque": "torque",
     "linear_acceleration": "linear_acceleration",
@@ -63,7 +49,7 @@ _GROUPS = {
     "position": "position",
     "translation": "position",
 }
-_TYPES = {
+_STREAM_TYPES = {
     "wrench": ("WrenchStamped", "Wrench"),
     "imu": ("Imu",),
     "pose": (
@@ -75,18 +61,18 @@ _TYPES = {
         "TFMessage",
     ),
 }
-"""The types that a stream may be, the likeliest first."""
+"""Message types for each stream, the most likely first."""
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a bag.
+    """Topic of a bag.
 
-    Args:
+    Attributes:
         name: such as "/ft/wrench".
-        type: of its messages, such as "geometry_msgs/msg/WrenchStamped".
-        messages: how many there are.
-        rate_hz: messages over the duration of the bag; 0 for an empty one.
+        type: such as "geometry_msgs/msg/WrenchStamped".
+        messages: number of messages.
+        rate_hz: mean rate; 0 for an empty bag.
     """
 
     name: str
@@ -96,17 +82,13 @@ class Topic:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether the path looks like a bag: a folder with metadata.yaml, or one of `SUFFIXES`."""
+    """Return whether the path is a folder with metadata.yaml or ends in one of `SUFFIXES`."""
     return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in SUFFIXES
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """The topics of a bag by name.
-
-    Raises:
-        DrakeTeleopError: if there is no such bag, it cannot be read, or rosbags is missing.
-    """
-    with _opened(path) as reader:
+    """Return the topics of a bag by name; raise an error if it cannot be read."""
+    with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
             Topic(name, info.msgtype or "several", info.msgcount, info.msgcount / seconds)
@@ -117,19 +99,11 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """The messages of a topic as a table, see the top of this module.
+    """Return the messages of a topic as a table.
 
-    Args:
-        path: the bag.
-        topic: its name.
-        child_frame: of transforms and odometry, only those whose child_frame_id this is; may be
-            left out if there is one only.
-
-    Raises:
-        DrakeTeleopError: if the bag cannot be read, rosbags is missing, the topic is none of its or
-            empty, or the child frame is not or not clearly one of its.
+    Raises an error if bag, topic or child frame are missing, or the child frame is ambiguous.
     """
-    with _opened(path) as reader:
+    with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
         if not connections:
             known = [f"{name} ({info.msgtype})" for name, info in sorted(reader.topics.items())]
@@ -141,15 +115,15 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
         pairs = (
             (received, part)
             for connection, received, raw in reader.messages(connections)
-            for part in _parts(reader.deserialize(raw, connection.msgtype))
+            for part in _split_transforms(reader.deserialize(raw, connection.msgtype))
         )
-        blocks = _blocks(pairs, child_frame, f"{path}:{topic}")
+        blocks = _read_blocks(pairs, child_frame, f"{path}:{topic}")
     if not blocks:
         raise DrakeTeleopError("holds no messages", where=f"{path}:{topic}", remedy="record again")
-    columns = _joined(blocks)
+    columns = _join_blocks(blocks)
     received = columns.pop(_RECEIVED)
-    absent = _take_absent(columns)
-    columns |= _short(columns)
+    absent = _remove_absent_groups(columns)
+    columns |= _short_names(columns)
     columns["received"] = received
     if "header.stamp" in columns and not columns["header.stamp"].any():
         del columns["header.stamp"]
@@ -158,14 +132,7 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """The table behind a stream of a description: its file, or a topic of the bag.
-
-    Args:
-        stream: with an absolute path.
-
-    Raises:
-        DrakeTeleopError: if it cannot be read, or is a bag without a topic.
-    """
+    """Return the table of a stream: its file or topic. Raises an error without a topic."""
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -174,27 +141,18 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
 
 
 def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
-    """A draft of a log description: the topics whose types suit the streams.
-
-    Args:
-        path: the bag.
-        topics: what is in it.
-        folder: where the draft will be, which its path to the bag starts from.
-
-    Returns:
-        YAML text whose first lines say that it is a draft, and which other topics would do.
-    """
+    """Return a draft description as YAML with suitable topics and paths relative to `folder`."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
-    for stream, types in _TYPES.items():
+    for stream, types in _STREAM_TYPES.items():
         kinds = {topic.name: topic.type.split("/")[-1] for topic in topics if topic.messages}
-        suited = [name for kind in types for name in kinds if kinds[name] == kind]
-        if suited:
-            draft[stream] = {"file": file, "topic": suited[0]}
-        if suited and kinds[suited[0]] == "TFMessage":
+        suitable = [name for kind in types for name in kinds if kinds[name] == kind]
+        if suitable:
+            draft[stream] = {"file": file, "topic": suitable[0]}
+        if suitable and kinds[suitable[0]] == "TFMessage":
             draft[stream]["child_frame"] = "FILL IN"
-        others += [f"{name} ({stream})" for name in suited[1:]]
+        others += [f"{name} ({stream})" for name in suitable[1:]]
     if "wrench" in draft or not draft:
         draft["wrench"] = {"file": file, "topic": "FILL IN"} | draft.get("wrench", {}) | {"sign": 1}
     head = [
@@ -206,21 +164,21 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:
-    """The error for a bag of which no topic is named."""
+    """Return the error for a bag without a named topic."""
     return DrakeTeleopError(
-        "is a bag, which does not say what its topics are",
+        "is a bag, and no topic is specified",
         where=str(path),
         remedy="describe it, with `topic` in each stream; `drake-teleop inspect` drafts that",
     )
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[AnyReader]:
+def _open_bag(path: Path) -> Iterator[AnyReader]:
     if not os.path.exists(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     if not is_bag(path):
         raise DrakeTeleopError(
-            "is no bag",
+            "is not a bag",
             where=str(path),
             remedy="give a folder with metadata.yaml, or a .mcap, .db3 or .bag file",
         )
@@ -236,15 +194,15 @@ def _opened(path: Path) -> Iterator[AnyReader]:
     try:
         for file in path.iterdir() if path.is_dir() else [path]:
             if file.suffix.lower() == ".mcap":
-                _check_unpacked(file)
+                _check_unpacked_size(file)
         standard = get_typestore(Stores.LATEST)
-        with _little_memory(), AnyReader([path], default_typestore=standard) as reader:
+        with _limit_memory(), AnyReader([path], default_typestore=standard) as reader:
             yield reader
     except DrakeTeleopError:
         raise
     except MemoryError:
-        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT) from None
-    # A damaged file fails somewhere in rosbags, or in the libraries below it, in many ways.
+        raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY) from None
+    # Damaged files cause many kinds of exceptions in rosbags and its libraries.
     except Exception as error:
         text = (str(error).splitlines() or [""])[0] or type(error).__name__
         raise DrakeTeleopError(
@@ -252,55 +210,54 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         ) from error
 
 
-def _check_unpacked(path: Path) -> None:
-    """Refuse an MCAP file whose chunks say that they are far larger than measured data get."""
-    total, most = 0, path.stat().st_size * _MOST_RATIO + _MOST_UNPACKED
+def _check_unpacked_size(path: Path) -> None:
+    """Reject an MCAP file whose chunks declare an implausible uncompressed size."""
+    total, limit = 0, path.stat().st_size * _MAX_UNPACK_RATIO + _MAX_UNPACKED_BYTES
     with path.open("rb") as file:
         file.seek(8)
-        while len(head := file.read(33)) == 33:  # of a record; of a chunk with times and size
+        while len(head := file.read(33)) == 33:  # head of a record
             length = int.from_bytes(head[1:9], "little")
-            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK else 0
-            file.seek(min(length - 24, most), 1)
-            if total > most:
-                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT)
+            total += int.from_bytes(head[25:33], "little") if head[0] == _CHUNK_OPCODE else 0
+            file.seek(min(length - 24, limit), 1)
+            if total > limit:
+                raise DrakeTeleopError(_TOO_LARGE, where=str(path), remedy=_CUT_REMEDY)
 
 
 @contextmanager
-def _little_memory() -> Iterator[None]:
-    """MemoryError for more than `_MOST_MEMORY` more, whatever a compressed block unpacks to."""
+def _limit_memory() -> Iterator[None]:
+    """Raise MemoryError for more than `_MAX_MEMORY_BYTES` additional bytes (Linux only)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except OSError:  # not on Linux, which alone keeps such a limit
+    except OSError:  # only Linux enforces this limit
         yield
         return
-    most = pages * resource.getpagesize() + _MOST_MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (most if soft < 0 else min(most, soft), hard))
+    limit = pages * resource.getpagesize() + _MAX_MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit if soft < 0 else min(limit, soft), hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _parts(message: Any) -> list[Any]:
+def _split_transforms(message: Any) -> list[Any]:
     return getattr(message, "transforms", [message])
 
 
-def _blocks(
+def _read_blocks(
     pairs: Iterator[tuple[int, Any]], child_frame: str | None, where: str
 ) -> list[dict[str, NDArray]]:
-    """The columns of every so many messages, which take a tenth of the memory of the messages."""
     children: set[str] = set()
     blocks: list[dict[str, NDArray]] = []
 
-    def of_child() -> Iterator[tuple[int, Any]]:
+    def select_child() -> Iterator[tuple[int, Any]]:
         for received, part in pairs:
             children.add(getattr(part, "child_frame_id", ""))
             if child_frame in (None, getattr(part, "child_frame_id", "")):
                 yield received, part
 
-    found = of_child()
-    while block := list(itertools.islice(found, _BLOCK)):
+    found = select_child()
+    while block := list(itertools.islice(found, _BLOCK_MESSAGES)):
         received = {_RECEIVED: np.array([time for time, _ in block]) * 1e-9}
         blocks.append(_columns([part for _, part in block]) | received)
     if (child_frame is None and len(children) > 1) or (child_frame and child_frame not in children):
@@ -314,8 +271,7 @@ def _blocks(
     return blocks
 
 
-def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
-    """The columns that all blocks have, with as many numbers in a row."""
+def _join_blocks(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
     return {
         name: np.concatenate([block[name] for block in blocks])
         for name, values in blocks[0].items()
@@ -324,9 +280,8 @@ def _joined(blocks: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 
 def _columns(messages: list[Any]) -> dict[str, NDArray]:
-    """Every number, time and short array of the messages by its path."""
     columns: dict[str, NDArray] = {}
-    for path, sample in _leaves(messages[0], ""):
+    for path, sample in _numeric_fields(messages[0], ""):
         get = attrgetter(path)
         values = [get(message) for message in messages]
         if hasattr(sample, "nanosec"):
@@ -341,20 +296,20 @@ def _columns(messages: list[Any]) -> dict[str, NDArray]:
     return columns
 
 
-def _leaves(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
     for field in dataclasses.fields(message):
         value, path = getattr(message, field.name), prefix + field.name
         if hasattr(value, "nanosec") or isinstance(value, (bool, int, float, np.number)):
             yield path, value
         elif isinstance(value, np.ndarray):
-            if value.dtype.kind in "fiu" and 0 < len(value) <= _LONGEST_ARRAY:
+            if value.dtype.kind in "fiu" and 0 < len(value) <= _MAX_ARRAY_LENGTH:
                 yield path, value
         elif dataclasses.is_dataclass(value):
-            yield from _leaves(value, f"{path}.")
+            yield from _numeric_fields(value, f"{path}.")
 
 
-def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
-    """The groups that their covariance calls not provided; they are taken out of `columns`."""
+def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
+    """Remove groups whose covariance begins with -1; return their names."""
     absent = tuple(
         name.removesuffix("_covariance")
         for name, values in columns.items()
@@ -365,11 +320,11 @@ def _take_absent(columns: dict[str, NDArray]) -> tuple[str, ...]:
     return absent
 
 
-def _short(columns: dict[str, NDArray]) -> dict[str, NDArray]:
-    """The standard groups by their short names, where only one path ends so."""
+def _short_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Return columns of the standard groups by unique short name."""
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]
-        if group in _GROUPS and axis in ("x", "y", "z", "w"):
-            found.setdefault(f"{_GROUPS[group]}.{axis}", []).append(path)
+        if group in _GROUP_NAMES and axis in ("x", "y", "z", "w"):
+            found.setdefault(f"{_GROUP_NAMES[group]}.{axis}", []).append(path)
     return {short: columns[paths[0]] for short, paths in found.items() if len(paths) == 1}

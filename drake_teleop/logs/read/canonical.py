@@ -1,8 +1,8 @@
-"""The canonical log: wrench and motion of the sensor frame S at common instants."""
+"""Canonical log: wrench and motion of the sensor frame S at common instants."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,25 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.writing import write_table
 from drake_teleop.logs.pose_motion.poses import Posed
-from drake_teleop.logs.read.clocks import SLOWEST
-from drake_teleop.logs.read.description import (
-    Acceleration,
-    AngularAcceleration,
-    AngularVelocity,
-    Description,
-    Force,
-    Imu,
-    Orientation,
-    Pose,
-    Position,
-    Static,
-    Time,
-    Torque,
-    Wrench,
-)
+from drake_teleop.logs.read.clocks import MIN_RATE_HZ
+from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.logs.read.tables import Table
 
@@ -39,85 +26,77 @@ ANGULAR_VELOCITY = ("omega_x", "omega_y", "omega_z")
 ANGULAR_ACCELERATION = ("alpha_x", "alpha_y", "alpha_z")
 ORIENTATION = ("q_w", "q_x", "q_y", "q_z")
 POSITION = ("p_x", "p_y", "p_z")
-_REST = 0.05  # rad/s
-_TURN = np.radians(10.0)
-_ARRAYS = (
-    "t",
-    "wrench",
-    "specific_force",
-    "angular_velocity",
-    "angular_acceleration",
-    "gravity",
-    "bridged",
-    "R_WS",
-)
+_KINEMATICS = {
+    "specific_force": SPECIFIC_FORCE,
+    "angular_velocity": ANGULAR_VELOCITY,
+    "angular_acceleration": ANGULAR_ACCELERATION,
+    "orientation": ORIENTATION,
+    "position": POSITION,
+}
+_MAX_REST_SPEED = 0.05  # rad/s
+_MIN_TURN = np.radians(10.0)
+_ROW_SHAPES: dict[str, tuple[int, ...]] = {
+    "t": (),
+    "wrench": (6,),
+    "specific_force": (3,),
+    "angular_velocity": (3,),
+    "angular_acceleration": (3,),
+    "gravity": (3,),
+    "bridged": (),
+    "R_WS": (3, 3),
+}
 
 
 @dataclass(frozen=True)
 class Log:
-    """What identification and elimination need: N samples on one clock, frame S, SI units.
+    """Wrench and motion of the sensor frame S: N samples on one clock, SI units.
 
-    Args:
-        t: (N,) time, uniformly spaced [s]; for static poses merely their number.
-        wrench: (N, 6) [f; tau] with the sign of Eq. (1): what the sensor exerts on the load, about
-            the origin of S [N, N m].
-        specific_force: (N, 3) s = a - g of the origin of S, in S [m/s^2].
+    Attributes:
+        t: (N,) uniform time [s]; row numbers for static poses.
+        wrench: (N, 6) [f; tau] that the sensor exerts on the load, about So, Eq. (1) [N, N m].
+        specific_force: (N, 3) s = a - g of So, in S [m/s^2].
         angular_velocity: (N, 3) omega_WS_S [rad/s].
         angular_acceleration: (N, 3) alpha_WS_S [rad/s^2].
-        gravity: (N, 3) g_S, gravity in S [m/s^2], if the orientation is known.
-        static: the samples are separate poses at rest; there is nothing to filter or to shift.
-        bridged: (N,) where a straight line stands in for samples that a stream does not have; None
-            if there are no gaps.
-        notes: what the reader had to assume, in words.
-        source: the file, for messages.
-        posed: the poses themselves, on the clock of `t`, where they have positions.
-        gain_std: standard deviation of the sensor's gains, as stated.
-        R_WS: (N, 3, 3) orientation of S, where `gravity` is from it.
-        gravity_W: (3,) gravity in the world [m/s^2], likewise.
-        one_sided_s: length of either end in which derivatives have samples on one side only [s].
-        described: the description, with what was found in the place of `auto`.
-        free: parts of `drake_teleop.logs.causes.model.Model` that the description leaves to the
-            data: "gravity" for `gravity: auto`, "weight" for `wrench.weight: removed`.
-        resolution: step of the file's numbers of force and torque [N, N m], of static poses.
+        gravity: (N, 3) in S [m/s^2], or None.
+        static: the samples are separate poses at rest.
+        bridged: (N,) samples interpolated over gaps, or None.
+        notes: assumptions of the reader.
+        source: file name for messages.
+        posed: recorded poses, if they have positions.
+        gain_std: stated standard deviation of the sensor gains.
+        R_WS: (N, 3, 3) orientation, or None.
+        gravity_W: (3,) in the world [m/s^2], or None.
+        one_sided_s: length of each end with one-sided derivatives [s].
+        described: the description, with estimates for `auto`.
+        free: causes left to the data: "gravity" and "weight".
+        resolution: step of force and torque of static poses [N, N m].
 
     Raises:
-        DrakeTeleopError: if the arrays do not fit each other, hold NaN or infinity, or `t` does not
-            increase.
+        DrakeTeleopError: for wrong shapes, values that are not finite, or decreasing `t`.
     """
 
-    t: NDArray[np.float64]
-    wrench: NDArray[np.float64]
-    specific_force: NDArray[np.float64]
-    angular_velocity: NDArray[np.float64]
-    angular_acceleration: NDArray[np.float64]
-    gravity: NDArray[np.float64] | None = None
+    t: Array
+    wrench: Array
+    specific_force: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+    gravity: Array | None = None
     static: bool = False
     bridged: NDArray[np.bool_] | None = None
     notes: tuple[str, ...] = ()
     source: str = "log"
     posed: Posed | None = None
     gain_std: float = 0.0
-    R_WS: NDArray[np.float64] | None = None
-    gravity_W: NDArray[np.float64] | None = None
+    R_WS: Array | None = None
+    gravity_W: Array | None = None
     one_sided_s: float = 0.0
     described: Description | None = None
     free: tuple[str, ...] = ()
     resolution: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        n = len(self.t)
-        shapes = {
-            "t": (n,),
-            "wrench": (n, 6),
-            "specific_force": (n, 3),
-            "angular_velocity": (n, 3),
-            "angular_acceleration": (n, 3),
-            "gravity": (n, 3),
-            "bridged": (n,),
-            "R_WS": (n, 3, 3),
-        }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
+        for name, row_shape in _ROW_SHAPES.items():
+            value, shape = getattr(self, name), (len(self.t), *row_shape)
             if value is None:
                 continue
             if np.shape(value) != shape:
@@ -138,43 +117,31 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Time between samples [s]; where samples in gaps were taken out, between the others."""
+        """Sample spacing [s], without steps across removed gaps."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
     def earlier(self, start: float) -> Log:
-        """The same with the times since `start` [s]."""
+        """Return the log with times relative to `start` [s]."""
         posed = None if self.posed is None else self.posed.earlier(start)
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:
-        """These samples of the log.
-
-        Args:
-            rows: which.
-        """
+        """Return the log with the selected rows."""
         if not isinstance(rows, slice) and rows.all():
             return self
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        taken: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
-        return replace(self, **taken)
+        arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
+        selected: dict[str, Any] = {k: None if x is None else x[rows] for k, x in arrays.items()}
+        return replace(self, **selected)
 
     @property
-    def motion(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """(specific_force, angular_velocity, angular_acceleration), the order of every function."""
+    def motion(self) -> tuple[Array, Array, Array]:
+        """Specific force, angular velocity and angular acceleration."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Writes a log as a canonical table: columns t, f_x ... alpha_z.
-
-    Args:
-        log: the log.
-        path: where to; ends in .csv or .parquet.
-
-    Raises:
-        DrakeTeleopError: for another suffix.
-    """
+    """Write a log as a canonical table; raise an error unless it is .csv or .parquet."""
     import polars as pl
 
     path = Path(path)
@@ -191,17 +158,10 @@ def write_log(log: Log, path: str | Path) -> None:
 
 
 def describe_canonical(path: Path, table: Table) -> Description:
-    """The description of a canonical table, so that there is one way of reading.
+    """Return the description of a canonical table.
 
-    Rows at rest are understood as static poses: those without `t`, or slower than any log of motion
-    and with gravity in S turned by more than 10 deg from row to row, at least once in five rows.
-
-    Args:
-        path: the table's file.
-        table: what is in it.
-
-    Raises:
-        DrakeTeleopError: if the wrench, or the kinematics and the pose in their place, are absent.
+    Rows without `t` are static poses. So are rows slower than 5 Hz, if gravity turns by more than
+    10 deg in a fifth of the steps. Raises an error if wrench or kinematics are absent.
     """
 
     def present(names: Sequence[str]) -> bool:
@@ -212,79 +172,58 @@ def describe_canonical(path: Path, table: Table) -> Description:
 
     if not {"t", *WRENCH} & set(table.columns):
         raise DrakeTeleopError(
-            "is no canonical log: it has none of the columns t, f_x ... tau_z",
+            "is not a canonical log: it has none of the columns t, f_x ... tau_z",
             where=str(path),
             remedy="describe it in a YAML file (docs/logs.md); `drake-teleop inspect` drafts one",
         )
     table.numbers(WRENCH, 6, str(path))
-    s, omega, alpha, q, p = (
-        present(names)
-        for names in (
-            SPECIFIC_FORCE,
-            ANGULAR_VELOCITY,
-            ANGULAR_ACCELERATION,
-            ORIENTATION,
-            POSITION,
-        )
-    )
-    force, torque = Force(columns=WRENCH[:3]), Torque(columns=WRENCH[3:])
-    orientation = Orientation(columns=ORIENTATION, form="quaternion_wxyz") if q else None
-    specific_force = Acceleration(columns=SPECIFIC_FORCE) if s else None
-    if _at_rest(table, s, omega, q):
-        kinematics = {"orientation": orientation} if q else {"specific_force": specific_force}
-        return Description(static=Static(file=path, force=force, torque=torque, **kinematics))
-    if not q and not (s and omega):
-        missing = "s_x s_y s_z" if not s else "omega_x omega_y omega_z"
+    fields: dict[str, dict[str, Any]] = {
+        name: {"columns": names} for name, names in _KINEMATICS.items() if present(names)
+    }
+    if "orientation" in fields:
+        fields["orientation"]["form"] = "quaternion_wxyz"
+    wrench = {"file": path, "force": {"columns": WRENCH[:3]}, "torque": {"columns": WRENCH[3:]}}
+    if _at_rest(table, fields):
+        kinematics = "orientation" if "orientation" in fields else "specific_force"
+        return Description.model_validate({"static": wrench | {kinematics: fields[kinematics]}})
+    if "orientation" not in fields and not {"specific_force", "angular_velocity"} <= fields.keys():
+        missing = ANGULAR_VELOCITY if "specific_force" in fields else SPECIFIC_FORCE
         raise DrakeTeleopError(
-            f"a wrench without kinematics: no columns {missing}",
+            f"a wrench without kinematics: no columns {' '.join(missing)}",
             where=str(path),
             remedy="add them, or the pose q_w q_x q_y q_z (and p_x p_y p_z)",
         )
     table.raw("t", str(path))
-    time = Time(column="t")
-    imu = pose = None
-    if s or omega:
-        imu = Imu(
-            file=path,
-            time=time,
-            specific_force=specific_force,
-            angular_velocity=AngularVelocity(columns=ANGULAR_VELOCITY) if omega else None,
-            angular_acceleration=AngularAcceleration(columns=ANGULAR_ACCELERATION)
-            if alpha
-            else None,
-        )
-    if orientation is not None:
-        pose = Pose(
-            file=path,
-            time=time,
-            orientation=orientation,
-            position=Position(columns=POSITION) if p else None,
-        )
-    wrench = Wrench(file=path, time=time, force=force, torque=torque)
-    return Description(wrench=wrench, imu=imu, pose=pose)
+    stream = {"file": path, "time": {"column": "t"}}
+    streams: dict[str, Any] = {"wrench": wrench | stream}
+    pose = {name: fields.pop(name) for name in ("orientation", "position") if name in fields}
+    if {"specific_force", "angular_velocity"} & fields.keys():
+        streams["imu"] = stream | fields
+    if "orientation" in pose:
+        streams["pose"] = stream | pose
+    return Description.model_validate(streams)
 
 
-def _at_rest(table: Table, s: bool, omega: bool, q: bool) -> bool:
-    """Whether the rows of a canonical table are poses at rest, see `describe_canonical`."""
-    where = str(table.path)
-    if not (s or q):
+def _at_rest(table: Table, fields: Container[str]) -> bool:
+    where, q = str(table.path), "orientation" in fields
+    if not q and "specific_force" not in fields:
         return False
-    if omega:
+    if "angular_velocity" in fields:
         speed = table.numbers(ANGULAR_VELOCITY, 3, where)
-        if np.median(np.linalg.norm(speed, axis=1)) > _REST:
+        if np.median(np.linalg.norm(speed, axis=1)) > _MAX_REST_SPEED:
             return False
     if "t" not in table.columns:
         return True
     t = table.single("t", where)
     if not np.isfinite(t).all():
-        return False  # the reader names the row
+        return False  # the reader raises an error that names the row
     steps = np.diff(t)
-    if not len(steps) or not np.median(steps) > 1 / SLOWEST:
+    if not len(steps) or not np.median(steps) > 1 / MIN_RATE_HZ:
         return False
     if q:
-        up = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
+        vertical = rotation_matrices(table.numbers(ORIENTATION, 4, where), "quaternion_wxyz")[:, 2]
     else:
-        up = table.numbers(SPECIFIC_FORCE, 3, where)
-    up = up / (np.linalg.norm(up, axis=1, keepdims=True) + 1e-300)
-    turned = np.arccos(np.clip((up[1:] * up[:-1]).sum(axis=1), -1.0, 1.0))
-    return bool(np.quantile(turned, 0.8) > _TURN)
+        vertical = table.numbers(SPECIFIC_FORCE, 3, where)
+    vertical = vertical / (np.linalg.norm(vertical, axis=1, keepdims=True) + 1e-300)
+    turned = np.arccos(np.clip((vertical[1:] * vertical[:-1]).sum(axis=1), -1.0, 1.0))
+    return bool(np.quantile(turned, 0.8) > _MIN_TURN)

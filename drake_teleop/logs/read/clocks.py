@@ -1,15 +1,14 @@
-"""The clock of one stream: what becomes of its time stamps, and where nothing was recorded.
+"""Clock of one stream: checks and corrections of its time stamps.
 
 =========================== ======================================================================
-time stamps                 outcome
+time stamps                 result
 =========================== ======================================================================
-missing (NaN)               the rows are left out, with a note
-repeated, rows identical    the repetitions are left out, with a note
-repeated, rows differ       bursts or coarse stamps: rows are spread evenly, see `spread`, with a
-                            note
-going back, or too uneven   an error that names the row
-of an absurd rate           an error that names the unit which would do
-gaps                        see `gaps`; what lies in them is not used
+missing (NaN)               rows are removed, with a note
+repeated, rows identical    repetitions are removed, with a note
+repeated, rows differ       rows are spaced evenly, see `spread`, with a note
+decreasing or too uneven    error that names the row
+implausible rate            error that proposes a unit
+gaps                        samples in them are not used, see `gaps`
 =========================== ======================================================================
 """
 
@@ -22,15 +21,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.description import UNITS, Time
 from drake_teleop.logs.read.tables import Table
 
-GAP = 4.0
-"""Steps longer than this many median steps may be gaps."""
-SLOWEST, FASTEST = 5.0, 1e5
-"""Rates outside are taken for a wrong unit [Hz]."""
-_SPARSE = 4.0
+MIN_GAP_STEPS = 4.0
+"""Least length of a gap in median steps."""
+MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
+"""Range of plausible rates [Hz]; other rates indicate a wrong unit."""
+_MAX_STEP_RATIO = 4.0
 _WINDOW = 50
 
 
@@ -38,40 +38,32 @@ _WINDOW = 50
 class Clock:
     """Times of the rows of a stream.
 
-    Args:
-        t: (N,) strictly increasing, on the common clock [s].
-        rows: (N,) the rows of the table that they belong to.
-        total: number of time stamps, those left out included.
-        notes: what was done to the stamps, in words.
+    Attributes:
+        t: (N,) increasing, on the common clock [s].
+        rows: (N,) their rows of the table.
+        total: number of stamps before removal.
+        notes: corrections.
     """
 
-    t: NDArray[np.float64]
+    t: Array
     rows: NDArray[np.intp]
     total: int
     notes: tuple[str, ...] = ()
 
-    def taken(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(N, ...) those rows of (total, ...)."""
+    def select(self, x: Array) -> Array:
+        """Return the rows of (total, ...) values that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """The times of a stream's rows, see the top of this module.
+    """Return the times of a stream's rows; raise an error by the table of this module.
 
-    Args:
-        time: the stream's field.
-        table: its table.
-        columns: of its signals: repeated rows are those that agree in all of them.
-        where: that field, for messages.
-
-    Raises:
-        DrakeTeleopError: if the stamps go back, stand still, or are too uneven, or if their rate is
-            absurd.
+    A repeated row equals the previous one in all `columns`. `where` names the field.
     """
     if time.column is None:
         assert time.rate is not None
         rows = np.arange(table.rows)
-        return Clock(_common(rows / time.rate, time), rows, table.rows)
+        return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
     stamps = table.raw(time.column, f"{where}.column")
     if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
         table.numbers([time.column], 1, f"{where}.column")
@@ -85,65 +77,52 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     rows = np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
-        notes.append(f"{len(t) - len(rows)} rows without a time stamp are left out")
+        notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
     _check_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)
-        rows = _distinct(rows, t, table, columns, where)
+        rows = _remove_repetitions(rows, t, table, columns, where)
         if len(rows) < before:
             notes.append(
-                f"{before - len(rows)} rows that repeat the one before, with its time stamp, are"
-                " left out"
+                f"{before - len(rows)} rows that repeat the previous row and its time stamp"
+                " are removed"
             )
     t = t[rows]
     shared = int((np.diff(t) == 0).sum())
     if shared:
         even = spread(t)
-        _check_spread(even, rows, table, where)
+        _check_increasing(even, rows, table, where)
         notes.append(
-            f"{shared} rows share the time stamp of the one before: all are taken as evenly spaced"
-            f" over {_WINDOW} stamps, which moves them by up to {np.abs(even - t).max():.2g} s"
+            f"{shared} rows share the time stamp of the previous row: all rows are spaced evenly"
+            f" over {_WINDOW} stamps, which changes times by up to {np.abs(even - t).max():.2g} s"
         )
         t = even
     _check_rate(t, time, where)
     _check_even(t, rows, table, where)
-    return Clock(_common(t, time), rows, len(stamps), tuple(notes))
+    return Clock(_to_common_clock(t, time), rows, len(stamps), tuple(notes))
 
 
-def _common(t: NDArray[np.float64], time: Time) -> NDArray[np.float64]:
-    """Times of the stream's clock on the common one."""
+def _to_common_clock(t: Array, time: Time) -> Array:
     return t[0] + time.scale * (t - t[0]) + time.offset
 
 
-def spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Times of rows of which several share a stamp, because it is coarse or given to a burst.
+def spread(t: Array) -> Array:
+    """Return times of rows with shared stamps: means over 50 distinct stamps.
 
-    A row's time is the mean of the stamps around it, over as many rows as 50 distinct stamps have
-    on average: within such a window rows count as evenly spaced. At the ends the outermost windows'
-    straight lines are continued. Windows do not reach over steps of more than three median ones.
-    The mean of the stamps is kept; if they are all early or late, by half a burst for instance, the
-    times are so too, which is a delay like any other.
-
-    Args:
-        t: (N,) stamps [s] that do not go back, at least two of them distinct.
+    Windows end at steps of more than three median steps. `t` (N,) must not decrease.
     """
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)
     parts = np.split(t, np.flatnonzero(np.diff(t) > 3 * step) + 1)
     half = math.ceil(0.5 * _WINDOW * per_stamp)
-    return np.concatenate([_evened(part, half, step / per_stamp) for part in parts])
+    return np.concatenate([_smooth_stamps(part, half, step / per_stamp) for part in parts])
 
 
-def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float64]:
-    """(G, 2) start and end of the steps over which the signal is not known.
+def gaps(t: Array, bandwidth_hz: float | None) -> Array:
+    """Return (G, 2) start and end of the gaps in increasing times `t` (N,) [s].
 
-    Those are longer than four median steps and, as shorter ones hide nothing that the low-pass
-    would let through, than half a period of its cut-off.
-
-    Args:
-        t: (N,) increasing times [s].
-        bandwidth_hz: the cut-off; None for none.
+    A gap is longer than four median steps and half a period of the low-pass.
     """
     steps = np.diff(t)
     at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))
@@ -151,18 +130,18 @@ def gaps(t: NDArray[np.float64], bandwidth_hz: float | None) -> NDArray[np.float
 
 
 def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
-    """Above which steps are gaps [s], see `gaps`; `step` is the median one [s]."""
-    return max(GAP * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
+    """Return the shortest gap [s] for a median `step` [s]."""
+    return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
-def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]:
-    """Moving average of the stamps over 2 half + 1 rows, with straight ends."""
+def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
+    """Return the moving average of the stamps over 2 half + 1 rows, with straight ends."""
     n = len(t)
     if t[0] == t[-1]:
         return t[0] + dt * (np.arange(n) - (n - 1) / 2)
     half = min(half, (n - 1) // 2)
     width = 2 * half + 1
-    # What is averaged are small deviations: stamps may count from 1970.
+    # Small deviations keep the precision: stamps can count from 1970.
     line = np.linspace(t[0], t[-1], n)
     deviation = t - line
     sums = np.concatenate([[0.0], np.cumsum(deviation)])
@@ -178,14 +157,10 @@ def _evened(t: NDArray[np.float64], half: int, dt: float) -> NDArray[np.float64]
     return line + smooth
 
 
-def _distinct(
-    rows: NDArray[np.intp],
-    t: NDArray[np.float64],
-    table: Table,
-    columns: Sequence[str | int],
-    where: str,
+def _remove_repetitions(
+    rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
-    """`rows` without those that are the same as the one before, time stamp included."""
+    """Return `rows` without repetitions of the previous row."""
     values = [table.raw(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0
@@ -194,14 +169,12 @@ def _distinct(
     return rows[np.concatenate([[True], ~same])]
 
 
-def _check_forward(
-    t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str
-) -> None:
+def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps < 0).any():
         first = int(np.argmax(steps < 0))
         raise DrakeTeleopError(
-            f"{int((steps < 0).sum())} time stamps go back, the first is row"
+            f"{int((steps < 0).sum())} time stamps decrease, the first in row"
             f" {rows[first + 1] + table.first_row} of {table.path.name}, by {-steps[first]:.3g} s",
             where=where,
             remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
@@ -214,28 +187,28 @@ def _check_forward(
         )
 
 
-def _check_spread(t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_increasing(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
         row = rows[int(np.argmax(steps <= 0))] + table.first_row
         raise DrakeTeleopError(
-            f"the time stamps stand still around row {row} of {table.path.name}",
+            f"the time stamps do not increase around row {row} of {table.path.name}",
             where=where,
             remedy="cut the log there, or give time.rate instead of the stamps",
         )
 
 
-def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
+def _check_rate(t: Array, time: Time, where: str) -> None:
     if len(t) < 2:
         return
     step = float(np.median(np.diff(t)))
-    if 1 / FASTEST <= step <= 1 / SLOWEST:
+    if 1 / MAX_RATE_HZ <= step <= 1 / MIN_RATE_HZ:
         return
     counts = step / UNITS[time.unit]
-    # Rates of a sensor that are most likely: 20 Hz to 10 kHz.
+    # Typical sensor rates are 20 Hz to 10 kHz.
     likely = [unit for unit in ("s", "ms", "us", "ns") if 1e-4 <= counts * UNITS[unit] <= 0.05]
     remedy = f"probably `unit: {likely[0]}`" if likely else "check the unit, or give time.rate"
-    if step > 1 / SLOWEST:
+    if step > 1 / MIN_RATE_HZ:
         remedy += "; if each row is a pose at rest, describe them as `static:`"
     raise DrakeTeleopError(
         f"the median step of the time stamps is {step:.3g} s, a rate of {1 / step:.3g} Hz",
@@ -244,9 +217,9 @@ def _check_rate(t: NDArray[np.float64], time: Time, where: str) -> None:
     )
 
 
-def _check_even(t: NDArray[np.float64], rows: NDArray[np.intp], table: Table, where: str) -> None:
+def _check_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
-    if len(t) < 3 or t[-1] - t[0] <= _SPARSE * len(t) * np.median(steps):
+    if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
     row = rows[longest + 1] + table.first_row

@@ -1,17 +1,7 @@
-"""CSV files as recorders and spreadsheets write them: which separator, decimal sign, header.
+"""CSV files of recorders and spreadsheets: separator, decimal sign, header and encoding.
 
-======================================== =========================================================
-in the file                              taken as
-======================================== =========================================================
-`;`, tab, or spaces                      the separator, where a line has no other; with the first
-                                         two, or in quotes, a number may have a decimal comma
-lines at the end without a cell          not there
-lines that end in CR alone               lines
-lines before the header that begin       comments, but for one right before the numbers that has
-with `#`                                 as many names: the header, as `numpy.savetxt` writes it
-UTF-16 with its mark, UTF-8 with one     text, as spreadsheets save it
-dates and times of ISO 8601              numpy's datetime64 (a time of day: timedelta64)
-======================================== =========================================================
+With separators `;` and tab, or in quotes, a comma can be the decimal sign. Lines with `#` before
+the header are comments, except names directly before the numbers. UTF-8 and UTF-16 are accepted.
 """
 
 from __future__ import annotations
@@ -27,11 +17,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import polars as pl
 
-_LOOKED_AT = 2**16  # bytes that tell all this
-_TELLING = 1000  # rows that tell what is in a column, if it is numbers
+_HEAD_BYTES = 2**16  # bytes from which the format is detected
+_TYPE_ROWS = 1000  # rows from which column types are inferred
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-_RETURN = re.compile(rb"\r(?!\n)")
-_EMPTY = b' \t,;\r\n\x00\x1a"'  # of which lines without a cell are made
+_LONE_CR = re.compile(rb"\r(?!\n)")
+_BLANK_BYTES = b' \t,;\r\n\x00\x1a"'  # characters of lines without a cell
 _QUOTED_NUMBER = re.compile(rb'"\s*([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)\s*"')
 _THOUSANDS = re.compile(rb"[-+]?[1-9]\d{0,2},\d{3}")
 _QUOTED = re.compile('"[^"]*"')
@@ -39,29 +29,21 @@ _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """The table in a CSV file, and the number of its first data row as a reader counts.
-
-    Args:
-        path: the file.
-        header: whether there are names.
-
-    Raises:
-        Exception: whatever polars says of what is no such file.
-    """
+    """Return the table of a CSV file and its first data line; errors are those of polars."""
     import polars as pl
 
     with path.open("rb") as file:
-        head = file.read(_LOOKED_AT)
+        head = file.read(_HEAD_BYTES)
     source: Path | bytes = path
     if head.startswith(_UTF_16):
         source = path.read_text("utf-16").encode()
-        head = source[:_LOOKED_AT]
-    if (text := _repaired(path, source, head)) is not None:
-        source, head = text, text[:_LOOKED_AT]
+        head = source[:_HEAD_BYTES]
+    if (text := _normalize(path, source, head)) is not None:
+        source, head = text, text[:_HEAD_BYTES]
     lines = head.decode("utf-8", "replace").lstrip("\ufeff").splitlines()
-    before = _comments(lines)
+    before = _count_comment_lines(lines)
     rest = lines[before:]
-    separator = _separator(rest[0]) if rest else ","
+    separator = _find_separator(rest[0]) if rest else ","
     if separator == " " and any(line != " ".join(line.split()) for line in rest):
         text = path.read_bytes() if isinstance(source, Path) else source
         aligned = text.removeprefix(codecs.BOM_UTF8).splitlines()
@@ -74,59 +56,54 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
         source,
         has_header=header,
         separator=separator,
-        decimal_comma=separator in ";\t" and _decimal_commas(rest, separator),
+        decimal_comma=separator in ";\t" and _has_decimal_commas(rest, separator),
         skip_lines=before,
         try_parse_dates=True,
     )
-    frame = _parsed(parse)
+    frame = _parse(parse)
     if names is not None:
         frame.columns = names
     return frame, before + (2 if header else 1)
 
 
-def _repaired(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
-    """The text with line feeds and decimal points and no empty end; None if it has them already."""
+def _normalize(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
+    """Return the text with LF, decimal points and no empty end; None if it is unchanged."""
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _LOOKED_AT))
+        file.seek(max(0, path.stat().st_size - _HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
-    returns, commas = bool(_RETURN.search(head)), _QUOTED_NUMBER.findall(head)
-    # "1,500" alone may be 1500.
+    returns, commas = bool(_LONE_CR.search(head)), _QUOTED_NUMBER.findall(head)
+    # "1,500" can be 1500.
     commas = [found for found in commas if not _THOUSANDS.fullmatch(b",".join(found))]
-    if not (returns or commas or _end(tail) < len(tail)):
+    if not (returns or commas or _content_length(tail) < len(tail)):
         return None
     text = path.read_bytes() if isinstance(source, Path) else source
-    text = _RETURN.sub(b"\n", text) if returns else text
+    text = _LONE_CR.sub(b"\n", text) if returns else text
     text = _QUOTED_NUMBER.sub(rb"\1.\2", text) if commas else text
-    return text[: _end(text)]
+    return text[: _content_length(text)]
 
 
-def _end(text: bytes) -> int:
-    """The number of bytes before the lines without a cell at the end."""
-    line = text.find(b"\n", len(text.rstrip(_EMPTY)))
+def _content_length(text: bytes) -> int:
+    line = text.find(b"\n", len(text.rstrip(_BLANK_BYTES)))
     return len(text) if line < 0 else line + 1
 
 
-def _parsed(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Of the types of its first rows if they are numbers, and all is; else of those of all rows.
-
-    To look at all of them takes six times as long as to read them.
-    """
+def _parse(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
+    """Parse with types of the first rows if all are numeric; otherwise of all rows (slow)."""
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):
-        frame = parse(infer_schema_length=_TELLING)
+        frame = parse(infer_schema_length=_TYPE_ROWS)
         if all(kind.is_numeric() for kind in frame.dtypes):
             return frame
     return parse(infer_schema_length=None)
 
 
-def _comments(lines: list[str]) -> int:
-    """How many lines stand before the table."""
+def _count_comment_lines(lines: list[str]) -> int:
     table = (i for i, line in enumerate(lines) if line.strip() and not line.startswith("#"))
     return next(table, 0)
 
 
-def _separator(line: str) -> str:
+def _find_separator(line: str) -> str:
     bare = _QUOTED.sub("", line).strip()
     if ";" in bare or "\t" in bare:
         return ";" if ";" in bare else "\t"
@@ -134,14 +111,13 @@ def _separator(line: str) -> str:
 
 
 def _names_in_comment(comments: list[str], rest: list[str], separator: str) -> list[str] | None:
-    """Of the last comment, if numbers follow it, one for each name."""
-    told = [line for line in comments if line.startswith("#")]
-    if not told or not all(_is_number(cell) for cell in rest[0].split(separator)):
+    marked = [line for line in comments if line.startswith("#")]
+    if not marked or not all(_is_number(cell) for cell in rest[0].split(separator)):
         return None
     cells = None if separator == " " else separator
-    names = [name.strip() for name in told[-1].lstrip("# ").split(cells)]
-    alike = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
-    return names if alike else None
+    names = [name.strip() for name in marked[-1].lstrip("# ").split(cells)]
+    matching = len(names) == len(rest[0].split(separator)) and len(set(names)) == len(names)
+    return names if matching else None
 
 
 def _is_number(cell: str) -> bool:
@@ -152,5 +128,5 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _decimal_commas(lines: list[str], separator: str) -> bool:
+def _has_decimal_commas(lines: list[str], separator: str) -> bool:
     return any(_DECIMAL_COMMA.fullmatch(cell) for line in lines for cell in line.split(separator))

@@ -1,4 +1,4 @@
-"""The delay between motion and wrench, from the log itself."""
+"""Delay between motion and wrench, estimated from the log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import checked, number
+from drake_teleop.common.arrays import Array, checked, number
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
@@ -16,60 +16,42 @@ from drake_teleop.logs.read.alignment import low_passed, measured, resample, wid
 from drake_teleop.logs.read.canonical import Log
 
 SEARCH_RANGE = 0.25
-_MOST_SAMPLES = 5000
-_FEWEST = 32
+_MAX_SAMPLES = 5000
+_MIN_SAMPLES = 32
 
 
-def estimate_delay(
-    log: Log, cutoff_hz: float | None, phi: NDArray[np.float64] | None = None
-) -> float | None:
-    """How far the motion lags behind the wrench: the shift with the smallest residual.
+def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
+    """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    Minimises sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the six channels c, the
-    likelihood of a Gaussian residual with unknown variance in each channel; offsets o, and phi if
-    it is not given, are fitted anew at every shift. First on a grid over +-0.25 s (at most a tenth
-    of the record), then refined to 10 us.
-
-    Args:
-        log: the log.
-        cutoff_hz: zero-phase low-pass before the comparison; None for 30 Hz.
-        phi: (10,) known load, or None.
-
-    Returns:
-        the delay [s], or None if the record does not determine it: the residual hardly depends on
-        the shift (twice a log likelihood ratio of 50, and 5 % in one channel, are asked for), or it
-        is smallest at the end of the range.
+    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c, within +-0.25
+    s or a tenth of the record. Offsets o, and phi if not given, are fitted. The cut-off is 30 Hz by
+    default.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)
     reach = min(SEARCH_RANGE, 0.1 * float(log.t[-1] - log.t[0]))
     step = min(1 / (8 * cutoff), reach / 8)
     inside = (smooth.t >= smooth.t[0] + reach) & (smooth.t <= smooth.t[-1] - reach)
-    inside = np.flatnonzero(inside & _known(log, cutoff, reach))
-    if len(inside) < _FEWEST:
+    inside = np.flatnonzero(inside & _away_from_gaps(log, cutoff, reach))
+    if len(inside) < _MIN_SAMPLES:
         return None
-    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MOST_SAMPLES)
-    cost = _cost(smooth, inside[::stride], phi)
+    stride = max(1, math.floor(1 / (4 * cutoff * log.dt)), len(inside) // _MAX_SAMPLES)
+    cost = _shift_cost(smooth, inside[::stride], phi)
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
     costs = np.array([cost(shift) for shift in shifts])
     best = int(np.argmin(costs))
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
     if best in (0, len(shifts) - 1) or costs.max() - costs[best] < 0.1 + 50 / independent:
         return None
-    return _refined(cost, float(shifts[best]), step)
+    return _refine_shift(cost, float(shifts[best]), step)
 
 
 def delay_of(
-    log: Log, cutoff_hz: float | None, delay: str | float, phi: NDArray[np.float64] | None = None
+    log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
-    """The delay to take out of the motion, and where it is from, as the summary has it.
+    """Return the delay to remove [s] and its source; estimate it if `delay` is "auto".
 
-    Args:
-        log, cutoff_hz, phi: as of `estimate_delay`.
-        delay: seconds, or "auto" to estimate it.
-
-    Raises:
-        DrakeTeleopError: for another text, or no number.
+    Raises an error for another text.
     """
     if log.static:
         return 0.0, "static"
@@ -83,13 +65,12 @@ def delay_of(
     return (0.0, "undetermined") if found is None else (found, "estimated")
 
 
-def _known(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
-    """(N,) samples that have no gap within reach of any shift."""
+def _away_from_gaps(log: Log, cutoff: float, reach: float) -> NDArray[np.bool_]:
     gap = ~measured(log, cutoff)
     return ~widened(gap, math.ceil(reach / log.dt)) if gap.any() else ~gap
 
 
-def _refined(cost: Callable[[float], float], best: float, step: float) -> float:
+def _refine_shift(cost: Callable[[float], float], best: float, step: float) -> float:
     while step > 1e-5:
         step /= 4
         candidates = best + step * np.arange(-4, 5)
@@ -97,26 +78,24 @@ def _refined(cost: Callable[[float], float], best: float, step: float) -> float:
     return best
 
 
-def _cost(
-    log: Log, rows: NDArray[np.intp], phi: NDArray[np.float64] | None
-) -> Callable[[float], float]:
+def _shift_cost(log: Log, rows: NDArray[np.intp], phi: Array | None) -> Callable[[float], float]:
     t, wrench = log.t[rows], log.wrench[rows]
-    # Of all forces, and of all torques: a channel with nothing in it must not weigh most, and the
-    # rounding of a wrench that does not change is nothing.
+    # Common scales of forces and torques prevent large weights of channels without a signal; the
+    # floor excludes rounding of a constant wrench.
     rounding = (1e-9 * np.abs(wrench).max()) ** 2 + 1e-30
     variance = np.repeat(wrench.var(axis=0).reshape(2, 3).sum(axis=1), 3) + rounding
     scale, floor = np.sqrt(variance), 1e-9 * variance
-    motion = np.hstack(log.motion)  # one search for the times serves all
+    motion = np.hstack(log.motion)  # one interpolation for all signals
 
-    def residual(shift: float) -> NDArray[np.float64]:
+    def residual(shift: float) -> Array:
         s, omega, alpha = np.split(resample(t + shift, log.t, motion), 3, axis=1)
         if phi is not None:
             return contact_wrench(wrench, np.zeros(6), s, omega, alpha, phi)
         V = regressor(s, omega, alpha)
-        # Taking the means away fits the offsets; scaling weighs force and torque alike.
+        # Subtracting the means fits the offsets; the scale weights force and torque equally.
         V = ((V - V.mean(axis=0)) / scale[:, None]).reshape(-1, 10)
         w = ((wrench - wrench.mean(axis=0)) / scale).ravel()
-        # The normal equations take a tenth of the time of a decomposition of V.
+        # Normal equations are ten times faster than a decomposition of V.
         theta = np.linalg.lstsq(V.T @ V, V.T @ w, rcond=1e-12)[0]
         return (w - V @ theta).reshape(-1, 6) * scale
 

@@ -1,12 +1,8 @@
-"""Log descriptions: where a foreign log keeps what (long: all classes of one file's format).
+"""Log descriptions: YAML files that specify files, columns, units and frames (docs/logs.md).
 
-YAML files that say it, with units and frames.
-
-Every field is documented in docs/logs.md. A number x of a file becomes a quantity in S by
+A number x of a file becomes a quantity in S by
 
     x_S = sign * R_S,stream * scale * (x - bias) * unit
-
-so a bias is in the unit and the axes of the file.
 """
 
 from __future__ import annotations
@@ -21,36 +17,34 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, ValidationError, model_validator
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
+    Acceleration,
+    AngularAcceleration,
+    AngularVelocity,
     Column,
+    Force,
     Frame,
     GainStd,
     Gravity,
     ImuFrame,
     Number,
-    Place,
-    Scale,
-    Turn,
-    Vector,
+    Position,
+    PositionOrAuto,
+    RotationOrAuto,
+    Strict,
+    Torque,
     Weight,
 )
 
 STANDARD_GRAVITY = 9.80665
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
-_LARGEST_GRAVITY = 100.0
+_MAX_GRAVITY = 100.0
 
 UNITS = {
     "s": 1.0,
@@ -73,23 +67,11 @@ UNITS = {
     "mm": 1e-3,
     "mm/s^2": 1e-3,
 }
-"""SI value of each unit; "g" is the magnitude of the description's gravity."""
+"""SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _in_reach(cls, value: Any) -> Any:
-        for number in value if isinstance(value, list) else [value]:
-            if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
-                raise ValueError(f"{number:g} is beyond 1e12")
-        return value
-
-
-class Time(_Strict):
-    """When the rows of a stream were taken: a column of time stamps, or a nominal rate."""
+class Time(Strict):
+    """Time of the rows of a stream: a column of stamps or a nominal rate."""
 
     column: Column | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
@@ -105,52 +87,14 @@ class Time(_Strict):
     )
 
     @model_validator(mode="after")
-    def _one_of(self) -> Time:
+    def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
             raise ValueError("give either column or rate")
         return self
 
 
-class _Quantity(_Strict):
-    columns: tuple[Column, ...]
-    scale: Scale = (1.0, 1.0, 1.0)
-
-
-class Force(_Quantity):
-    """Columns of a force and their unit."""
-
-    unit: Literal["N", "lbf"] = "N"
-
-
-class Torque(_Quantity):
-    """Columns of a torque and their unit."""
-
-    unit: Literal["N m", "N mm", "lbf in"] = "N m"
-
-
-class Acceleration(_Quantity):
-    """Columns of a linear acceleration, their unit, and what it reads of none."""
-
-    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class AngularVelocity(_Quantity):
-    """Columns of an angular velocity, their unit, and what it reads of none."""
-
-    unit: Literal["rad/s", "deg/s"] = "rad/s"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class AngularAcceleration(_Quantity):
-    """Columns of an angular acceleration, their unit, and what it reads of none."""
-
-    unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
-    bias: Vector = (0.0, 0.0, 0.0)
-
-
-class Orientation(_Strict):
-    """R_WS, or of the stream's frame if `frame` is a rotation."""
+class Orientation(Strict):
+    """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
     form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
@@ -158,38 +102,32 @@ class Orientation(_Strict):
     inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
 
 
-class Position(_Quantity):
-    """Columns of a position and their unit."""
-
-    unit: Literal["m", "mm"] = "m"
-
-
-def _named(group: str, axes: str = "xyz") -> list[str]:
+def _axis_columns(group: str, axes: str = "xyz") -> list[str]:
     return [f"{group}.{axis}" for axis in axes]
 
 
-_OF_TOPIC: dict[str, dict[str, Any]] = {
-    "force": {"columns": _named("force")},
-    "torque": {"columns": _named("torque")},
-    "specific_force": {"columns": _named("linear_acceleration")},
-    "angular_velocity": {"columns": _named("angular_velocity")},
-    "orientation": {"columns": _named("orientation", "wxyz"), "form": "quaternion_wxyz"},
-    "position": {"columns": _named("position")},
+_TOPIC_DEFAULTS: dict[str, dict[str, Any]] = {
+    "force": {"columns": _axis_columns("force")},
+    "torque": {"columns": _axis_columns("torque")},
+    "specific_force": {"columns": _axis_columns("linear_acceleration")},
+    "angular_velocity": {"columns": _axis_columns("angular_velocity")},
+    "orientation": {"columns": _axis_columns("orientation", "wxyz"), "form": "quaternion_wxyz"},
+    "position": {"columns": _axis_columns("position")},
 }
 
 
-class _Stream(_Strict):
+class _Stream(Strict):
     file: Path
     header: bool = True
 
     @property
     def source(self) -> Path:
-        """The file, or, in a bag, the file and the topic behind it."""
+        """File and, in a bag, topic."""
         return self.file
 
 
 class _Recorded(_Stream):
-    """A stream with a clock: a table, or a topic of a bag, for which much has defaults."""
+    """Stream with a clock: a table, or a topic with default columns."""
 
     topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
     child_frame: str | None = Field(default=None, description="which transform of the topic")
@@ -199,7 +137,7 @@ class _Recorded(_Stream):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_topic(cls, data: Any) -> Any:
+    def _fill_topic_defaults(cls, data: Any) -> Any:
         if not isinstance(data, dict) or data.get("topic") is None:
             return data
         data = {"time": {}, **{name: {} for name in cls._defaults}, **data}
@@ -209,7 +147,7 @@ class _Recorded(_Stream):
         for name in cls._defaults:
             given = data[name]
             if isinstance(given, dict) and not {"columns", "form"} & set(given):
-                data[name] = {**_OF_TOPIC[name], **given}
+                data[name] = {**_TOPIC_DEFAULTS[name], **given}
         return data
 
     @property
@@ -220,7 +158,7 @@ class _Recorded(_Stream):
 
 
 class Wrench(_Recorded):
-    """The force-torque sensor's file and columns."""
+    """File and columns of the force-torque sensor."""
 
     _defaults = ("force", "torque")
 
@@ -233,7 +171,7 @@ class Wrench(_Recorded):
 
 
 class Imu(_Recorded):
-    """The file and columns of an IMU."""
+    """File and columns of an IMU."""
 
     _defaults = ("specific_force", "angular_velocity")
 
@@ -242,13 +180,12 @@ class Imu(_Recorded):
     angular_acceleration: AngularAcceleration | None = None
     sign: Literal[1, -1] = Field(default=1, description="of the specific force; -1 for g - a")
     frame: ImuFrame = Field(default="sensor", description="auto: the rotation is found")
-    position: Place = Field(
-        default=(0.0, 0.0, 0.0),
-        description="p_SoIo_S of the accelerometer, m; auto: it is found",
+    position: PositionOrAuto = Field(
+        default=(0.0, 0.0, 0.0), description="p_SoIo_S of the accelerometer, m; auto: it is found"
     )
 
     @model_validator(mode="after")
-    def _not_empty(self) -> Imu:
+    def _check_signals(self) -> Imu:
         if not (self.specific_force or self.angular_velocity):
             raise ValueError("give specific_force, angular_velocity, or both")
         if self.automatic and not self.specific_force:
@@ -259,29 +196,29 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data shall tell the frame or the position."""
+        """Whether frame or position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
 class Pose(_Recorded):
-    """The file and columns of a pose of sensor, flange or TCP."""
+    """File and columns of a pose of sensor, flange or TCP."""
 
     _defaults = ("orientation", "position")
 
     orientation: Orientation
     position: Position | None = None
     frame: Frame = "sensor"
-    position_in_sensor: Place = Field(
+    position_in_sensor: PositionOrAuto = Field(
         default=(0.0, 0.0, 0.0),
         description="p_SoPo_S of the posed frame's origin, m; auto: it is found",
     )
-    rotation_in_sensor: Turn = Field(
+    rotation_in_sensor: RotationOrAuto = Field(
         default=None,
         description="R_SP, from the posed frame to S, as frame has it; auto: it is found",
     )
 
     @model_validator(mode="after")
-    def _not_base(self) -> Pose:
+    def _check_frame(self) -> Pose:
         if self.frame == "base":
             raise ValueError("frame must be sensor, or the rotation from the posed frame to S")
         if self.frame != "sensor" and self.rotation_in_sensor is not None:
@@ -295,12 +232,12 @@ class Pose(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether the data shall tell where the posed frame is."""
+        """Whether position or rotation of the posed frame is `auto`."""
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
-    def R_SP(self) -> NDArray[np.float64] | None:
-        """(3, 3) from the posed frame to S, where it is given; None for the axes of S."""
+    def R_SP(self) -> Array | None:
+        """(3, 3) rotation from the posed frame to S; None for the axes of S."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -308,7 +245,7 @@ class Pose(_Recorded):
 
 
 class Static(_Stream):
-    """Averages over separate poses at rest, one a row."""
+    """Averages over separate poses at rest, one per row."""
 
     force: Force
     torque: Torque
@@ -323,39 +260,35 @@ class Static(_Stream):
     gain_std: GainStd = 0.0
 
     @model_validator(mode="after")
-    def _one_of(self) -> Static:
+    def _check_alternatives(self) -> Static:
         if sum(x is not None for x in (self.gravity, self.specific_force, self.orientation)) != 1:
             raise ValueError("give one of gravity (in S), specific_force (in S), orientation")
         if self.weight == "removed":
             raise ValueError(
-                "weight: removed leaves nothing of a load at rest: record it in motion, or give"
-                " [m, m c_x, m c_y, m c_z] of the payload in the robot's controller"
+                "weight: removed cannot be used with static poses: record the load in motion,"
+                " or give [m, m c_x, m c_y, m c_z] of the payload in the robot's controller"
             )
         return self
 
 
-class Description(_Strict):
-    """A whole log: a wrench stream with imu, pose, or both; or static poses."""
+class Description(Strict):
+    """Description of a log: a wrench with imu, pose or both; or static poses."""
 
-    gravity: Gravity = (
-        0.0,
-        0.0,
-        -STANDARD_GRAVITY,
-    )
+    gravity: Gravity = (0.0, 0.0, -STANDARD_GRAVITY)
     wrench: Wrench | None = None
     imu: Imu | None = None
     pose: Pose | None = None
     static: Static | None = None
 
     @model_validator(mode="after")
-    def _complete(self) -> Description:
-        if np.abs(self.gravity_W).max() > _LARGEST_GRAVITY:
-            raise ValueError(f"gravity is beyond {_LARGEST_GRAVITY:g} m/s^2")
+    def _check_streams(self) -> Description:
+        if np.abs(self.gravity_W).max() > _MAX_GRAVITY:
+            raise ValueError(f"gravity exceeds {_MAX_GRAVITY:g} m/s^2")
         if self.gravity == "auto" and (self.pose is None or self.imu is not None):
             raise ValueError("gravity: auto is found from a wrench with a pose and no imu")
         if self.static is not None:
             if self.wrench or self.imu or self.pose:
-                raise ValueError("static poses stand alone: remove wrench, imu and pose")
+                raise ValueError("static poses cannot be combined with wrench, imu or pose")
             return self
         if self.wrench is None:
             raise ValueError(
@@ -366,9 +299,9 @@ class Description(_Strict):
                 "a wrench without kinematics: add imu or pose, from whichever file has it"
             )
         if self.pose is None and (self.imu is None or self.imu.angular_velocity is None):
-            raise ValueError("nothing gives the angular velocity: add imu.angular_velocity or pose")
+            raise ValueError("the angular velocity is missing: add imu.angular_velocity or pose")
         if self.pose is None and (self.imu is None or self.imu.specific_force is None):
-            raise ValueError("nothing gives the specific force: add imu.specific_force or pose")
+            raise ValueError("the specific force is missing: add imu.specific_force or pose")
         if self.pose is None and self.imu is not None and self.imu.frame == "auto":
             raise ValueError("imu.frame: auto compares the IMU with a pose: add pose")
         if self.pose is not None and self.pose.automatic and self.wrench.frame == "base":
@@ -387,27 +320,27 @@ class Description(_Strict):
             raise ValueError(f"{' and '.join(both)} cannot be combined: give one of them alone")
 
     @property
-    def gravity_W(self) -> NDArray[np.float64]:
-        """(3,) gravity in W [m/s^2]; straight down for `auto`."""
+    def gravity_W(self) -> Array:
+        """(3,) gravity in W [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Poses of S with what else is described of them, and what an IMU tells of S."""
+        """Return poses of S with gravity, the pose frame and IMU data."""
         assert self.pose is not None
-        place, turn = self.pose.position_in_sensor, self.pose.R_SP
-        turn = np.eye(3) if turn is None else turn
-        return Posed(poses, self.gravity_W, np.array(place), turn, imu)
+        origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
+        rotation = np.eye(3) if rotation is None else rotation
+        return Posed(poses, self.gravity_W, np.array(origin), rotation, imu)
 
     def scale(self, unit: str) -> float:
-        """SI value of a unit; "g" is the magnitude of this description's gravity."""
+        """Return the SI value of a unit; "g" is the described gravity."""
         return float(np.linalg.norm(self.gravity_W)) if unit == "g" else UNITS[unit]
 
 
 def json_schema() -> str:
-    """The JSON schema of a description, as text: what docs/log-description.schema.json holds."""
+    """Return the JSON schema of a description (docs/log-description.schema.json)."""
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= Description.model_json_schema()
-    # With a topic a stream needs its file and nothing else.
+    # With a topic, only the file is required.
     for name in ("Wrench", "Imu", "Pose"):
         stream = schema["$defs"][name]
         without = [field for field in stream["required"] if field != "file"]
@@ -418,13 +351,9 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Reads a log description.
+    """Read a description from a YAML file; its paths are relative to the folder.
 
-    Args:
-        path: the YAML file. Relative paths in it are relative to its folder.
-
-    Raises:
-        DrakeTeleopError: naming file and field, if it is absent, no YAML, or does not fit.
+    Raises an error that names file and field.
     """
     path = Path(path)
     if not os.path.exists(path):
@@ -437,11 +366,11 @@ def load_description(path: str | Path) -> Description:
     try:
         description = Description.model_validate(data)
     except ValidationError as error:
-        raise _explained(error, path) from error
-    return _resolved(description, path.parent)
+        raise _validation_error(error, path) from error
+    return _resolve_paths(description, path.parent)
 
 
-def _resolved(description: Description, folder: Path) -> Description:
+def _resolve_paths(description: Description, folder: Path) -> Description:
     streams = {
         name: stream.model_copy(update={"file": folder / stream.file})
         for name in ("wrench", "imu", "pose", "static")
@@ -450,8 +379,8 @@ def _resolved(description: Description, folder: Path) -> Description:
     return description.model_copy(update=streams)
 
 
-def _explained(error: ValidationError, path: Path) -> DrakeTeleopError:
-    # A misspelt field is also a missing one: name what stands there first.
+def _validation_error(error: ValidationError, path: Path) -> DrakeTeleopError:
+    # A misspelt field also causes "missing"; report the misspelling first.
     first = min(error.errors(), key=lambda entry: entry["type"] == "missing")
     *outer, last = first["loc"] or ("",)
     unknown = first["type"] == "extra_forbidden"

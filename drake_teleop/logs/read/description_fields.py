@@ -1,20 +1,20 @@
-"""Kinds of fields of a log description: numbers, vectors, frames and places."""
+"""Field types of a log description."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
 
 from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 
 ROTATION_TOLERANCE = 0.01
-"""Entries of R^T R may be off those of the identity by this."""
-_LEAST_SCALE = 1e-12
+"""Largest deviation of entries of R^T R from the identity."""
+_MIN_SCALE = 1e-12
 
 
-def _frame(value: Any) -> Any:
+def _parse_frame(value: Any) -> Any:
     if value in ("sensor", "base"):
         return value
     try:
@@ -28,17 +28,17 @@ def _frame(value: Any) -> Any:
     return tuple(map(tuple, nearest_rotation(matrix).tolist()))
 
 
-def _imu_frame(value: Any) -> Any:
-    return value if value == "auto" else _frame(value)
+def _parse_imu_frame(value: Any) -> Any:
+    return value if value == "auto" else _parse_frame(value)
 
 
-def _turn(value: Any) -> Any:
+def _parse_rotation(value: Any) -> Any:
     if value in ("sensor", "base"):
         raise ValueError("must be a 3x3 rotation matrix from the posed frame to S, or auto")
-    return value if value is None else _imu_frame(value)
+    return value if value is None else _parse_imu_frame(value)
 
 
-def _place(value: Any) -> Any:
+def _parse_position(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
         raise ValueError("must be three numbers [m], or auto")
     return value
@@ -48,20 +48,20 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _gravity(value: Any) -> Any:
+def _parse_gravity(value: Any) -> Any:
     if isinstance(value, str) and value != "auto":
         raise ValueError("must be a number, three numbers [m/s^2], or auto")
     return [0.0, 0.0, -float(value)] if _is_number(value) else value
 
 
-def _scale(value: Any) -> Any:
+def _parse_scale(value: Any) -> Any:
     factors = value if isinstance(value, (list, tuple)) else [value]
-    if any(_is_number(x) and abs(x) < _LEAST_SCALE for x in factors):
-        raise ValueError(f"must be at least {_LEAST_SCALE:g} in size")
+    if any(_is_number(x) and abs(x) < _MIN_SCALE for x in factors):
+        raise ValueError(f"must be at least {_MIN_SCALE:g} in size")
     return [float(value)] * 3 if _is_number(value) else value
 
 
-def _weight(value: Any) -> Any:
+def _parse_weight(value: Any) -> Any:
     if value is not None and value != "removed" and not isinstance(value, (list, tuple)):
         raise ValueError("must be removed, or four numbers [m, m c_x, m c_y, m c_z] [kg, kg m]")
     return value
@@ -70,7 +70,7 @@ def _weight(value: Any) -> Any:
 Column = str | int
 
 
-Number = Annotated[float, Field(strict=True)]  # neither true nor "1"
+Number = Annotated[float, Field(strict=True)]  # rejects true and "1"
 Vector = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 Rotation = tuple[Vector, Vector, Vector]
 GainStd = Annotated[
@@ -91,23 +91,83 @@ _GRAVITY_SCHEMA = {
     "description": "magnitude, or the vector in the world, m/s^2; auto: the direction is found",
 }
 Gravity = Annotated[
-    Vector | Literal["auto"], BeforeValidator(_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
+    Vector | Literal["auto"], BeforeValidator(_parse_gravity), WithJsonSchema(_GRAVITY_SCHEMA)
 ]
 _SCALE_SCHEMA = {
     "anyOf": _NUMBERS,
     "description": "factor on the numbers of the file, or one for each column; -1 for another sign",
 }
-Scale = Annotated[Vector, BeforeValidator(_scale), WithJsonSchema(_SCALE_SCHEMA)]
-Four = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
+Scale = Annotated[Vector, BeforeValidator(_parse_scale), WithJsonSchema(_SCALE_SCHEMA)]
+Vector4 = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Weight = Annotated[
-    Four | Literal["removed"] | None,
-    BeforeValidator(_weight),
+    Vector4 | Literal["removed"] | None,
+    BeforeValidator(_parse_weight),
     Field(
         description="that the robot has subtracted: removed if it is the load's, or that of a"
         " payload, [m, m c_x, m c_y, m c_z] in S, kg and kg m"
     ),
 ]
-Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_frame)]
-ImuFrame = Annotated[Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_imu_frame)]
-Turn = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_turn)]
-Place = Annotated[Vector | Literal["auto"], BeforeValidator(_place)]
+Frame = Annotated[Literal["sensor", "base"] | Rotation, BeforeValidator(_parse_frame)]
+ImuFrame = Annotated[
+    Literal["sensor", "base", "auto"] | Rotation, BeforeValidator(_parse_imu_frame)
+]
+RotationOrAuto = Annotated[Literal["auto"] | Rotation | None, BeforeValidator(_parse_rotation)]
+PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_position)]
+
+
+class Strict(BaseModel):
+    """Frozen model without unknown fields, and with numbers of at most 1e12."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _limit_size(cls, value: Any) -> Any:
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, (int, float)) and 1e12 < abs(number) < np.inf:
+                raise ValueError(f"{number:g} exceeds 1e12")
+        return value
+
+
+class _Quantity(Strict):
+    columns: tuple[Column, ...]
+    scale: Scale = (1.0, 1.0, 1.0)
+
+
+class Force(_Quantity):
+    """Columns of a force and their unit."""
+
+    unit: Literal["N", "lbf"] = "N"
+
+
+class Torque(_Quantity):
+    """Columns of a torque and their unit."""
+
+    unit: Literal["N m", "N mm", "lbf in"] = "N m"
+
+
+class Acceleration(_Quantity):
+    """Columns of a linear acceleration, their unit and bias."""
+
+    unit: Literal["m/s^2", "g", "mm/s^2"] = "m/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularVelocity(_Quantity):
+    """Columns of an angular velocity, their unit and bias."""
+
+    unit: Literal["rad/s", "deg/s"] = "rad/s"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class AngularAcceleration(_Quantity):
+    """Columns of an angular acceleration, their unit and bias."""
+
+    unit: Literal["rad/s^2", "deg/s^2"] = "rad/s^2"
+    bias: Vector = (0.0, 0.0, 0.0)
+
+
+class Position(_Quantity):
+    """Columns of a position and their unit."""
+
+    unit: Literal["m", "mm"] = "m"

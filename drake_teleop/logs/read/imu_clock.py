@@ -1,48 +1,44 @@
-"""How far the clock of an IMU is behind that of the pose, whatever the axes of either."""
+"""Lag and drift of an IMU's clock behind the pose's clock, for any axes."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 
-# A drift is believed from this likelihood ratio (twice its logarithm), and if it amounts to this.
-_LIKELIHOOD, _DRIFTED = 50.0, 0.01
+# Least log likelihood ratio (times 2) and total lag [s] of a significant drift.
+_MIN_LIKELIHOOD_RATIO, _MIN_DRIFT_S = 50.0, 0.01
 
 
-Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Of each sensor, the pose's signal and the IMU's, see `signal_pairs`."""
+Pairs = list[tuple[Array, Array]]
+"""Signal of the pose and of the IMU, for each sensor, see `signal_pairs`."""
 
 
-def signal_pairs(t: NDArray[np.float64], imu: Log, pose: Log, gyroscope: bool) -> Pairs:
-    """Of each sensor, the signal (N, 3) of the pose at `t`, and that of the IMU on its clock."""
+def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
+    """Return (N, 3) signals of the pose at `t` with those of the IMU on its clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
         pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
     return pairs
 
 
-def best_shift(
-    t: NDArray[np.float64],
-    pairs: Pairs,
-    t_imu: NDArray[np.float64],
-    reach: float,
-    arm: NDArray[np.float64],
-) -> float:
-    """The shift at which free maps leave least, beyond what is linear in `arm` (N, k)."""
+def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
+    """Return the shift [s] of the best affine maps, without effects linear in `arm` (N, k)."""
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
-    def beyond(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def without_arm(x: Array) -> Array:
         return x - U @ (U.T @ x)
 
-    expected, sensed = [beyond(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
+    expected, sensed = [without_arm(y) for y, _ in pairs], np.hstack([x for _, x in pairs])
 
     def cost(shift: float) -> float:
-        moved = beyond(resample(t + shift, t_imu, sensed))
-        return sum(_unmapped(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected))
+        moved = without_arm(resample(t + shift, t_imu, sensed))
+        return sum(
+            _unexplained_share(y, moved[:, 3 * k : 3 * k + 3]) for k, y in enumerate(expected)
+        )
 
     step = 0.01
     shifts = step * np.arange(-round(reach / step), round(reach / step) + 1)
@@ -56,24 +52,12 @@ def best_shift(
 
 
 def clock_drift(
-    t: NDArray[np.float64],
-    pairs: Pairs,
-    t_imu: NDArray[np.float64],
-    lag: float,
-    independent: float,
+    t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
-    """Lag in the middle and its growth, by Gauss-Newton steps from a constant lag.
+    """Return lag at mid-record [s] and drift [s/s], from a constant lag [s].
 
-    Args:
-        t: (N,) times on the clock of the pose.
-        pairs: of signals at `t` and signals of the IMU at `t_imu`, each mapped freely.
-        t_imu: times on the clock of the IMU.
-        lag: the best constant lag [s].
-        independent: how many samples of such signals say something new.
-
-    Returns:
-        the lag in the middle [s] and its growth [s/s]; `lag` and 0 if the likelihood of a constant
-        lag is not exceeded decisively, or the lag changes by less than 10 ms.
+    `independent` is the number of independent samples. A drift that is insignificant or below 10 ms
+    is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])
@@ -87,7 +71,7 @@ def clock_drift(
             basis = np.column_stack([np.ones(len(t)), moved])
             Q = np.linalg.qr(basis)[0]
             mapped = np.linalg.lstsq(basis, y, rcond=1e-6)[0][1:]
-            # What a small shift does, beyond what another map could do as well.
+            # Effects of a small shift that a change of the map cannot reproduce.
             effects = [rate @ mapped, tau[:, None] * (rate @ mapped)]
             size = np.sqrt(y.var(axis=0).sum() + 1e-12)
             rows.append(np.stack([(e - Q @ (Q.T @ e)).ravel() / size for e in effects], axis=1))
@@ -98,14 +82,14 @@ def clock_drift(
         residual = np.concatenate([r.ravel() for r in left])
         found = found + np.linalg.lstsq(np.vstack(rows), residual, rcond=1e-6)[0]
     gain = independent * np.log(start / (cost + 1e-300))
-    moved_s = abs(found[1]) * float(t[-1] - t[0])
-    if gain < _LIKELIHOOD or moved_s < _DRIFTED:
+    total_drift_s = abs(found[1]) * float(t[-1] - t[0])
+    if gain < _MIN_LIKELIHOOD_RATIO or total_drift_s < _MIN_DRIFT_S:
         return lag, 0.0
     return float(found[0]), float(found[1])
 
 
-def _unmapped(y: NDArray[np.float64], x: NDArray[np.float64]) -> float:
-    """Share of the variance of y (N, 3) that no affine map of x (N, 3) explains."""
+def _unexplained_share(y: Array, x: Array) -> float:
+    """Return the share of the variance of y (N, 3) that no affine map of x explains."""
     y, x = y - y.mean(axis=0), x - x.mean(axis=0)
     both, total = x.T @ y, float((y * y).sum()) + 1e-12 * len(y)
     explained = (both * (np.linalg.pinv(x.T @ x, rcond=1e-12, hermitian=True) @ both)).sum()

@@ -1,7 +1,4 @@
-"""Least squares whose standard deviations are those of a jackknife.
-
-It leaves out one of 20 blocks of time after the other, so that residuals may be coloured.
-"""
+"""Nonlinear least squares with jackknife standard deviations, Eq. (T22)."""
 
 from __future__ import annotations
 
@@ -9,39 +6,33 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from drake_teleop.common.arrays import Array
 
 _BLOCKS = 20
-# Singular values of the scaled Jacobian below this share of the largest: nothing determines them.
+# Directions with smaller singular values, relative to the largest, are undetermined.
 RANK = 1e-5
-_STEPS = 15  # of the solver at most: records that make sense take six, hopeless ones a hundred
+_MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 
 
 def solve(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
-    """Least squares of (N, 3 k) residuals, every three channels weighted by their own.
+    """Return the solution (n,) and standard deviations (n,); inf if undetermined.
 
     Args:
-        residual: of x (n,).
-        x: where to begin.
-        linear: (N, 3 k, m) what a unit of each of the last m of x adds to the residuals, whatever
-            the others are. No differences need be taken of these.
-
-    Returns:
-        the solution (n,), and its standard deviations (n,), inf for what is not determined.
+        residual: of x (n,), (N, 3 k). Each three channels are weighted by their residual.
+        x: start.
+        linear: (N, 3 k, m) constant derivatives by the last m parameters.
     """
     linear = np.empty((*residual(x).shape, 0)) if linear is None else linear
     rows, channels, _ = linear.shape
-    found = _fitted(residual, x, linear)
-    found = _fitted(residual, found.x, linear)  # with the weights that the residuals have there
+    found = _fit(residual, x, linear)
+    found = _fit(residual, found.x, linear)  # with updated weights
     return found.x, jackknife(found.jac, found.fun, channels * (rows // _BLOCKS))
 
 
-def _fitted(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
-    """scipy's solution from x on, with the weights that the residuals have at x."""
+def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     from scipy.optimize import approx_fprime, least_squares
 
     errors, others = residual(x), len(x) - linear.shape[2]
@@ -52,15 +43,15 @@ def _fitted(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
     def weighted(z: Array) -> Array:
         return (residual(z) / sigma).ravel()
 
-    def slopes(z: Array) -> Array:
+    def derivatives(z: Array) -> Array:
         found = approx_fprime(z[:others], lambda y: weighted(np.append(y, z[others:])))
         return np.hstack([found, known])
 
-    return least_squares(weighted, x, jac=slopes, x_scale="jac", max_nfev=_STEPS)
+    return least_squares(weighted, x, jac=derivatives, x_scale="jac", max_nfev=_MAX_EVALUATIONS)
 
 
 def jackknife(jacobian: Array, residual: Array, width: int) -> Array:
-    """(n,) standard deviations of a least-squares solution, leaving out blocks of `width` rows."""
+    """Return (n,) jackknife standard deviations for blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
     known = singular > RANK * singular[0]

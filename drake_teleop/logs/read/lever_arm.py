@@ -1,12 +1,6 @@
-"""Where an accelerometer sits on the sensor, from the wrench of a rigid load.
+"""Position of an accelerometer on the sensor, from the wrench of a rigid load, Eqs. (T20), (T21).
 
-An accelerometer at Io, a point of the body of S, measures in the axes of S, up to a bias,
-
-    s_I = s + alpha x p + omega x (omega x p) = s + K p,    p = p_SoIo_S
-
-with the specific force s of So and the motion of S. Force and torque, Eqs. (1)-(2), are linear in
-s, and while a shift of the accelerometer looks like a shift of the centre of mass in the force
-alone, the torque knows the centre of mass from the weight. So the wrench tells p.
+The force determines m c - m p, the torque determines m c.
 """
 
 from __future__ import annotations
@@ -17,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
@@ -25,62 +20,54 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.jackknife import RANK, solve
 
-LEVER_KNOWN = 0.005
-"""A coordinate of the accelerometer is determined if its standard deviation is below this [m]."""
-BELIEVABLE = 0.05
-"""A fit that leaves more of the variance than this tells nothing."""
-CUTOFF = 8.0
-"""Of the low-pass on everything [Hz]."""
-SAMPLES = 1500
-"""As many are compared."""
-# Least ratio of a motion's power to that of its noise, for a lever arm 5 % too short at worst.
-_SIGNAL = 20.0
+MAX_LEVER_DEVIATION = 0.005
+"""Largest standard deviation of a determined coordinate [m]."""
+MAX_UNEXPLAINED = 0.05
+"""Largest unexplained share of the variance of a valid fit."""
+CUTOFF_HZ = 8.0
+"""Cut-off of the low-pass on all signals [Hz]."""
+COMPARED_SAMPLES = 1500
+"""Number of compared samples."""
+# Least signal-to-noise power ratio of the motion; the lever arm is at most 5 % too short.
+_MIN_SIGNAL_RATIO = 20.0
 
 
 @dataclass(frozen=True)
 class LeverArm:
-    """Where the accelerometer is.
+    """Estimated position of the accelerometer.
 
-    Args:
-        p_SoIo_S: (3,) its position in S, on top of what the description says already [m].
-        deviations: (3,) standard deviations [m]; inf along an axis that the motion says nothing of.
-        source: "pose" or "wrench", which told it.
+    Attributes:
+        p_SoIo_S: (3,) relative to the described position, in S [m].
+        deviations: (3,) standard deviations [m]; inf if undetermined.
+        source: "pose" or "wrench".
     """
 
-    p_SoIo_S: NDArray[np.float64]
-    deviations: NDArray[np.float64]
+    p_SoIo_S: Array
+    deviations: Array
     source: str
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(3,) the verdict on each axis."""
-        return self.deviations < LEVER_KNOWN
+        """(3,) whether each coordinate is determined."""
+        return self.deviations < MAX_LEVER_DEVIATION
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
-    """The lever arm of an accelerometer from the wrench of a rigid load that touches nothing.
+    """Fit offsets, load, delay and lever arm to the wrench of a rigid load, Eq. (T21).
 
-    Least squares of the wrench over offsets, load, delay and lever arm together: the wrench of
-    Eqs. (1)-(2) with s = s_measured - K p. Forces and torques are weighted by their own residuals.
-    All signals are low-passed at 8 Hz.
-
-    Args:
-        log: its specific force is that of the accelerometer, in the axes of S.
-
-    Returns:
-        None if the load leaves more than 5 % of the wrench's variance: then something is touched;
-        or if gaps leave less than a tenth of the record.
+    Returns None if more than 5 % of the variance remains (contact), or gaps leave less than a
+    tenth.
     """
-    cutoff = min(CUTOFF, 0.2 / log.dt)
+    cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
     smooth = low_passed(undelayed(log, delay), cutoff)
     margin = min(0.1, 0.1 * float(smooth.t[-1] - smooth.t[0]))
     t = common_times(smooth.t[0] + margin, smooth.t[-1] - margin, (smooth,), cutoff)
-    if len(t) < SAMPLES // 10:
+    if len(t) < COMPARED_SAMPLES // 10:
         return None
     wrench = resample(t, smooth.t, smooth.wrench)
 
-    def residual(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(x: Array) -> Array:
         s, omega, alpha = (resample(t + x[3], smooth.t, signal) for signal in smooth.motion)
         s = s - lever_matrix(omega, alpha) @ x[:3]
         return contact_wrench(wrench, x[4:10], s, omega, alpha, x[10:])
@@ -93,33 +80,30 @@ def lever_arm_from_wrench(log: Log) -> LeverArm | None:
     offsets = (wrench - V @ phi).mean(axis=0)
     x, deviations = solve(residual, np.concatenate([np.zeros(4), offsets, phi]))
     left, whole = (y.var(axis=0).reshape(2, 3).sum(axis=1) for y in (residual(x), wrench))
-    if (left > BELIEVABLE * whole).any():
+    if (left > MAX_UNEXPLAINED * whole).any():
         return None
-    shown = shown_axes(lever_matrix(*motion[1:]), smooth, cutoff)
-    return LeverArm(x[:3], np.where(shown, deviations[:3], np.inf), "wrench")
+    observable = observable_axes(lever_matrix(*motion[1:]), smooth, cutoff)
+    return LeverArm(x[:3], np.where(observable, deviations[:3], np.inf), "wrench")
 
 
-def common_times(
-    start: float, stop: float, logs: Sequence[Log], cutoff: float
-) -> NDArray[np.float64]:
-    """Evenly spaced times at which all logs have samples, and not bridges over gaps."""
-    t = np.linspace(start, stop, SAMPLES)
+def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) -> Array:
+    """Return evenly spaced times at which all logs have samples."""
+    t = np.linspace(start, stop, COMPARED_SAMPLES)
     known = [np.interp(t, log.t, measured(log, cutoff).astype(float)) > 0.99 for log in logs]
     return t[np.all(known, axis=0)]
 
 
-def lever_matrix(omega: NDArray[np.float64], alpha: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3, 3) K = [alpha x] + [omega x]^2: K p is what p adds to the specific force."""
+def lever_matrix(omega: Array, alpha: Array) -> Array:
+    """Return (N, 3, 3) K of Eq. (T20)."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
 
-def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """(3,) lever arms that the motion shows, and not only its noise.
+def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
+    """Return (3,) axes along which the motion exceeds its noise, which biases the arm to zero.
 
-    Noise in K is not seen in residuals: it draws the lever arm to zero, with confidence. The power
-    per Hz of white noise that was differentiated grows with the square of the frequency at least,
-    so below the cut-off there is at most a seventh of what is in the octave above it.
+    The noise below the cut-off is at most a seventh of that in the next octave, because its power
+    density grows at least with f^2.
     """
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
@@ -127,4 +111,4 @@ def shown_axes(K: NDArray[np.float64], log: Log, cutoff: float) -> NDArray[np.bo
     K = K - K.mean(axis=0)
     information = np.einsum("nij,nik->jk", K, K) / len(K)
     alone = 1 / np.diag(np.linalg.pinv(information, rcond=1e-12, hermitian=True))
-    return alone > _SIGNAL * (noise.sum() - noise)
+    return alone > _MIN_SIGNAL_RATIO * (noise.sum() - noise)

@@ -1,9 +1,7 @@
-"""MATLAB's files up to version 7: variables, and fields of structures, that are arrays of numbers.
+"""Numeric arrays of MATLAB files up to version 7, with fields of structures.
 
-Files of version 5 to 7 are taken apart here (MathWorks, MAT-File Format, chapter 1), because what a
-broken or planted file says leads SciPy's reader out of its memory, which ends the process; those of
-version 4, one array after the other, are SciPy's. All else (texts, cells, sparse and complex
-matrices, objects) is passed over.
+Versions 5 to 7 are parsed here (MathWorks, MAT-File Format), because invalid files can crash
+SciPy's reader. Other types are ignored.
 """
 
 from __future__ import annotations
@@ -17,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-_HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _DEEPEST = 128, 14, 15, 2, 1 << 11, 20
-_NUMBERS = range(6, 16)  # classes
+_HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = 128, 14, 15, 2, 1 << 11, 20
+_NUMERIC_CLASSES = range(6, 16)  # numeric classes
 _TYPES = {
     1: "i1",
     2: "u1",
@@ -32,38 +30,38 @@ _TYPES = {
     13: "u8",
 }
 _FLAGS_AND_SIZE = [6, 5]
-_BROKEN = "it is broken, or not all of it is there"
+_BROKEN = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
-    """Arrays by name; those in structures as `structure.field`.
+    """Return arrays by name; fields are named `structure.field`.
 
     Raises:
-        ValueError: if it is no such file, not all of one, or has no arrays.
+        ValueError: if the file is invalid or has no arrays.
     """
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
 
     version = matfile_version(path)[0]
     if version == 2:
-        raise ValueError("it is of version 7.3; save(..., '-v7') writes one that can be")
+        raise ValueError("version 7.3 is not supported; save it by save(..., '-v7')")
     found: dict[str, NDArray] = {}
     if version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
-        for kind, content in _elements(memoryview(data)[_HEADER:], order):
-            _take(kind, content, order, None, 0, found)
+        for kind, content in _iterate_elements(memoryview(data)[_HEADER:], order):
+            _add_variable(kind, content, order, None, 0, found)
     else:
         for name, value in loadmat(path).items():
             if isinstance(value, np.ndarray):
-                _put(name, value, found)
+                _add_array(name, value, found)
     if not found:
-        raise ValueError("it has no arrays: what is in tables and timeseries, save as arrays")
+        raise ValueError("it has no arrays; save tables and timeseries as arrays")
     return found
 
 
-def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """The kind of each element, and what is in it."""
+def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Yield type and content of each element."""
     start = 0
     while start < len(data):
         if len(data) - start < 8:
@@ -75,44 +73,44 @@ def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
         if len(content) < size or (small and size > 4):
             raise ValueError(_BROKEN)
         if kind == _COMPRESSED:
-            yield from _elements(memoryview(zlib.decompress(content)), order)
+            yield from _iterate_elements(memoryview(zlib.decompress(content)), order)
         else:
             yield kind, content
         start += 8 if small else 8 + (size if kind == _COMPRESSED else -(-size // 8) * 8)
 
 
-def _take(
+def _add_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    """Puts the arrays of one variable, or of a field by its name, with those that were found."""
-    parts = list(_elements(content, order)) if kind == _MATRIX else []
+    """Add the arrays of a variable or named field to `found`."""
+    parts = list(_iterate_elements(content, order)) if kind == _MATRIX else []
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
-    if depth > _DEEPEST:
+    if depth > _MAX_DEPTH:
         raise ValueError(_BROKEN)
-    (flags, *_), size = (_numbers(part, order).tolist() for part in parts[:2])
+    (flags, *_), size = (_parse_numbers(part, order).tolist() for part in parts[:2])
     name = bytes(parts[2][1]).decode("latin-1") if name is None else name
-    if flags & 0xFF in _NUMBERS and not flags & _COMPLEX:
+    if flags & 0xFF in _NUMERIC_CLASSES and not flags & _COMPLEX:
         if len(parts) != 4:
             raise ValueError(_BROKEN)
-        _put(name, _numbers(parts[3], order).reshape(size, order="F"), found)
+        _add_array(name, _parse_numbers(parts[3], order).reshape(size, order="F"), found)
     elif flags & 0xFF == _STRUCTURE and math.prod(size) == 1 and len(parts) > 4:
-        (length, *_), names = _numbers(parts[3], order).tolist(), bytes(parts[4][1])
+        (length, *_), names = _parse_numbers(parts[3], order).tolist(), bytes(parts[4][1])
         fields = [names[i : i + length] for i in range(0, len(names), max(length, 1))]
         for field, part in zip(fields, parts[5:], strict=True):
             label = field.partition(b"\0")[0].decode("latin-1")
-            _take(*part, order, f"{name}.{label}", depth + 1, found)
+            _add_variable(*part, order, f"{name}.{label}", depth + 1, found)
 
 
-def _numbers(part: tuple[int, memoryview], order: str) -> NDArray:
+def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
     kind, content = part
     if kind not in _TYPES:
         raise ValueError(_BROKEN)
     return np.frombuffer(content, f"{order}{_TYPES[kind]}").astype(_TYPES[kind])
 
 
-def _put(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
-    """A row or a column is a list, and a single number nothing. MATLAB counts matrices last."""
+def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
+    """Add an array: vectors as 1-D, matrix stacks with the stack axis first."""
     if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:

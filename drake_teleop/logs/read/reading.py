@@ -1,8 +1,8 @@
-"""From a file to a `Log`: canonical tables and descriptions alike (long: stream by stream)."""
+"""Conversion of a canonical table or a described recording into a `Log`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import number
+from drake_teleop.common.arrays import Array, number
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
@@ -22,9 +22,7 @@ from drake_teleop.logs.read.alignment import (
     spacing,
     uniform_times,
 )
-from drake_teleop.logs.read.auto_gravity import describe_gravity
-from drake_teleop.logs.read.auto_mounting import describe_mounting
-from drake_teleop.logs.read.auto_pose import describe_pose_frame
+from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
@@ -32,52 +30,56 @@ from drake_teleop.logs.read.description import (
     NO_YAML,
     Description,
     Imu,
-    Orientation,
     Pose,
     Static,
     Wrench,
     load_description,
 )
-from drake_teleop.logs.read.orientations import Orientations
-from drake_teleop.logs.read.removed_weight import restored, weight_of
+from drake_teleop.logs.read.gravity import describe_gravity, restore_weight, weight_wrench
 from drake_teleop.logs.read.rotations import nearest_rotation, quaternions, rotation_matrices
-from drake_teleop.logs.read.streams import LARGEST, Stream, at_S, in_S, on_clock, turned_wrench
+from drake_teleop.logs.read.streams import (
+    MAX_VALUES,
+    MINIMUM_SAMPLES,
+    Orientations,
+    Stream,
+    common_time,
+    in_S,
+    move_to_So,
+    on_clock,
+    wrench_in_S,
+)
 from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
 
-MINIMUM_SAMPLES = 16
 MINIMUM_POSES = 3
-_LEAST_HZ = 1e-3
-_CHUNK = 2**16
-_BRIDGED = 4.0
+_MIN_BANDWIDTH_HZ = 1e-3
+_CHUNK_ROWS = 2**16
+_GAP_RATIO = 4.0
+_Describe = Callable[..., tuple[Description, tuple[str, ...]]]
 
 
 def read_log(
     path: str | Path, *, bandwidth_hz: float | None = 30.0, differentiate: bool = True
 ) -> Log:
-    """Reads a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
+    """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
-    Streams are brought to the wrench's clock and its median rate by linear interpolation, over the
-    time that all of them cover; faster streams pass a zero-phase low-pass first, so that nothing is
-    folded down. What becomes of doubtful time stamps, and what a gap is, stands in
-    `drake_teleop.logs.read.clocks`; gaps are marked in `Log.bridged`. Angular velocity is taken
-    from the gyroscope if there is one, else from the orientation; angular acceleration from the
-    file, else by differentiating the angular velocity, else the orientation; the specific force
-    from the accelerometer (moved to the origin of S by its lever arm), else from the position, else
-    it is minus gravity, and a note says so.
+    Streams are interpolated on the wrench's clock at its median rate; faster streams are low-passed
+    first. Angular velocity comes from the gyroscope, else the orientation; angular acceleration
+    from the file, else by differentiation; specific force from the accelerometer, else the
+    position, else it is -gravity.
 
     Args:
         path: the file.
-        bandwidth_hz: of the smoother that differentiates; see `smooth_derivatives`.
-        differentiate: whether poses are differentiated that alone tell the motion; if not, the
-            motion is zero, and `Log.posed` is there for those who have a better way.
+        bandwidth_hz: see `smooth_derivatives`.
+        differentiate: False leaves the motion zero where poses are its only source, for users of
+            `Log.posed`.
 
     Raises:
-        DrakeTeleopError: naming file and field and what to do, if the log cannot be used.
+        DrakeTeleopError: naming file, field and remedy.
     """
     expect((str, Path), path, "log", "give the file's name")
-    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _LEAST_HZ:
+    if bandwidth_hz is not None and not number("bandwidth_hz", bandwidth_hz) >= _MIN_BANDWIDTH_HZ:
         raise DrakeTeleopError(
-            f"{bandwidth_hz:g} Hz leave nothing", where="bandwidth_hz", remedy="give more, or None"
+            f"{bandwidth_hz:g} Hz is too low", where="bandwidth_hz", remedy="give more, or None"
         )
     path = Path(path)
     if path.suffix.lower() in (".yaml", ".yml"):
@@ -98,26 +100,14 @@ def read_log(
 
 
 def read_description(
-    description: Description,
-    source: str,
-    *,
-    tables: dict[Path, Table] | None = None,
+    description: Description, source: str, *, tables: dict[Path, Table] | None = None
 ) -> Log:
-    """The log of a description in memory, as of `read_log`.
-
-    Args:
-        description: with absolute paths.
-        source: the file, for messages.
-        tables: files that are read already.
-
-    Raises:
-        DrakeTeleopError: if the log cannot be used.
-    """
+    """Return the log of a description with absolute paths, as `read_log`."""
     return _Reader(description, source, 30.0, tables).log()
 
 
 class _Reader:
-    """Reads the streams of one description; holds what they have in common."""
+    """Reader of the streams of one description."""
 
     def __init__(
         self,
@@ -130,62 +120,58 @@ class _Reader:
         self._source = source
         self._bandwidth_hz = bandwidth_hz
         self._notes: list[str] = []
-        self._gaps: list[NDArray[np.float64]] = []
+        self._gaps: list[Array] = []
         self._one_sided_s = 0.0
         self._tables = dict(tables or {})
 
     def log(self, *, keep_origin: bool = False, differentiate: bool = True) -> Log:
         if self._description.static is not None:
             if keep_origin:
-                self._notes.append("each row is taken for a pose at rest")
+                self._notes.append("each row is interpreted as a pose at rest")
             return self._static(self._description.static)
         assert self._description.wrench is not None
         weight = self._description.wrench.weight
-        parts = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
-        free = tuple(name for name, known in parts.items() if known)
+        causes = {"gravity": self._description.gravity == "auto", "weight": weight == "removed"}
+        free = tuple(name for name, is_free in causes.items() if is_free)
         if self._description.gravity == "auto":
-            self._find(describe_gravity)
+            self._replace_auto(describe_gravity)
         if self._description.pose is not None and self._description.pose.automatic:
-            self._find(describe_pose_frame, differentiate=False)
+            self._replace_auto(describe_pose_frame, differentiate=False)
         if self._description.imu is not None and self._description.imu.automatic:
-            self._find(describe_mounting)
-        wrench_t, wrench = self._wrench(self._description.wrench)
+            self._replace_auto(describe_mounting)
+        table = self._table(self._description.wrench)
+        clock = self._clock("wrench", self._description.wrench, table)
+        forces = self._forces("wrench", self._description.wrench, table, clock.total)
+        wrench_t, wrench = clock.t, clock.select(forces)
         pose = imu = None
         if self._description.pose is not None:
             pose = self._pose(self._description.pose, differentiate=differentiate)
         if self._description.imu is not None:
             imu = self._imu(self._description.imu, pose)
         streams = [stream for stream in (imu, pose) if stream is not None]
-        t = self._common_time(wrench_t, streams)
-        log = self._assembled(t, resample(t, wrench_t, wrench), imu, pose)
-        log = replace(log, gain_std=self._description.wrench.gain_std, free=free)
-        log = replace(log, described=self._description)
+        t = common_time(wrench_t, streams, self._source)
+        log = self._assemble(t, resample(t, wrench_t, wrench), imu, pose)
+        gain_std = self._description.wrench.gain_std
+        log = replace(log, gain_std=gain_std, free=free, described=self._description)
         if pose is not None and pose.raw is not None:
-            told = None if imu is None else imu.told
-            log = replace(log, posed=self._description.posed(pose.raw, told))
+            inertial = None if imu is None else imu.inertial
+            log = replace(log, posed=self._description.posed(pose.raw, inertial))
         log = log if keep_origin else log.earlier(float(wrench_t[0]))
         if not isinstance(weight, tuple):
             return log
         without = self._description.wrench.model_copy(update={"weight": None})
         other = self._description.model_copy(update={"wrench": without})
-        return restored(log, np.array(weight), self._another(other))
+        return restore_weight(log, np.array(weight), self._read_other(other))
 
-    def _find(
-        self,
-        describe: Callable[..., tuple[Description, tuple[str, ...]]],
-        *,
-        differentiate: bool = True,
-    ) -> None:
-        """Puts what the data say in the place of `auto`."""
+    def _replace_auto(self, describe: _Describe, *, differentiate: bool = True) -> None:
+        """Replace `auto` by the estimates of `describe`."""
         self._description, notes = describe(
-            self._description,
-            self._source,
-            partial(self._another, differentiate=differentiate),
+            self._description, self._source, partial(self._read_other, differentiate=differentiate)
         )
         self._notes += notes
 
-    def _another(self, description: Description, *, differentiate: bool = True) -> Log:
-        """The log with another description of the same files."""
+    def _read_other(self, description: Description, *, differentiate: bool = True) -> Log:
+        """Return the log of another description of the same files."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table(stream)
@@ -197,14 +183,7 @@ class _Reader:
             self._tables[stream.source] = read_stream(stream)
         return self._tables[stream.source]
 
-    def _wrench(self, stream: Wrench) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        table = self._table(stream)
-        clock = self._clock("wrench", stream, table)
-        return clock.t, clock.taken(self._forces("wrench", stream, table, clock.total))
-
-    def _forces(
-        self, name: str, stream: Wrench | Static, table: Table, rows: int
-    ) -> NDArray[np.float64]:
+    def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
             self._vectors(name, field, quantity, table, rows, stream.sign)
             for field, quantity in (("force", stream.force), ("torque", stream.torque))
@@ -216,8 +195,8 @@ class _Reader:
 
     def _vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
-    ) -> NDArray[np.float64]:
-        """(rows, 3) of a stream's field in SI, in the axes of the file, of a size that can be."""
+    ) -> Array:
+        """Return (rows, 3) values of a field in SI units, in the axes of the file."""
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
@@ -227,14 +206,11 @@ class _Reader:
             f"if these are raw counts, set {name}.{field}.scale, such as 1e-6{of_table};"
             " else check column and unit, or delete the row"
         )
-        table.check_size(values, *LARGEST[field], where, remedy)
+        table.check_size(values, *MAX_VALUES[field], where, remedy)
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
-        """The motion by differentiation, unless it is not wanted and the poses are enough.
-
-        Of an hour at 1 kHz the poses fit into memory, their rotations and derivatives do not.
-        """
+        """Return the differentiated motion, or only the poses to save memory."""
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
         t, raw = uniform_times(clock.t), None
@@ -245,7 +221,7 @@ class _Reader:
             if not differentiate and imu is None and wrench is not None and wrench.frame != "base":
                 return Stream("pose", t, raw=raw)
         dt = spacing(t)
-        self._differentiated(dt)
+        self._extend_one_sided(dt)
         raw_R = rotation_matrices(quaternion, "quaternion_wxyz")
         R_WS = nearest_rotation(resample(t, clock.t, raw_R))
         acceleration = np.zeros(3)
@@ -261,26 +237,27 @@ class _Reader:
             raw,
         )
 
-    def _poses_of_S(
-        self, stream: Pose, table: Table, clock: Clock
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-        """(N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W if there are positions."""
+    def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
+        """Return (N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W or None."""
         position = None
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
-            position = clock.taken(position)
-        orientations = self._orientations("pose", stream.orientation, table, clock.total)
+            position = clock.select(position)
+        where = f"{self._source}:pose.orientation"
+        orientations = Orientations(
+            self._description, stream.orientation, table, clock.total, where
+        )
         quaternion = np.empty((len(clock.rows), 4))
         origin = np.array(stream.position_in_sensor)
-        for start in range(0, len(quaternion), _CHUNK):
-            part = slice(start, start + _CHUNK)
+        for start in range(0, len(quaternion), _CHUNK_ROWS):
+            part = slice(start, start + _CHUNK_ROWS)
             q = orientations.quaternions(clock.rows[part])
             if stream.R_SP is not None or (position is not None and origin.any()):
                 R_WS = rotation_matrices(q, "quaternion_wxyz")
                 if stream.R_SP is not None:
                     R_WS = R_WS @ stream.R_SP.T
                     q = quaternions(R_WS)
-                if position is not None:  # from the posed origin to that of S
+                if position is not None:  # from Po to So
                     position[part] -= R_WS @ origin
             quaternion[part] = q
         return quaternion, position
@@ -292,45 +269,45 @@ class _Reader:
         t = uniform_times(raw_t)
         dt = spacing(t)
 
-        def vectors(field: str, sign: float = 1.0) -> NDArray[np.float64] | None:
+        def vectors(field: str, sign: float = 1.0) -> Array | None:
             quantity = getattr(stream, field)
             if quantity is None:
                 return None
             values = self._vectors("imu", field, quantity, table, clock.total, sign)
-            return self._to_S("imu", stream.frame, resample(t, raw_t, clock.taken(values)), t, pose)
+            return self._to_S(
+                "imu", stream.frame, resample(t, raw_t, clock.select(values)), t, pose
+            )
 
         s = vectors("specific_force", stream.sign)
         omega, alpha = vectors("angular_velocity"), vectors("angular_acceleration")
         if omega is not None and alpha is None:
-            self._differentiated(dt)
+            self._extend_one_sided(dt)
             alpha = smooth_derivatives(omega, dt, self._bandwidth_hz)[1]
         assert stream.position != "auto"
         if s is not None and any(stream.position):
-            s = at_S(s, np.array(stream.position), t, omega, alpha, pose)
+            s = move_to_So(s, np.array(stream.position), t, omega, alpha, pose)
         at = np.clip(np.searchsorted(raw_t, t), 1, len(raw_t) - 1)
-        kept = raw_t[at] - raw_t[at - 1] < _BRIDGED * dt  # not within a gap
-        both = (None if x is None else x[kept] for x in (s, omega))
-        return Stream("imu", t, s, omega, alpha, told=Inertial(t[kept], *both))
+        outside_gaps = raw_t[at] - raw_t[at - 1] < _GAP_RATIO * dt  # outside of gaps
+        both = (None if x is None else x[outside_gaps] for x in (s, omega))
+        return Stream("imu", t, s, omega, alpha, inertial=Inertial(t[outside_gaps], *both))
 
     def _to_S(
-        self,
-        name: str,
-        frame: str | tuple,
-        vectors: NDArray[np.float64],
-        t: NDArray[np.float64],
-        pose: Stream | None,
-    ) -> NDArray[np.float64]:
+        self, name: str, frame: str | tuple, vectors: Array, t: Array, pose: Stream | None
+    ) -> Array:
         if isinstance(frame, tuple):
             return vectors @ np.array(frame).T
         if frame == "sensor":
             return vectors
         if pose is None or pose.R_WS is None:
-            raise DrakeTeleopError(
-                "base axes cannot be turned to S without an orientation",
-                where=f"{self._source}:{name}.frame",
-                remedy="add a pose stream",
-            )
+            raise self._no_orientation(name)
         return in_S(nearest_rotation(resample(t, pose.t, pose.R_WS)), vectors)
+
+    def _no_orientation(self, name: str, remedy: str = "add a pose stream") -> DrakeTeleopError:
+        return DrakeTeleopError(
+            "base axes cannot be turned to S without an orientation",
+            where=f"{self._source}:{name}.frame",
+            remedy=remedy,
+        )
 
     def _static(self, stream: Static) -> Log:
         table = self._table(stream)
@@ -343,20 +320,20 @@ class _Reader:
             gravity = -s
         else:
             assert stream.orientation is not None
-            orientations = self._orientations("static", stream.orientation, table, table.rows)
+            where = f"{self._source}:static.orientation"
+            orientations = Orientations(
+                self._description, stream.orientation, table, table.rows, where
+            )
             R_WS = orientations.rotations(np.arange(table.rows))
             R_SW = np.swapaxes(R_WS, 1, 2)
             gravity = R_SW @ self._description.gravity_W
         if stream.frame == "base":
             if R_SW is None:
-                raise DrakeTeleopError(
-                    "base axes cannot be turned to S without an orientation",
-                    where=f"{self._source}:static.frame",
-                    remedy="give static.orientation instead of gravity or specific_force",
-                )
-            wrench = turned_wrench(R_SW, wrench)
+                remedy = "give static.orientation instead of gravity or specific_force"
+                raise self._no_orientation("static", remedy)
+            wrench = wrench_in_S(R_SW, wrench)
         if isinstance(stream.weight, tuple):
-            wrench = wrench + weight_of(np.array(stream.weight), gravity)
+            wrench = wrench + weight_wrench(np.array(stream.weight), gravity)
         n = len(wrench)
         if n < MINIMUM_POSES:
             raise DrakeTeleopError(
@@ -365,16 +342,17 @@ class _Reader:
                 remedy=f"record at least {MINIMUM_POSES}, better 12, with different orientations",
             )
         rest = np.zeros((n, 3))
-        motion = (-gravity, rest, rest)
-        notes = tuple(self._notes)
-        index = np.arange(float(n))
-        log = Log(index, wrench, *motion, gravity, True, notes=notes, source=self._source)
-        resolution = self._resolution(stream, table)
-        described = self._description
-        return replace(log, gain_std=stream.gain_std, described=described, resolution=resolution)
+        return Log(
+            *(np.arange(float(n)), wrench, -gravity, rest, rest, gravity, True),
+            notes=tuple(self._notes),
+            source=self._source,
+            gain_std=stream.gain_std,
+            described=self._description,
+            resolution=self._resolution(stream, table),
+        )
 
     def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
-        """Step of the numbers of force and torque [N, N m]."""
+        """Return the steps of force and torque [N, N m]."""
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
             * (self._description.scale(quantity.unit) * np.abs(quantity.scale).max())
@@ -383,7 +361,7 @@ class _Reader:
         return force, torque
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        """Strictly increasing times of a stream, and the rows of the table that they belong to."""
+        """Return the times of a stream; record its notes and gaps."""
         columns = [
             column
             for field in type(stream).model_fields
@@ -402,83 +380,47 @@ class _Reader:
             self._notes.append(
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
-        holes = gaps(t, self._bandwidth_hz)
-        if len(holes):
-            start, stop = holes[int(np.argmax(holes[:, 1] - holes[:, 0]))]
+        found_gaps = gaps(t, self._bandwidth_hz)
+        if len(found_gaps):
+            start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
-                f"{name}: {len(holes)} gaps, the longest of {stop - start:.3g} s at"
-                f" {start - t[0]:.3g} s; what lies in them and close by is not used"
+                f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
+                f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
-            seen = self._half_window(float(np.median(np.diff(t))))
-            self._gaps.append(holes + np.array([-seen, seen]))
+            half_window = self._half_window(float(np.median(np.diff(t))))
+            self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock
 
     def _half_window(self, dt: float) -> float:
-        """How far to either side a derivative has seen [s]."""
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0
         return max(4 * dt, 0.5 * window)
 
-    def _differentiated(self, dt: float) -> None:
+    def _extend_one_sided(self, dt: float) -> None:
         self._one_sided_s = max(self._one_sided_s, self._half_window(dt))
 
-    def _orientations(
-        self, name: str, orientation: Orientation, table: Table, rows: int
-    ) -> Orientations:
-        where = f"{self._source}:{name}.orientation"
-        return Orientations(self._description, orientation, table, rows, where)
-
-    def _common_time(
-        self, wrench_t: NDArray[np.float64], streams: Sequence[Stream]
-    ) -> NDArray[np.float64]:
-        """Uniform times at the wrench's rate, over the time that all streams cover."""
-        start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
-        stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
-        spans = "; ".join(
-            f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
-            for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
-        )
-        if stop <= start:
-            raise DrakeTeleopError(
-                f"the streams do not overlap in time ({spans})",
-                where=self._source,
-                remedy="check time.unit of each stream, or shift its clock by time.offset",
-            )
-        uniform = uniform_times(wrench_t)
-        dt = spacing(uniform)
-        # A rounding error of the clocks must not cost the first and the last sample.
-        inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
-        t = uniform[inside]
-        if len(t) < MINIMUM_SAMPLES:
-            raise DrakeTeleopError(
-                f"the streams have only {len(t)} samples in common ({spans})",
-                where=self._source,
-                remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
-            )
-        return t
-
-    def _assembled(
-        self,
-        t: NDArray[np.float64],
-        wrench: NDArray[np.float64],
-        imu: Stream | None,
-        pose: Stream | None,
-    ) -> Log:
-        def signal(field: str) -> NDArray[np.float64]:
+    def _assemble(self, t: Array, wrench: Array, imu: Stream | None, pose: Stream | None) -> Log:
+        def signal(field: str) -> Array:
             for stream in (imu, pose):
                 values = None if stream is None else getattr(stream, field)
                 if stream is not None and values is not None:
                     return on_clock(t, stream, values)
             return np.broadcast_to(0.0, (len(t), 3))  # not differentiated
 
-        gravity, R_WS = None, None
+        gravity = R_WS = None
+        described, described_pose = self._description.wrench, self._description.pose
+        in_base = described is not None and described.frame == "base"
         if pose is not None and pose.R_WS is not None:
             R_WS = nearest_rotation(on_clock(t, pose, pose.R_WS))
             gravity = np.swapaxes(R_WS, 1, 2) @ self._description.gravity_W
-            described = self._description.wrench
-            if described is not None and described.frame == "base":
-                wrench = turned_wrench(np.swapaxes(R_WS, 1, 2), wrench)
-        self._check_base_wrench(pose)
-        self._note_rest(imu)
+            if in_base:
+                wrench = wrench_in_S(np.swapaxes(R_WS, 1, 2), wrench)
+        if in_base and pose is None:
+            raise self._no_orientation("wrench")
+        accelerometer = imu is not None and imu.specific_force is not None
+        if not accelerometer and described_pose and described_pose.position is None:
+            self._notes.append(
+                "neither accelerometer nor position: the acceleration of S is taken as zero"
+            )
         return Log(
             *(t, wrench, signal("specific_force"), signal("angular_velocity")),
             signal("angular_acceleration"),
@@ -491,8 +433,8 @@ class _Reader:
             one_sided_s=self._one_sided_s,
         )
 
-    def _bridged(self, t: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """(N,) samples that a gap of any stream has touched; None without gaps."""
+    def _bridged(self, t: Array) -> NDArray[np.bool_] | None:
+        """Return (N,) flags of samples that a gap affects, or None."""
         if not self._gaps:
             return None
         flags = np.zeros(len(t), bool)
@@ -505,19 +447,3 @@ class _Reader:
                 remedy="record without interruptions",
             )
         return flags
-
-    def _check_base_wrench(self, pose: Stream | None) -> None:
-        described = self._description.wrench
-        if described is not None and described.frame == "base" and pose is None:
-            raise DrakeTeleopError(
-                "base axes cannot be turned to S without an orientation",
-                where=f"{self._source}:wrench.frame",
-                remedy="add a pose stream",
-            )
-
-    def _note_rest(self, imu: Stream | None) -> None:
-        posed = self._description.pose
-        if (imu is None or imu.specific_force is None) and posed and posed.position is None:
-            self._notes.append(
-                "neither accelerometer nor position: the acceleration of S is taken as zero"
-            )

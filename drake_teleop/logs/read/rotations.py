@@ -1,23 +1,21 @@
-"""Rotations in the forms that logs keep them in."""
+"""Conversions between rotation matrices, quaternions and rotation vectors."""
 
 from __future__ import annotations
 
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
+
+from drake_teleop.common.arrays import Array
 
 WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vector": 3}
 """Number of columns of each form."""
 
 
-def rotation_matrices(columns: NDArray[np.float64], form: str) -> NDArray[np.float64]:
-    """(N, 3, 3) matrices from the columns of a log.
+def rotation_matrices(columns: Array, form: str) -> Array:
+    """Return (N, 3, 3) matrices from columns (N, WIDTHS[form]), without normalization.
 
-    Args:
-        columns: (N, k) with k = `WIDTHS[form]`: row-major matrix entries, a quaternion, or axis
-            times angle [rad]. Quaternions and matrices are taken as they are, not normalised.
-        form: a key of `WIDTHS`.
+    Matrices are row-major, rotation vectors in [rad].
     """
     if form == "matrix":
         return columns.reshape(-1, 3, 3)
@@ -26,28 +24,28 @@ def rotation_matrices(columns: NDArray[np.float64], form: str) -> NDArray[np.flo
     return _from_quaternions(columns if form == "quaternion_wxyz" else np.roll(columns, 1, axis=1))
 
 
-def rotation_error(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (...) of (..., 3, 3) matrices from rotations: max |R^T R - I|; >= 2 if mirrored."""
+def rotation_error(R: Array) -> Array:
+    """Return max |R^T R - I| of (..., 3, 3) matrices; at least 2 for reflections."""
     error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(R) < 0, np.maximum(error, 2.0), error)
 
 
-def nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotations closest to (..., 3, 3) matrices that are nearly rotations."""
-    # Newton's iteration for the polar factor; 4 steps take an error of 0.3 to below 1e-15.
+def nearest_rotation(R: Array) -> Array:
+    """Return the rotations closest to (..., 3, 3) near-rotations."""
+    # Newton-Schulz iteration for the polar factor; 4 steps reduce an error of 0.3 below 1e-15.
     for _ in range(4):
         R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
     return R
 
 
-def quaternions(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 4) [w, x, y, z] of rotations (N, 3, 3), of either sign."""
+def quaternions(R: Array) -> Array:
+    """Return (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])
 
 
-def _from_quaternions(q: NDArray[np.float64]) -> NDArray[np.float64]:
+def _from_quaternions(q: Array) -> Array:
     w, x, y, z = q.T
     return np.stack(
         [
@@ -59,14 +57,14 @@ def _from_quaternions(q: NDArray[np.float64]) -> NDArray[np.float64]:
     ).reshape(-1, 3, 3)
 
 
-def _from_rotation_vectors(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _from_rotation_vectors(vectors: Array) -> Array:
     half = np.linalg.norm(vectors, axis=1, keepdims=True) / 2
-    # np.sinc(x) is sin(pi x) / (pi x), so there is nothing to divide by at angle 0.
+    # np.sinc(x) = sin(pi x) / (pi x) avoids a division by zero at angle 0.
     return np.hstack([np.cos(half), 0.5 * np.sinc(half / np.pi) * vectors])
 
 
-def right_angled_rotations() -> list[NDArray[np.float64]]:
-    """The 24 rotations (3, 3) that exchange and turn axes, the identity first."""
+def right_angled_rotations() -> list[Array]:
+    """Return the 24 rotations (3, 3) that map axes to axes, identity first."""
     matrices = [
         np.diag(signs) @ np.eye(3)[list(order)]
         for order in permutations(range(3))

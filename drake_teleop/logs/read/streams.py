@@ -1,16 +1,30 @@
-"""Signals on a clock of their own, brought to another, and vectors turned to the axes of S."""
+"""Signals and orientations of one stream: resampling and transformation to S."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
-from drake_teleop.logs.read.alignment import low_pass, resample, spacing
+from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
+from drake_teleop.logs.read.description import Description, Orientation
+from drake_teleop.logs.read.description_fields import ROTATION_TOLERANCE
+from drake_teleop.logs.read.rotations import (
+    WIDTHS,
+    nearest_rotation,
+    quaternions,
+    rotation_error,
+    rotation_matrices,
+)
+from drake_teleop.logs.read.tables import Table
 
-LARGEST = {
+MINIMUM_SAMPLES = 16
+MAX_VALUES = {
     "force": (1e6, "N"),
     "torque": (1e6, "N m"),
     "specific_force": (1e6, "m/s^2"),
@@ -19,63 +33,137 @@ LARGEST = {
     "angular_acceleration": (1e9, "rad/s^2"),
     "position": (1e9, "m"),
 }
-"""What no log holds, not even in wrong units within reach: those are told by what they explain."""
+"""Largest plausible value of each signal and its unit, also for wrong units."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """Signals on one clock. Arrays (N, ...) or None; `t` is [s] on the common clock.
+    """Signals (N, ...) on one clock `t` [s], or None.
 
-    `raw` are the poses of S as they were recorded, `told` what an IMU tells of S.
+    `raw` are the recorded poses of S, `inertial` the IMU data in S.
     """
 
     name: str
-    t: NDArray[np.float64]
-    specific_force: NDArray[np.float64] | None = None
-    angular_velocity: NDArray[np.float64] | None = None
-    angular_acceleration: NDArray[np.float64] | None = None
-    R_WS: NDArray[np.float64] | None = None
+    t: Array
+    specific_force: Array | None = None
+    angular_velocity: Array | None = None
+    angular_acceleration: Array | None = None
+    R_WS: Array | None = None
     raw: Poses | None = None
-    told: Inertial | None = None
+    inertial: Inertial | None = None
 
     @property
     def dt(self) -> float:
-        """Usual time from one sample to the next [s]."""
+        """Mean sample spacing [s]."""
         return spacing(self.t)
 
 
-def on_clock(
-    t: NDArray[np.float64], stream: Stream, values: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """`values` of a stream at times `t`, without what is too fast for their spacing."""
+def on_clock(t: Array, stream: Stream, values: Array) -> Array:
+    """Return `values` of a stream at times `t`, low-passed if the stream is faster."""
     rate = 1 / spacing(t)
     faster = stream.dt * rate < 0.9
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
 
 
-def in_S(R_WS: NDArray[np.float64], vectors_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3) vectors in S, of such in W."""
+def in_S(R_WS: Array, vectors_W: Array) -> Array:
+    """Return (N, 3) vectors in S of vectors in W."""
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
-def turned_wrench(R_SW: NDArray[np.float64], wrench_W: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 6) wrenches in S, of such in W."""
+def wrench_in_S(R_SW: Array, wrench_W: Array) -> Array:
+    """Return (N, 6) wrenches in S of wrenches in W."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
 
 
-def at_S(
-    s: NDArray[np.float64],
-    p_SoIo_S: NDArray[np.float64],
-    t: NDArray[np.float64],
-    omega: NDArray[np.float64] | None,
-    alpha: NDArray[np.float64] | None,
+def move_to_So(
+    s: Array,
+    p_SoIo_S: Array,
+    t: Array,
+    omega: Array | None,
+    alpha: Array | None,
     pose: Stream | None,
-) -> NDArray[np.float64]:
-    """Specific force of So from the one measured at Io, a point of the same rigid body."""
+) -> Array:
+    """Return the specific force of So from that of Io on the same rigid body."""
     if omega is None or alpha is None:
         assert pose is not None and pose.angular_velocity is not None
         assert pose.angular_acceleration is not None
         omega = resample(t, pose.t, pose.angular_velocity)
         alpha = resample(t, pose.t, pose.angular_acceleration)
     return s - np.cross(alpha, p_SoIo_S) - np.cross(omega, np.cross(omega, p_SoIo_S))
+
+
+class Orientations:
+    """Orientations R_WS, or their inverses, of `rows` rows of a table."""
+
+    def __init__(
+        self,
+        description: Description,
+        orientation: Orientation,
+        table: Table,
+        rows: int,
+        where: str,
+    ) -> None:
+        self._orientation, self._table, self._where = orientation, table, where
+        width = WIDTHS[orientation.form]
+        self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
+        if orientation.form == "rotation_vector":
+            self._columns *= description.scale(orientation.unit)
+
+    def rotations(self, rows: NDArray[np.intp]) -> Array:
+        """Return (n, 3, 3) R_WS of n rows; raise an error for other matrices."""
+        R = rotation_matrices(self._columns[rows], self._orientation.form)
+        self._check_errors(rotation_error(R), rows)
+        return nearest_rotation(np.swapaxes(R, 1, 2) if self._orientation.inverse else R)
+
+    def quaternions(self, rows: NDArray[np.intp]) -> Array:
+        """Return (n, 4) [w, x, y, z] of `rotations`, without matrices where possible."""
+        if not self._orientation.form.startswith("quaternion"):
+            return quaternions(self.rotations(rows))
+        q = self._columns[rows]
+        if self._orientation.form == "quaternion_xyzw":
+            q = np.roll(q, 1, axis=1)
+        squared = np.einsum("ij,ij->i", q, q)  # the matrix of q is this, times a rotation
+        self._check_errors(np.abs(squared**2 - 1.0), rows)
+        q /= np.sqrt(squared)[:, None]
+        if self._orientation.inverse:
+            q[:, 1:] *= -1.0
+        return q
+
+    def _check_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
+        worst = int(np.argmax(errors))
+        if errors[worst] > ROTATION_TOLERANCE:
+            row = rows[worst] + self._table.first_row
+            raise DrakeTeleopError(
+                f"row {row} of {self._table.path.name} is not a rotation",
+                where=self._where,
+                remedy=f"check the columns and their order; form is {self._orientation.form}",
+            )
+
+
+def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
+    """Return uniform times at the wrench's rate that all streams cover."""
+    start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
+    stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
+    spans = "; ".join(
+        f"{name} {t[0]:.6g} to {t[-1]:.6g} s"
+        for name, t in [("wrench", wrench_t), *((s.name, s.t) for s in streams)]
+    )
+    if stop <= start:
+        raise DrakeTeleopError(
+            f"the streams do not overlap in time ({spans})",
+            where=source,
+            remedy="check time.unit of each stream, or shift its clock by time.offset",
+        )
+    uniform = uniform_times(wrench_t)
+    dt = spacing(uniform)
+    # Rounding of the clocks must not exclude the first and last sample.
+    inside = (uniform >= start - 1e-6 * dt) & (uniform <= stop + 1e-6 * dt)
+    t = uniform[inside]
+    if len(t) < MINIMUM_SAMPLES:
+        raise DrakeTeleopError(
+            f"the streams have only {len(t)} samples in common ({spans})",
+            where=source,
+            remedy=f"record at least {MINIMUM_SAMPLES}, or check time.offset",
+        )
+    return t

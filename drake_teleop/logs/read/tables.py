@@ -1,7 +1,4 @@
-"""Tables of numbers from files of text, Parquet, NPZ, MAT; messages name file, column, row.
-
-Topics of bags become the same kind of table in `drake_teleop.logs.read.bags`.
-"""
+"""Tables of numbers from text, Parquet, NPZ and MAT files; errors name file, column and row."""
 
 from __future__ import annotations
 
@@ -18,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, reading, refuse_fork
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.logs.read.csv_text import read_csv
@@ -28,26 +26,25 @@ if TYPE_CHECKING:
 
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
-LARGEST = 1e25
-"""Numbers beyond are none that were measured, in whatever unit: nanoseconds since 1970 are 2e18."""
+MAX_NUMBER = 1e25
+"""Largest plausible number in any unit; nanoseconds since 1970 are 2e18."""
 _CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
 _Column = TypeVar("_Column")
-_PARTS = 16  # numbers of an array that are columns of their own: up to a homogeneous matrix
-_MOST_DECIMALS = 12
-_LARGE = 2**24
-"""Numbers in a table that are more than is kept in memory, where the file's format allows it."""
+_MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
+_MAX_DECIMALS = 12
+_MAX_CELLS_IN_MEMORY = 2**24
+"""Number of cells above which columns of a Parquet file are read on access."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """The columns of one file.
+    """Columns of one file.
 
-    Args:
-        path: the file, for messages.
-        columns: name to array (N,) or, from NPZ and MAT files, (N, ...), whose numbers are columns
-            of their own as well, `name[0]` and so on in row-major order; of any type as yet.
-        first_row: number of the first data row in the file as a reader counts, for messages.
-        absent: groups of columns, such as "orientation", that the file says it does not have.
+    Attributes:
+        path: file name for messages.
+        columns: arrays (N,) of any type by name; also (N, ...) with columns `name[0]`, row-major.
+        first_row: number of the first data row in the file.
+        absent: groups that the file marks as not provided.
     """
 
     path: Path
@@ -62,20 +59,10 @@ class Table:
 
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
-    ) -> NDArray[np.float64]:
-        """(N, width) finite numbers from the named columns side by side.
+    ) -> Array:
+        """Return (N, width) finite numbers of the named columns, side by side.
 
-        An array with several columns counts as that many, row-major.
-
-        Args:
-            names: of the columns.
-            width: how many they have to be.
-            where: the field that names them, for messages.
-            rows: how many rows they have to have; None for the same number in all of them.
-
-        Raises:
-            DrakeTeleopError: if a column is absent, a cell is no finite number, or the numbers of
-                columns and rows are not these.
+        Raises an error if a column is absent, a cell is not finite, or `width` or `rows` differ.
         """
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
@@ -91,7 +78,6 @@ class Table:
     def _check_rows(
         self, names: Sequence[str | int], columns: list[NDArray], where: str, rows: int | None
     ) -> None:
-        """Raises an error if not all have so many rows, or None: as many as the first."""
         rows = len(columns[0]) if columns and rows is None else rows
         for name, column in zip(names, columns, strict=True):
             if len(column) != rows:
@@ -101,43 +87,23 @@ class Table:
                     remedy="name columns that belong together",
                 )
 
-    def all_raw(self, names: Sequence[str | int], where: str) -> NDArray[np.float64]:
-        """`raw` of several columns, side by side.
-
-        Raises:
-            DrakeTeleopError: as `raw`, and if they have different numbers of rows.
-        """
+    def all_raw(self, names: Sequence[str | int], where: str) -> Array:
+        """Return `raw` of several columns with equal numbers of rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
 
-    def raw(self, name: str | int, where: str) -> NDArray[np.float64]:
-        """(N, k) numbers of one column, whatever they are: NaN and infinity included.
-
-        Args:
-            name: of the column.
-            where: the field that names it, for messages.
-
-        Raises:
-            DrakeTeleopError: if the column is absent or a cell is no number.
-        """
+    def raw(self, name: str | int, where: str) -> Array:
+        """Return (N, k) numbers of a column, including NaN and infinity, or raise an error."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
         numbers = self._numbers(name)
-        self.check_size(numbers, LARGEST, "", f"{self.path}:{name}")
+        self.check_size(numbers, MAX_NUMBER, "", f"{self.path}:{name}")
         return numbers
 
-    def single(self, name: str | int, where: str) -> NDArray[np.float64]:
-        """(N,) numbers of a column that is one wide, whatever they are: NaN and infinity included.
-
-        Args:
-            name: of the column.
-            where: the field that names it, for messages.
-
-        Raises:
-            DrakeTeleopError: if the column is absent, wider, or a cell is no number.
-        """
+    def single(self, name: str | int, where: str) -> Array:
+        """Return (N,) numbers of a column as `raw`; raise an error if it is wider."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
@@ -149,24 +115,13 @@ class Table:
 
     def check_size(
         self,
-        values: NDArray[np.float64],
+        values: Array,
         largest: float,
         unit: str,
         where: str,
         remedy: str = "check the column and its unit, or delete the row",
     ) -> None:
-        """Refuses what cannot have been measured, and would be beyond all floats when squared.
-
-        Args:
-            values: (N, k), a row for each of the table's.
-            largest: size of a value, in the unit.
-            unit: for the message.
-            where: the field, for the message.
-            remedy: for the message.
-
-        Raises:
-            DrakeTeleopError: naming the first row with a number that is larger, but not infinite.
-        """
+        """Raise an error for the first row with a finite value beyond `largest`."""
         if not values.size or (values.min() >= -largest and values.max() <= largest):
             return
         bad = ((np.abs(values) > largest) & np.isfinite(values)).any(axis=1)
@@ -180,7 +135,7 @@ class Table:
                 remedy=remedy,
             )
 
-    def _column(self, name: str, where: str) -> NDArray[np.float64]:
+    def _column(self, name: str, where: str) -> Array:
         if name not in self.columns:
             if name.rpartition(".")[0] in self.absent:
                 raise DrakeTeleopError(
@@ -188,12 +143,12 @@ class Table:
                     where=where,
                     remedy="name another column, or leave this out",
                 )
-            near = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
-            hint = "did you mean" if near else "its columns are"
+            similar = difflib.get_close_matches(name, self.columns, n=3, cutoff=0.5)
+            hint = "did you mean" if similar else "its columns are"
             raise DrakeTeleopError(
                 f"{self.path.name} has no column {name!r}",
                 where=where,
-                remedy=f"{hint} {_listed(near or list(self.columns))}",
+                remedy=f"{hint} {_join_names(similar or list(self.columns))}",
             )
         numbers = self.raw(name, where)
         bad = ~np.isfinite(numbers).all(axis=1)
@@ -207,12 +162,12 @@ class Table:
             )
         return numbers
 
-    def _numbers(self, name: str) -> NDArray[np.float64]:
+    def _numbers(self, name: str) -> Array:
         column = self.columns[name]
-        numbers = _as_numbers(column, lambda row, cell: self._bad(name, row, cell))
+        numbers = _as_numbers(column, lambda row, cell: self._cell_error(name, row, cell))
         return numbers.reshape(len(column), math.prod(numbers.shape[1:]))
 
-    def _bad(self, name: str, row: int, cell: object) -> DrakeTeleopError:
+    def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
             f"{cell!r} in row {row + self.first_row} is not a number",
             where=f"{self.path}:{name}",
@@ -221,9 +176,9 @@ class Table:
         )
 
 
-def decimal_step(values: NDArray[np.float64]) -> float:
-    """Largest power of ten, 1 at most, of which all values are multiples; 0 if there is none."""
-    for decimals in range(_MOST_DECIMALS if values.any() else 0):
+def decimal_step(values: Array) -> float:
+    """Return the largest power of ten <= 1 that divides all values, or 0."""
+    for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
             return float(10.0**-decimals)
@@ -231,15 +186,9 @@ def decimal_step(values: NDArray[np.float64]) -> float:
 
 
 def read_table(path: Path, *, header: bool = True) -> Table:
-    """Reads a file of one of the `FORMATS`, told apart by its suffix.
+    """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
 
-    Args:
-        path: the file.
-        header: whether the first line of a file of text holds names; if not, the columns are named
-            by their numbers, from "0".
-
-    Raises:
-        DrakeTeleopError: if the file is absent, of another kind, or cannot be parsed.
+    Without a header the columns of a text file are named from "0".
     """
     if path.suffix.lower() not in FORMATS:
         raise DrakeTeleopError(
@@ -252,7 +201,9 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     refuse_fork()
     with reading(path, f"check that it is a valid {path.suffix} file"):
         arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
-        table = _read_frame(path, header) if arrays is None else _table_of(path, arrays(path))
+        table = (
+            _read_frame(path, header) if arrays is None else _table_from_arrays(path, arrays(path))
+        )
     if not table.columns or not all(len(c) for c in table.columns.values()):
         raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
     return table
@@ -265,33 +216,36 @@ def _read_frame(path: Path, header: bool) -> Table:
         check_parquet(path)
         names = list(pl.read_parquet_schema(path))
         lazy = _ParquetColumns(
-            path, _with_canonical(dict(zip(_stripped(names), names, strict=True)))
+            path, _with_canonical(dict(zip(_strip_names(names), names, strict=True)))
         )
-        small = len(names) * pl.scan_parquet(path).select(pl.len()).collect().item() <= _LARGE
+        small = (
+            len(names) * pl.scan_parquet(path).select(pl.len()).collect().item()
+            <= _MAX_CELLS_IN_MEMORY
+        )
         return Table(path, dict(lazy) if small else lazy)
     frame, first_row = read_csv(path, header)
     names = [name if header else str(i) for i, name in enumerate(frame.columns)]
     found = [_frame_column(series) for series in frame.get_columns()]
-    columns = dict(zip(_stripped(names), found, strict=True))
+    columns = dict(zip(_strip_names(names), found, strict=True))
     return Table(path, _with_canonical(columns), first_row)
 
 
-def _stripped(names: list[str]) -> list[str]:
+def _strip_names(names: list[str]) -> list[str]:
     stripped = [name.strip() for name in names]
     if len(set(stripped)) < len(names):
-        raise ValueError("two of its columns have names that differ in spaces alone")
+        raise ValueError("two column names differ only in spaces")
     return stripped
 
 
 def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
-    """The columns, and under their canonical names those of a canonical log in other letters."""
+    """Add lower-case column names if the table is a canonical log."""
     small = {name.lower(): column for name, column in columns.items()}
     canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
     return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
 
 
 class _ParquetColumns(UserDict[str, Any]):
-    """The columns of a file, each read when it is asked for: all of an hour's fill the memory."""
+    """Columns of a Parquet file, each read on access to limit memory."""
 
     def __init__(self, path: Path, names: dict[str, str]) -> None:
         super().__init__(names)
@@ -311,40 +265,38 @@ def _frame_column(series: pl.Series) -> NDArray:
         series = series.cast(pl.Duration("ns"))
     if series.dtype in (pl.Datetime, pl.Duration):
         return series.to_numpy()
-    if series.dtype == pl.Int128:  # which numpy has not
+    if series.dtype == pl.Int128:  # not supported by NumPy
         series = series.cast(pl.Float64)
-    # Floats keep their empty cells as NaN, which is reported with its row later on.
+    # Empty cells become NaN, which is reported with its row later.
     return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
 
 
-def _table_of(path: Path, arrays: dict[str, NDArray]) -> Table:
+def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
     arrays = {name: array for name, array in arrays.items() if len(array)}
     parts = {
         f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
         for name, array in arrays.items()
         for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
-        if k < _PARTS
+        if k < _MAX_ELEMENT_COLUMNS
     }
     return Table(path, parts | arrays)
 
 
 def _read_npz(path: Path) -> dict[str, NDArray]:
     if not zipfile.is_zipfile(path):
-        raise ValueError("it is no archive of arrays, or not all of one; numpy.savez writes them")
+        raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
     with np.load(path, allow_pickle=False) as archive:
         columns = {key: archive[key] for key in archive.files}
     return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
 
 
-def _as_numbers(
-    column: NDArray, bad: Callable[[int, object], DrakeTeleopError]
-) -> NDArray[np.float64]:
+def _as_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:
     if column.dtype.kind in "fiu":
         return column.astype(float, copy=False)
     if column.dtype.kind in "mM":  # seconds, since 1970 or midnight
         count = column.astype(f"{column.dtype.kind}8[ns]").astype(np.int64)
         return np.where(np.isnat(column), np.nan, count * 1e-9)
-    if column.dtype.kind == "c" and len(column):  # float() would drop half of it
+    if column.dtype.kind == "c" and len(column):  # float() would drop the imaginary part
         raise bad(0, column[0])
     numbers = np.empty(len(column))
     for row, cell in enumerate(column):
@@ -352,11 +304,11 @@ def _as_numbers(
             numbers[row] = np.nan if cell is None else float(cell)
         except (TypeError, ValueError) as error:
             raise bad(row, cell) from error
-        if isinstance(cell, str) and "_" in cell:  # which Python reads over
+        if isinstance(cell, str) and "_" in cell:  # which Python ignores
             raise bad(row, cell)
     return numbers
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join_names(names: Sequence[str]) -> str:
     shown = ", ".join(names[:12])
     return f"{shown}, ..." if len(names) > 12 else shown

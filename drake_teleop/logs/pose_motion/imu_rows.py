@@ -1,0 +1,161 @@
+"""Comparison of an IMU with splines of poses, Eqs. (T82), (T83).
+
+The poses determine the IMU's bias, axes and clock. The corrected IMU then refines the splines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.logs.pose_motion.poses import Inertial
+from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude
+from drake_teleop.logs.pose_motion.splines import ImuRows, PoseSplines
+
+_PRIOR_GAIN_STD = 0.1
+_STEPS, _MAX_SHIFT_S, _POWER_ITERATIONS, _MIN_FREQUENCIES = 4, 0.1, 10, 40
+_MAX_GAIN_ERROR = 0.2  # largest entry of D
+# Share of 1 / h that splines pass, and largest unexplained share of the motion.
+_PASSED_SHARE, _MAX_UNEXPLAINED = 0.25, 0.05
+# Rates of comparison and of added rows [Hz], and least length of a comparison [s].
+_COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Sensor:
+    """Model y = b + (1 + D) x(t + tau) of one sensor, and its noise power density."""
+
+    D: Array
+    b: Array
+    tau: float
+    power: float
+
+    def corrected(self, y: Array) -> Array:
+        return np.asarray(np.linalg.solve(np.eye(3) + self.D, (y - self.b).T).T)
+
+
+def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRows | None:
+    """Return the corrected IMU data for splines of poses, or None if the two do not agree."""
+    powers = tuple(std**2 / splines.rate for std in splines.noise())
+    averaged, sensors = imu.averaged(_COMPARISON_RATE_HZ), []
+    for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
+        sensor = None
+        if y is not None:
+            pose_noise = powers[which], 4 - 2 * which
+            sensor = _fit_sensor(splines, averaged.t, y, gravity_W, which, pose_noise)
+            if sensor is None:
+                return None
+        sensors.append(sensor)
+    fitted = [sensor for sensor in sensors if sensor is not None]
+    if not fitted:
+        return None
+    rows = imu.averaged(_ROWS_RATE_HZ)
+    t = rows.t + fitted[-1].tau  # the gyroscope determines the clock best
+    inside = (t > splines.poses.t[0]) & (t < splines.poses.t[-1])
+    s, omega = (
+        None if sensor is None or y is None else sensor.corrected(y[inside])
+        for sensor, y in zip(sensors, (rows.specific_force, rows.angular_velocity), strict=True)
+    )
+    imu_powers = [0.0 if sensor is None else sensor.power for sensor in sensors]
+    imu_rows = None
+    for _ in range(2):  # repeat with the orientation of poses and IMU
+        imu_rows = ImuRows.of(
+            PoseSplines(splines.poses, splines.spacing, imu_rows),
+            t[inside],
+            gravity_W,
+            s,
+            omega,
+            rate=rows.rate,
+            pose_powers=(powers[0], powers[1]),
+            own_powers=(imu_powers[0], imu_powers[1]),
+        )
+    return imu_rows
+
+
+def _fit_sensor(
+    splines: PoseSplines,
+    t: Array,
+    y: Array,
+    gravity_W: Array,
+    which: int,
+    pose_noise: tuple[float, int],
+) -> _Sensor | None:
+    """Fit y (K, 3) at t (K,) to the splines; return None if these do not explain it.
+
+    `which` is 0 for the specific force and 1 for the angular velocity. `pose_noise` is the power of
+    the poses' noise and its exponent of the angular frequency.
+    """
+    dt = float(np.median(np.diff(t)))
+    place = np.round((t - t[0]) / dt).astype(int)
+    even = t[0] + dt * np.arange(place[-1] + 1)
+    lost, values = np.ones(len(even), bool), np.zeros((len(even), 3))
+    lost[place], values[place] = False, y
+    start, stop = max(t[0], splines.poses.t[0]), min(t[-1], splines.poses.t[-1])
+    taper = exclude(end_taper(even, start + _MAX_SHIFT_S, stop - _MAX_SHIFT_S), lost, dt)
+    if (taper > 0.5).sum() * dt < _MIN_LENGTH_S:
+        return None
+    frequency = np.fft.rfftfreq(len(even), dt)
+    used = frequency <= _PASSED_SHARE / splines.spacing
+    noise: NDArray[np.floating] = pose_noise[0] * (2.0 * np.pi * frequency[used]) ** pose_noise[1]
+    energy = float(np.sum(taper**2)) / dt
+
+    def spectrum(x: Array) -> Complex:
+        return np.asarray(np.fft.rfft(x * taper[:, None], axis=0)[used], np.complex128)
+
+    # Third differences remove the motion; the squares of 1, 3, 3, 1 add up to 20.
+    least = float(np.mean(np.diff(y, 3, axis=0) ** 2)) * dt / 20.0 + 1e-30
+    Y, one, tau, power = spectrum(values), spectrum(np.ones((len(even), 1))), 0.0, least
+    for step in range(_STEPS):
+        x = splines.motion(even + tau, gravity_W)[which]
+        X, change = spectrum(x), spectrum(np.gradient(x, dt, axis=0))
+        if step == 0:
+            power = max(power, float(np.median(np.abs(Y - X) ** 2)) / energy)
+        weight = 1.0 / np.sqrt(energy * (noise + power))
+        D, b, shift = _least_squares(Y - X, X, one, change, weight)
+        residual: Array = np.abs(Y - X - X @ D.T - one * b - shift * change) ** 2
+        power = _noise_power(residual.sum(axis=1) / (3.0 * energy), noise, least)
+        tau += shift
+        if abs(tau) > _MAX_SHIFT_S:
+            return None
+    if (
+        np.abs(D).max() > _MAX_GAIN_ERROR
+        or residual[1:].sum() > _MAX_UNEXPLAINED * (np.abs(X[1:]) ** 2).sum()
+    ):
+        return None
+    return _Sensor(D, b, tau, power)
+
+
+def _least_squares(
+    y: Complex, X: Complex, one: Complex, change: Complex, weight: Array
+) -> tuple[Array, Array, float]:
+    """Return D (3, 3), b (3,) and tau of y = X D^T + b + tau change, from spectra."""
+    K = len(y)
+    columns = np.zeros((K, 3, 13), complex)
+    for i in range(3):
+        columns[:, i, 3 * i : 3 * i + 3] = X
+        columns[:, i, 9 + i] = one[:, 0]
+    columns[:, :, 12] = change
+    A = (columns * weight[:, None, None]).reshape(3 * K, 13)
+    right = (y * weight[:, None]).ravel()
+    gram = (A.conj().T @ A).real
+    gram[range(9), range(9)] += 1.0 / _PRIOR_GAIN_STD**2
+    found = np.linalg.solve(gram, (A.conj().T @ right).real)
+    return found[:9].reshape(3, 3), found[9:12], float(found[12])
+
+
+def _noise_power(
+    residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
+) -> float:
+    """Return the IMU's noise power from the residual power and the poses' share, both (K,).
+
+    Return `white` where the poses' noise dominates at most frequencies.
+    """
+    power = max(float(np.median(residual)), white)
+    for _ in range(_POWER_ITERATIONS):
+        weight = 1.0 / (power + pose_noise) ** 2
+        power = max(float(weight @ (residual - pose_noise) / weight.sum()), white)
+    effective = float(np.sum((white / (white + pose_noise)) ** 2))
+    return power if effective > _MIN_FREQUENCIES else white

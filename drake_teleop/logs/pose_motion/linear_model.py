@@ -1,0 +1,375 @@
+"""Linear model of the wrench with free coefficients, Eqs. (T73) to (T75); choice of knots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.logs.pose_motion.poses import Poses
+from drake_teleop.logs.pose_motion.spectra import (
+    FORCES,
+    Bands,
+    Complex,
+    Grid,
+    Levels,
+    bands,
+    end_taper,
+    moments,
+    random_walk_shape,
+    shift_taper,
+    shifted,
+    signal_spectrum,
+    taper_derivative,
+    wrench_spectrum,
+)
+from drake_teleop.logs.pose_motion.splines import (
+    MIN_POSES_PER_KNOT,
+    SIGNALS,
+    PoseSplines,
+    SplineCache,
+)
+
+SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
+"""Knot distances that are tried before two beside the best [s]."""
+MAX_DELAY_CHANGE_S = 0.25
+"""Largest change of the delay in the search, or a tenth of the record [s]."""
+ROUNDING = 1e-7
+"""Least noise of a channel relative to the wrench."""
+_COARSE_STEP_S, _FINE_STEP_S, _FINEST_STEP_S = 0.016, 1e-3, 1e-5
+_ITERATIONS = 4
+_SEARCH_RATE_HZ = 125.0
+_RANK_TOLERANCE, _FULL_RANK = 1e-12, 1e-8
+# Corners of a wandering offset [Hz], and least reduction of a channel's cost.
+_CORNERS_HZ = tuple(0.05 * 2.0**k for k in range(9))
+_MIN_COST_REDUCTION = 3.0
+_SPACING_FACTOR, _SPACING_FACTOR_OF_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Fit of the linear model.
+
+    Attributes:
+        coefficients: (6, 16) C; zero for constant signals.
+        covariance: (6, 16, 16) of the rows of C.
+        power: (bands, 6) mean noise power.
+        costs: (6,) of the channels.
+    """
+
+    coefficients: Array
+    covariance: Array
+    power: Array
+    costs: Array
+
+    @property
+    def cost(self) -> float:
+        """Cost (T75)."""
+        return float(self.costs.sum())
+
+
+def fit_linear_model(Z: Array, levels: Levels) -> LinearFit:
+    """Fit the model to moments (bands, 38, 38)."""
+    return _fit_moments(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z), levels)
+
+
+def _wrench_powers(Z: Array) -> Array:
+    return np.diagonal(Z[:, FORCES, FORCES], axis1=1, axis2=2)
+
+
+def _fit_moments(
+    zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
+) -> LinearFit:
+    """Fit the model to moments zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6).
+
+    Leading dimensions are separate fits. With `load` (6, 16) only the constants are free.
+    """
+    floor = _rounding_power(ff, levels.sizes)
+    if load is not None:
+        explained = zz @ load.T
+        ff = ff - np.sum((2.0 * zf - explained) * load.T, axis=-2)
+        zf, zz = (zf - explained)[..., :1, :], zz[..., :1, :1]
+    size = np.diagonal(zz.sum(axis=-3), axis1=-2, axis2=-1)
+    constant = zz[..., 0, 0].sum(axis=-1)[..., None]
+    scale = np.where(size > 1e-18 * constant, 1.0 / np.sqrt(size + 1e-300), 0.0)
+    both = scale[..., :, None] * scale[..., None, :]
+    zz, zf = zz * both[..., None, :, :], zf * scale[..., None, :, None]
+    power = np.maximum(ff / levels.sizes[:, None], floor).mean(axis=-2, keepdims=True)
+    power = np.broadcast_to(power, (*zf.shape[:-2], 6))
+    flat = zz.reshape(*zz.shape[:-2], -1)
+    for _ in range(_ITERATIONS):
+        weight = 1.0 / power
+        gram = (np.swapaxes(weight, -1, -2) @ flat).reshape(*zz.shape[:-3], 6, *zz.shape[-2:])
+        right = np.swapaxes(np.sum(zf * weight[..., None, :], axis=-3), -1, -2)
+        inverse = _inverses(gram)
+        C = (inverse @ right[..., None])[..., 0]
+        across = np.swapaxes(C, -1, -2)[..., None, :, :]
+        explained = np.sum((2.0 * zf - zz @ across) * across, axis=-2)
+        power = np.maximum(levels.power(ff - explained), floor)
+    return LinearFit(
+        coefficients=C * scale[..., None, :],
+        covariance=0.5 * inverse * both[..., None, :, :],
+        power=power,
+        costs=levels.costs(power),
+    )
+
+
+def _inverses(gram: Array) -> Array:
+    largest = np.diagonal(gram, axis1=-2, axis2=-1).max(axis=-1, keepdims=True)
+    try:
+        pivots = np.diagonal(np.linalg.cholesky(gram), axis1=-2, axis2=-1) ** 2
+        if (pivots > _FULL_RANK * largest).all():
+            return np.asarray(np.linalg.inv(gram))  # three times faster
+    except np.linalg.LinAlgError:
+        pass
+    values, vectors = np.linalg.eigh(gram)
+    good = values > _RANK_TOLERANCE * values[..., -1:]
+    scaled = vectors * np.where(good, 1.0 / np.where(good, values, 1.0), 0.0)[..., None, :]
+    return np.asarray(scaled @ np.swapaxes(vectors, -1, -2))
+
+
+def least_power(Z: Array, sizes: Array) -> Array:
+    """Return (6,) power of rounding errors."""
+    return _rounding_power(_wrench_powers(Z), sizes)
+
+
+def _rounding_power(ff: Array, sizes: Array) -> Array:
+    power = ff.sum(axis=0) / sizes.sum()
+    both = power.reshape(2, 3).sum(axis=1).repeat(3)
+    return np.maximum(ROUNDING**2 * both, 1e-60)
+
+
+def fit_levels(Z: Array, of: Bands) -> Levels:
+    """Return levels with the corner of lowest cost in each channel, Eq. (T74)."""
+    levels = Levels.flat(of)
+    least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
+    for corner in _CORNERS_HZ:
+        rising = np.repeat(random_walk_shape(of, corner)[:, None], 6, axis=1)
+        costs = fit_linear_model(Z, replace(levels, shape=rising)).costs
+        better = costs < least
+        least, shape = np.where(better, costs, least), np.where(better, rising, shape)
+    return replace(levels, shape=shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Spectra of a record for one taper, splines and delay.
+
+    Attributes:
+        of: bands.
+        wrench: (K, 6).
+        signals: (K, 16), of P at t + `delay`.
+        delay: [s].
+        grid, taper, zeta: of the record; zeta is (M, 16) in time.
+    """
+
+    of: Bands
+    wrench: Complex
+    signals: Complex
+    delay: float
+    grid: Grid
+    taper: Array
+    zeta: Array
+
+    @property
+    def reach(self) -> float:
+        """Largest change of the delay in a search [s]."""
+        return min(MAX_DELAY_CHANGE_S, 0.1 * float(self.grid.t[-1] - self.grid.t[0]))
+
+    @cached_property
+    def taper_fixed(self) -> bool:
+        """Whether the taper excludes interior samples, or the load is known.
+
+        Then edges of the taper would bias the delay if they moved with the signals.
+        """
+        inside = np.flatnonzero(self.taper > 0.5)
+        edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
+        return bool(edged or self.grid.load is not None)
+
+    def at(self, delay: float) -> Spectra:
+        """Return the spectra with signals at another delay; `zeta` is unchanged."""
+        shift, signals = delay - self.delay, self.signals
+        if self.taper_fixed:
+            before = shift_taper(self.grid, self.taper, shift)
+            signals = signal_spectrum(self.grid, before, self.zeta, len(signals))
+        late = shifted(signals, self.of.frequency, shift)
+        late[:, 0] = self.signals[:, 0]
+        return replace(self, signals=late)
+
+    def moments(self) -> Array:
+        """Return (bands, 38, 38) moments, with derivatives of the signals alone."""
+        rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
+        edges = taper_derivative(self.grid, self.taper)
+        rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
+        rates[:, 0] = 0.0
+        return moments(self.signals, self.wrench, self.of, rates)
+
+    def fit(self) -> LinearFit:
+        """Fit all coefficients with flat levels; only the constants if the load is known."""
+        Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
+        parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
+        fit = _fit_moments(*parts, Levels.flat(self.of), load)
+        if load is None:
+            return fit
+        return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
+
+    def costs(self, delays: Array) -> Array:
+        """Return (D,) costs at delays (D,)."""
+        if self.taper_fixed:
+            Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
+            zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
+        else:
+            zz, zf = self._delayed_moments(np.asarray(delays))
+        power = np.abs(self.wrench) ** 2
+        fits = _fit_moments(zz, zf, self.of.sums(power), Levels.flat(self.of), self.grid.load)
+        return fits.costs.sum(axis=-1)
+
+    def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
+        """Return (D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,) for a whole taper.
+
+        Phases cancel in products of signals, except with the constant.
+        """
+        of, Z = self.of, moments(self.signals, self.wrench, self.of)
+        fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
+        products = np.conj(self.signals)[:, :, None] * fixed[:, None]
+        flat = products.reshape(len(products), -1)
+        angle = 2.0 * np.pi * np.outer(delays - self.delay, of.frequency)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        starts = np.searchsorted(of.band, np.arange(of.count + 1))
+        sums = np.empty((len(delays), of.count, flat.shape[1]))
+        for k in range(of.count):
+            part = slice(starts[k], starts[k + 1])
+            sums[:, k] = cosine[:, part] @ flat[part].real + sine[:, part] @ flat[part].imag
+        zf = sums.reshape(len(delays), of.count, SIGNALS, 7)
+        zf[:, :, 0, :6], zf[:, :, 0, 6] = Z[:, 0, FORCES], Z[:, 0, 0]
+        zz = np.repeat(Z[None, :, :SIGNALS, :SIGNALS], len(delays), axis=0)
+        zz[..., 0] = zz[..., 0, :] = zf[..., 6]
+        return zz, zf[..., :6]
+
+    def with_motion(self, splines: PoseSplines, gravity_W: Array, delay: float) -> Spectra:
+        """Return the spectra with other splines and delay [s]."""
+        zeta = splines.signals(self.grid.t + delay, gravity_W)
+        signals = signal_spectrum(self.grid, self.taper, zeta, len(self.wrench))
+        return replace(self, signals=signals, delay=delay, zeta=zeta)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Record for a fit: grid, taper (M,), gravity (3,) [m/s^2] and highest frequency [Hz]."""
+
+    grid: Grid
+    taper: Array
+    gravity_W: Array
+    top: float
+
+    def part(self, rows: slice) -> Window:
+        """Return a part of the grid, with ramps at its ends."""
+        grid = self.grid
+        wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
+        grid = replace(grid, t=grid.t[rows], wrench=wrench)
+        taper = self.taper[rows] * end_taper(grid.t, grid.t[0], grid.t[-1])
+        return replace(self, grid=grid, taper=taper)
+
+    def spectra(self, splines: PoseSplines, delay: float) -> Spectra:
+        """Return spectra of the wrench and of the motion `delay` [s] later."""
+        of = bands(self.grid, self.taper, self.top)
+        count = len(of.frequency)
+        zeta = splines.signals(self.grid.t + delay, self.gravity_W)
+        wrench = wrench_spectrum(self.grid, self.taper, count)
+        signals = signal_spectrum(self.grid, self.taper, zeta, count)
+        return Spectra(of, wrench, signals, delay, self.grid, self.taper, zeta)
+
+
+def best_delay(
+    spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
+) -> tuple[float, float]:
+    """Return the delay of lowest cost within `reach`, to `finest` [s], and the cost."""
+    step = min(_COARSE_STEP_S, reach / 2)
+    at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
+    costs = spectra.costs(at)
+    while step > finest:
+        best = int(np.clip(np.argmin(costs), 1, len(costs) - 2))
+        left, middle, right = costs[best - 1 : best + 2]
+        bend = left - 2.0 * middle + right
+        move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+        centre = float(at[best] + step * np.clip(move, -1.0, 1.0))
+        step /= 8.0
+        at = centre + step * np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+        costs = spectra.costs(at)
+    best = int(np.argmin(costs))
+    return float(at[best]), float(costs[best])
+
+
+def delay_deviation(spectra: Spectra) -> float:
+    """Return the standard deviation of the delay [s]; inf if undetermined."""
+    reach = spectra.reach
+    beside = np.array([-_FINE_STEP_S, 0.0, _FINE_STEP_S])
+    left, least, right = spectra.costs(spectra.delay + beside)
+    far = spectra.costs(spectra.delay + np.arange(-reach, reach, _COARSE_STEP_S))
+    bend = left - 2.0 * least + right
+    if bend <= 0.0 or far.max() - least < _MIN_COST_RISE or far.min() < least - 1.0:
+        return np.inf
+    return float(_FINE_STEP_S / np.sqrt(bend))
+
+
+def guess_spacing(
+    window: Window, cache: SplineCache, delay: float, *, known: bool
+) -> tuple[float, float]:
+    """Return knot distance and delay of lowest cost on a coarse grid."""
+    spacings, found = _allowed_spacings(cache)[::2], []
+    start = window.spectra(cache.at(spacings[0]), delay)
+    for h in spacings:
+        spectra = start.with_motion(cache.at(h), window.gravity_W, delay)
+        if known:
+            found.append((spectra.fit().cost, h, delay))
+            continue
+        late, cost = best_delay(spectra, spectra.reach, _FINE_STEP_S)
+        found.append((cost, h, late))
+    return min(found)[1:]
+
+
+def choose_spacing(
+    window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
+) -> tuple[SplineCache, float, float]:
+    """Return the choice, knot distance [s] and delay [s] of lowest cost.
+
+    Knots are slightly closer than at the minimum, because fits do not compensate for motion that
+    the splines miss.
+    """
+    start = window.spectra(choices[0].at(SPACINGS[0]), delay)
+    found = []
+    for cache in choices:
+        spacings = _allowed_spacings(cache)
+
+        def cost(h: float, cache: SplineCache = cache) -> float:
+            return start.with_motion(cache.at(h), window.gravity_W, delay).fit().cost
+
+        costs = [(cost(h), h) for h in spacings]
+        middle = min(costs)[1]
+        between = [float(np.sqrt(middle * h)) for h in _neighbours(middle, spacings)]
+        found.append(min(costs + [(cost(h), h) for h in between]))
+    least = min(range(len(found)), key=lambda k: found[k])
+    cache = choices[least]
+    finer = _SPACING_FACTOR if window.grid.load is None else _SPACING_FACTOR_OF_LOAD
+    best = max(finer * found[least][1], MIN_POSES_PER_KNOT / cache.rate)
+    if not known:
+        last = start.with_motion(cache.at(best), window.gravity_W, delay)
+        delay, _ = best_delay(last, 3 * _COARSE_STEP_S)
+    return cache, best, delay
+
+
+def averaged_splines(poses: Poses) -> SplineCache:
+    """Return splines of averaged poses, at the rate that the search needs."""
+    return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
+
+
+def _neighbours(h: float, of: list[float]) -> list[float]:
+    k = of.index(h)
+    return of[max(0, k - 1) : k] + of[k + 1 : k + 2]
+
+
+def _allowed_spacings(cache: SplineCache) -> list[float]:
+    return [h for h in SPACINGS if h * cache.rate >= MIN_POSES_PER_KNOT] or [SPACINGS[0]]

@@ -1,0 +1,201 @@
+"""Estimates for `auto` in the frames of IMU and pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench
+from drake_teleop.logs.read.mounting import Mounting, find_mounting
+
+MAX_LAG_S = 0.05
+"""Lag between the clocks of IMU and pose that causes a warning [s]."""
+
+
+def describe_mounting(
+    description: Description, source: str, read: Callable[[Description], Log]
+) -> tuple[Description, tuple[str, ...]]:
+    """Replace `auto` in the IMU's frame and position by estimates; return notes.
+
+    Raises an error if the data do not determine a value.
+    """
+    imu = description.imu
+    assert imu is not None
+
+    def with_imu(**changes: Any) -> Description:
+        return description.model_copy(update={"imu": imu.model_copy(update=changes)})
+
+    frame: Any = imu.frame
+    position: Any = imu.position
+    notes: list[str] = []
+    start = "sensor" if frame == "auto" else frame
+    mounting = None
+    if description.pose is not None:
+        alone = read(description.model_copy(update={"imu": None}))
+        at_Io = read(with_imu(frame=start, position=(0.0, 0.0, 0.0)))
+        mounting = find_mounting(at_Io, alone, position=description.pose.position is not None)
+    if frame == "auto":
+        found = _require_rotation(mounting, f"{source}:imu.frame")
+        frame = tuple(map(tuple, found.R_SI.tolist()))
+        notes += _rotation_notes(found)
+    if position == "auto":
+        at_Io = read(with_imu(frame=frame, position=(0.0, 0.0, 0.0)))
+        lever = _choose_lever_arm(mounting, at_Io, f"{source}:imu.position")
+        position = tuple(lever.p_SoIo_S.tolist())
+        notes.append(
+            f"imu.position found: {_format_mm(lever)} mm, from the {lever.source}; write it into"
+            f" the description as imu.position: {_round(lever.p_SoIo_S)}"
+        )
+    return with_imu(frame=frame, position=position), tuple(notes)
+
+
+def _require_rotation(mounting: Mounting | None, where: str) -> Mounting:
+    if mounting is None:
+        problem = "the specific force hardly changes, or gaps leave too little of it"
+        remedy = "turn the sensor about two axes"
+    elif mounting.mirrored:
+        problem = "the axes of the IMU are mirrored relative to those of the pose"
+        remedy = "exchange two of its columns, or change imu.sign"
+    elif not mounting.fits:
+        problem = f"no rotation makes IMU and pose agree ({_unexplained_shares(mounting)})"
+        remedy = "find wrong units, signs or clocks by `drake-teleop inspect` with `frame: sensor`"
+    elif not mounting.determined:
+        worst = float(mounting.deviations_deg.max())
+        problem = f"one direction has a standard deviation of {worst:.2g} deg"
+        remedy = "turn the sensor about two axes, by more than 30 deg"
+    else:
+        return mounting
+    raise DrakeTeleopError(
+        f"the data do not determine the rotation of the IMU: {problem}",
+        where=where,
+        remedy=f"{remedy}, or give a rotation matrix",
+    )
+
+
+def _unexplained_shares(found: Mounting) -> str:
+    shares = {"specific force": found.unexplained, "angular velocity": found.unexplained_turning}
+    return ", ".join(f"{v:.2g} of the {k}'s variance" for k, v in shares.items() if v is not None)
+
+
+def _rotation_notes(found: Mounting) -> list[str]:
+    nearest = found.right_angled.astype(int).tolist()
+    oblique = f"{found.oblique_deg:.1f} deg from the right-angled mounting {nearest}"
+    std = f"{float(found.deviations_deg.max()):.2g} deg"
+    notes = [
+        f"imu.frame found: {oblique}, standard deviation {std}; write it into the description as"
+        f" imu.frame: {_round(found.R_SI)}"
+    ]
+    if not found.is_right_angled:
+        notes.append(f"warning: the IMU is mounted obliquely, {oblique}: check this")
+    if abs(found.lag_s) > MAX_LAG_S:
+        notes.append(
+            f"warning: the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
+            f" add {-found.lag_s:.3f} to imu.time.offset to correct it"
+        )
+    return notes
+
+
+def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
+    """Return the lever arm from the pose, or else from the wrench."""
+    lever = None
+    if mounting is not None and mounting.fits:
+        lever = mounting.lever
+    if lever is None or not lever.determined.all():
+        other = lever_arm_from_wrench(at_Io)
+        if lever is None or (other and other.determined.sum() > lever.determined.sum()):
+            lever = other
+    if lever is None:
+        raise DrakeTeleopError(
+            "the data do not determine the position of the accelerometer: no pose position fits,"
+            " and the wrench contains more than the load",
+            where=where,
+            remedy="give imu.position in metres, or pose.position",
+        )
+    if not lever.determined.all():
+        axes = ", ".join(a for a, known in zip("xyz", lever.determined, strict=True) if not known)
+        raise DrakeTeleopError(
+            f"the motion does not determine {axes} of the accelerometer's position"
+            f" ({_format_mm(lever)} mm, from the {lever.source})",
+            where=where,
+            remedy="turn faster, about more axes, or give imu.position in metres",
+        )
+    return lever
+
+
+def _round(x: Array) -> list:
+    return list((np.round(x, 4) + 0.0).tolist())
+
+
+def _format_mm(lever: LeverArm) -> str:
+    return ", ".join(
+        f"{axis} {1e3 * value:.1f} +- {1e3 * deviation:.1f}" if deviation < 1 else f"{axis} unknown"
+        for axis, value, deviation in zip("xyz", lever.p_SoIo_S, lever.deviations, strict=True)
+    )
+
+
+def describe_pose_frame(
+    description: Description, source: str, read: Callable[[Description], Log]
+) -> tuple[Description, tuple[str, ...]]:
+    """Replace `auto` in the pose frame by estimates from the wrench; return notes.
+
+    Raises an error if the data do not determine a value.
+    """
+    from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
+
+    pose = description.pose
+    assert pose is not None
+    plain = {"position_in_sensor": (0.0, 0.0, 0.0), "rotation_in_sensor": None, "frame": "sensor"}
+    alone = {"imu": None, "pose": pose.model_copy(update=plain)}
+    log = read(description.model_copy(update=alone))
+    assert log.posed is not None
+    found = estimate_from_poses(
+        log.t,
+        log.wrench,
+        log.posed.poses,
+        log.posed.gravity_W,
+        p_SoPo_S=None,
+        R_SP=None,
+        lost=log.bridged,
+    )
+    frame = found.frame
+    changes: dict[str, Any] = {}
+    notes: list[str] = []
+    if pose.position_in_sensor == "auto":
+        _require_determined(
+            frame.position_known, f"{source}:pose.position_in_sensor", "the pose's origin along"
+        )
+        changes["position_in_sensor"] = tuple(frame.p_SoPo_S.tolist())
+        deviation = 1e3 * float(frame.position_deviations.max())
+        notes.append(_result_note("position_in_sensor", frame.p_SoPo_S, f"{deviation:.2g} mm"))
+    if pose.rotation_in_sensor == "auto":
+        _require_determined(
+            frame.rotation_known, f"{source}:pose.rotation_in_sensor", "the pose's turn about"
+        )
+        changes["rotation_in_sensor"] = tuple(map(tuple, frame.R_SP.tolist()))
+        deviation = float(frame.turn_deviations_deg.max())
+        notes.append(_result_note("rotation_in_sensor", frame.R_SP, f"{deviation:.2g} deg"))
+    return description.model_copy(update={"pose": pose.model_copy(update=changes)}), tuple(notes)
+
+
+def _require_determined(known: Any, where: str, quantity: str) -> None:
+    if not known.all():
+        axes = ", ".join(a for a, deviation in zip("xyz", known, strict=True) if not deviation)
+        raise DrakeTeleopError(
+            f"the data do not determine {quantity} {axes}",
+            where=where,
+            remedy="turn the sensor faster, about more axes, touching nothing; or give it",
+        )
+
+
+def _result_note(name: str, value: Any, deviation: str) -> str:
+    written = (np.round(value, 4) + 0.0).tolist()
+    return (
+        f"pose.{name} found, standard deviation {deviation}; write it into the description as"
+        f" pose.{name}: {written}"
+    )
