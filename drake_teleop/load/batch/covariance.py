@@ -1,19 +1,8 @@
-"""How sure a batch estimator's solution is.
+"""Covariance of the batch estimators (docs/theory.md, "Details of the estimators").
 
-The covariance is that of `normal_equations.NormalEquations` with the same weights of the rows, so
-coloured noise is accounted for; where noise of the motion couples the channels, with the
-correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
-to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
-rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
-covariance is about are then those at the start of the record. A walk that goes as far as the noise
-within a record counts twice, since it is in the residuals too: that is cautious. Errors in
-variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
-K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
-without the constraint, which is cautious. A prior adds its information to that of the record, and
-parameters that it says most about are named.
-
-Errors of the sensor's gains, if some are stated, are no noise: a record of any length has the same
-ones. What each of the 36 does to the solution is added up (`gain_effects`).
+It starts from that of `NormalEquations` and adds noise of the motion, random walks of the offsets,
+errors in variables, the prior and errors of the sensor's 36 gains. `consistent` uses the covariance
+without its constraint.
 """
 
 from __future__ import annotations
@@ -35,19 +24,18 @@ from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
 ARM = 0.06
-"""Length that compares an error of a force's gain with one of a torque's [m]."""
+"""Length that relates gain errors of forces to those of torques [m]."""
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
+    """Return the covariance (16, 16) of data and prior, and (16,) bools: prior-dominated.
 
-    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
-    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
-    a single parameter it is 1 - (standard deviation over the prior's)^2.
+    With information D of the data and P of the prior (10, 10), the data's share is the diagonal of
+    (D + P)^-1 D.
     """
     known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
     used = known | (np.arange(16) >= 6)
-    # In units in which the entries are of one size.
+    # Scaled so that all entries have similar size.
     scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
     scale[6:] = np.diag(information) ** -0.5
     data, total = np.zeros((2, 16, 16))
@@ -64,11 +52,7 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """(16, 16) of least squares with weights W that couple the channels, if they do.
-
-    Noise of the motion is in several channels of the wrench at once, which `plain`, of
-    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
-    """
+    """Return the covariance (16, 16) for weights W between channels, correlated as W^-1."""
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -84,19 +68,14 @@ def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Arra
 
 
 def _inverse_gram(fit: Fit) -> Array:
-    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
+    """Return the pseudo-inverse (16, 16) of the sum of [E V]^T W [E V]."""
     Z = fit.moments.mean
     root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
     return np.asarray(root @ root.T / fit.moments.samples)
 
 
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
-    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
-
-    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
-    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
-    covariance, those of the motion's channels as changes of V phi.
-    """
+    """Return the covariance (16, 16) of random walks of the offsets, steps (6, 6) per sample."""
     covariance = np.zeros((16, 16))
     if not steps.any():
         return covariance
@@ -117,23 +96,21 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """(n, 36) what an error of 1 in each of the sensor's gains does to least squares.
-
-    A gain from force to torque counts as 1 at `ARM` [m], one from torque to force at 1 / `ARM`.
+    """Return the effect (n, 36) of a unit error of each sensor gain, scaled by `ARM`.
 
     Args:
         products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
         W: (bands, 6, 6) weights between the channels.
-        inverse: (n, n) of the Gram matrix of the same moments.
+        inverse: (n, n) inverse Gram matrix.
     """
-    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # of gain d, k
+    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, ARM], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(len(inverse), 36))
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """(16, 16) of the form's solution by errors of the gains of standard deviation 1."""
+    """Return the covariance (16, 16) due to gain errors with standard deviation 1."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)
@@ -143,10 +120,10 @@ def gain_covariance(fit: Fit, offsets: bool) -> Array:
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
+    """Return the covariance (16, 16) of the form's solution from that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
-    if not offsets:  # what is left when the offsets are known
+    if not offsets:  # covariance for known offsets
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0

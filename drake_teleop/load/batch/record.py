@@ -1,4 +1,4 @@
-"""What a batch estimator is given, and what it finds."""
+"""Input and result of a batch estimator."""
 
 from __future__ import annotations
 
@@ -15,19 +15,12 @@ from drake_teleop.load.batch.total_least_squares import NormalForm
 from drake_teleop.load.regressor import non_contact_wrench
 
 CHUNK = 2**15
-"""Samples of a long record that are looked at together."""
+"""Samples per pass over a long record."""
 
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """What an estimator may know beyond the record.
-
-    Attributes:
-        noise: of wrench and motion.
-        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
-        shared_noise: whether the forces, and the torques, have one estimated noise each.
-        prior, ellipsoid: for `consistent`.
-    """
+    """Options of an estimator, as for `identify_batch`."""
 
     noise: Noise
     offsets: bool = True
@@ -38,7 +31,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A checked record: (N, 6), (N, 3), (N, 3), (N, 3), as for `normal_equations.identify`."""
+    """Checked record: wrench (N, 6), s, omega and alpha (N, 3)."""
 
     wrench: Array
     s: Array
@@ -47,30 +40,29 @@ class Record:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Wrench (N, 6), then s, omega and alpha (N, 3) each."""
+        """Wrench (N, 6), s, omega and alpha (N, 3)."""
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
     def moments(self) -> Moments:
-        """Its sums of squares and products, added up once."""
+        """Second moments of the record."""
         moments = Moments()
         moments.add(*self.arrays)
         return moments
 
     def every(self, step: int) -> Record:
-        """Every `step`th sample of it."""
+        """Return every `step`-th sample."""
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        """(n, 6) F - [E V] theta of a part of the samples [N, N m]."""
+        """Return F - [E V] theta (n, 6) of a part of the samples [N, N m]."""
         F, s, omega, alpha = (table[part] for table in self.arrays)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What an estimator found: the normal form, and of the wrench's noise (6,) what it used;
-    `rejected` are (N,) bools, the samples it did without; `note`, what a user has to know."""
+    """Normal form, wrench noise (6,), moments, rejected samples (N,) and a note for the user."""
 
     form: NormalForm
     wrench_noise: Array

@@ -1,28 +1,11 @@
-"""Errors in variables: the motion is measured with noise too, so V is not what it should be.
+"""Mixed least squares and total least squares: noise in the measured motion too, Eq. (T4).
 
-Noise of s, alpha and omega enters many entries of V at once, in force and torque rows together,
-and least squares takes the excess of V^T V for excitation: it makes inertias too small. With the
-mean covariance Q of the noise of z (`moments`) the residual r = F - [E V] theta has the covariance
-R(theta) = L(theta) Q L(theta)^T, L the coefficients of r in z. Offsets and structural zeros have no
-noise in Q and so stay exact.
+The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)), the factor of the specified
+variances (Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3 and 8).
+W = R(theta)^-1 is updated until convergence (Kukush, Van Huffel, Metrika 59, 2004).
 
-`total_least_squares` is mixed LS-TLS (Van Huffel, Vandewalle, The Total Least Squares Problem,
-1991, chapters 3 and 8) for a given weight W between the channels: it minimises the ratio
-
-    lambda = tr(W S(theta)) / tr(W R(theta)),   S the mean of r r^T,
-
-a generalised eigenvalue problem of (17, 17) matrices, whose solution is that of the compensated
-normal equations (G - lambda C) theta = b: C is the Gram of the noise alone. lambda is the factor by
-which the variances were stated too small; only their ratios matter. W = R(theta)^-1 is then taken
-from the solution and the step repeated, which is the element-wise weighted TLS estimator for noise
-whose covariance is the same in every sample (Kukush, Van Huffel, Metrika 59, 2004); omega's noise
-has another in every sample, of which this uses the mean. Without noise in the motion C = 0, and it
-is weighted least squares.
-
-Where the motion is no more than its noise, as the angular acceleration in static poses, there is
-nothing to learn, and dividing by the difference of G and lambda C would sell noise for inertias.
-Directions v in which v^T G v exceeds lambda v^T C v by less than the fraction 5 sqrt(2 / N), five
-standard deviations of a sum of squares of N samples of noise, are therefore left out.
+A direction v is left out if v^T G v exceeds lambda v^T C v by less than 5 sqrt(2 / N) of it: the
+motion is not distinguishable from its noise.
 """
 
 from __future__ import annotations
@@ -44,24 +27,23 @@ from drake_teleop.load.batch.moments import (
     residual_covariance,
 )
 
-# At most so many weights, until theta changes by less; how near to a pole a root may be; and
-# standard deviations of noise that a signal must exceed.
+# Largest number of weight updates, relative change of theta at convergence, smallest relative
+# distance of a root from a pole, and standard deviations of noise that a signal must exceed.
 _ITERATIONS, _CONVERGED, _ROUNDING, _SIGNIFICANT = 10, 1e-8, 1e-12, 5.0
-_NOTHING = 1e-60  # N^2, N^2 m^2: mean squares whose inverse is beyond all use
+_NOTHING = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
-    """gram theta = right of an estimator, divided by the number of samples, with its solution.
+    """Equations gram theta = right, divided by the number of samples, and their solution.
 
     Attributes:
-        gram: (16, 16), compensated for the noise in it.
+        gram: (16, 16), compensated for noise.
         right: (16,).
         theta: (16,) [offsets; phi] [SI].
-        weights: (6, 6) W between the channels, the inverse of the residual's covariance.
-        scale: lambda, residual variance over what the noise predicts.
-        transfer: (16, 16) from the solution of plain least squares with these weights to theta.
-        undetermined: (16,) bools, parameters whose variance in plain least squares comes for the
-            most part from directions that were left out.
+        weights: (6, 6) W between channels.
+        scale: lambda.
+        transfer: (16, 16) from plain least squares to theta.
+        undetermined: (16,) bools, parameters with most of their variance in left-out directions.
     """
 
     gram: Array
@@ -80,13 +62,9 @@ def total_least_squares(
     *,
     offsets: bool = True,
 ) -> NormalForm:
-    """Offsets and load where wrench and motion are noisy.
+    """Return offsets and load for noise of the wrench (6,) [N, N m] and of the motion.
 
-    Args:
-        moments: of the record.
-        noise: of the motion.
-        wrench_noise: (6,) standard deviations of the wrench channels [N, N m].
-        offsets: whether to estimate them; otherwise they are 0, subtracted already.
+    `offsets` False fixes them at 0.
 
     Raises:
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
@@ -112,14 +90,14 @@ def total_least_squares(
 
 
 def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalForm:
-    """Mixed TLS with the weight W, without directions of which less than `least` is signal."""
+    """Return mixed TLS with the weight W, without directions with a signal share below `least`."""
     gram, right = normal_equations(Z, W)
-    if not offsets:  # uncorrelated with all else, their estimate is 0
+    if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
         right[:6] = 0.0
     compensation, _ = normal_equations(Q, W)
     root = inverse_root(gram, excited_columns(Z))
-    # In these coordinates G is the identity: nu is the share of noise in each direction.
+    # In these coordinates G is the identity; nu is the noise share of each direction.
     nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
     scale = _ratio(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
@@ -143,9 +121,8 @@ def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalFo
 
 
 def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """The smallest lambda with [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise] singular.
-
-    It is the one root below 1 / max nu of the secular equation.
+    """Return the smallest lambda that makes [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise]
+    singular: the only root below 1 / max(nu) of the secular equation.
     """
 
     def excess(ratio: float) -> float:

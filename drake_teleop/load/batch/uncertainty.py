@@ -1,8 +1,4 @@
-"""What an identification knows: intervals, determined combinations, priors, predicted wrenches.
-
-Standard deviations and degrees of freedom come with the `Identification`; how they are made honest
-in coloured noise is said in the docstring of `identification`.
-"""
+"""Intervals, determined combinations, prior shares and predicted wrenches of an identification."""
 
 from __future__ import annotations
 
@@ -24,32 +20,26 @@ from drake_teleop.load.identification import (
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
-_MANY_DEGREES = 1e6  # beyond, Student's t is the normal distribution to six digits
+_MANY_DEGREES = 1e6  # Student's t is then normal to six digits
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
 _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
-# Directions of the scaled Gram below which nothing is determined (as in `identification`), and
-# coefficients of combinations that count as zero: rounding.
+# Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
+# coefficient that is rounding.
 _RANK, _NO_COEFFICIENT = 1e-12, 1e-6
-# Terms of a combination that are worth a number, or a mention, as shares of the largest.
+# Terms of a combination, relative to the largest, that appear with a number, or as "...".
 _WORTH_A_NUMBER, _WORTH_A_MENTION = 0.1, 0.01
-_CHUNK = 2**13  # rows of V at a time: 4 MB
+_CHUNK = 2**13  # samples per pass, 4 MB of V
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """(16,) lower and (16,) upper ends of the intervals of [offsets; phi] [SI].
+    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
 
-    Student's t with the degrees of freedom of each variance: variances that were estimated from few
-    independent stretches of noise scatter themselves, and 1.96 standard deviations would hold
-    less often than stated. Undetermined parameters have (-inf, inf).
-
-    Args:
-        load: the identification.
-        level: share of the records in which an interval is to hold the truth.
+    Student's t with the degrees of freedom of each variance; (-inf, inf) if undetermined.
 
     Raises:
-        DrakeTeleopError: if the level is not within (0, 1).
+        DrakeTeleopError: if the level is outside (0, 1).
     """
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(f"{level} is not within (0, 1)", where="level")
@@ -62,23 +52,10 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Which parameters are still mostly the prior's, for `Identification.prior_dominated`.
-
-    An estimate with a Gaussian prior is the mean of data and prior weighted by their information;
-    the prior's weight is the square of (posterior / prior standard deviation). From a share of 0.5
-    on, the prior has a quarter of the weight or more, and the data alone would be less certain than
-    0.58 of the prior.
-
-    Args:
-        standard_deviations: (n,) of the estimate.
-        prior_std: (n,) of the prior; inf for none.
-        share: of the prior's standard deviation from which on it dominates.
-
-    Returns:
-        (n,) bools.
+    """Return (n,) bools: standard deviation at least `share` of the prior's, inf for no prior.
 
     Raises:
-        DrakeTeleopError: if the shapes differ or a standard deviation of the prior is not positive.
+        DrakeTeleopError: if shapes differ or a prior standard deviation is not positive.
     """
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
@@ -91,17 +68,15 @@ def prior_dominated(
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """A linear combination of [offsets; phi] that a record determines.
+    """Linear combination of [offsets; phi] that a record determines.
 
     Attributes:
-        coefficients: (16,) of [offsets; phi]; the combination has the unit of its leading
-            parameter, whose coefficient is 1.
-        leading: index of that parameter in `PARAMETERS`.
-        value: the estimate, in the unit of the leading parameter.
-        standard_deviation: likewise.
-        share: standard deviation over what is natural for the load (`natural_scale`).
-        words: the sum, such as "I_zz + 0.2 m c_x"; terms below a tenth of the largest, by what is
-            natural for the load, are "...", and those below a hundredth are left out.
+        coefficients: (16,); 1 for the leading parameter, which gives the unit.
+        leading: its index in `PARAMETERS`.
+        value: estimate.
+        standard_deviation: of the estimate.
+        share: standard deviation over the natural scale.
+        words: the sum as text; "..." stands for terms below a tenth of the largest.
     """
 
     coefficients: Array
@@ -112,25 +87,22 @@ class Combination:
     words: str
 
     def __str__(self) -> str:
-        """For instance "I_zz + 0.2 m c_x = 0.31 +- 0.01 kg m^2"."""
+        """Return text such as "I_zz + 0.2 m c_x = 0.31 +- 0.01 kg m^2"."""
         numbers = f"{self.value:.4g} +- {self.standard_deviation:.2g} {_UNITS[self.leading]}"
         return f"{self.words} = {numbers}"
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Which combinations of load and offsets a record determines (base parameters).
+    """Base parameters: combinations of load and offsets that a record determines.
 
     Attributes:
-        combinations: as many as the rank of [E V]; each is one parameter plus multiples of those
-            that cannot be told from it. Gautier, Khalil, IEEE Trans. Robotics and Automation 6(3),
-            1990, whose numerical form is a QR decomposition with pivoting (Gautier, ICRA 1990).
-        without_influence: names of the parameters that had no part in the wrench at all.
-        directions: of the parameters that are determined but not identified, the independent
-            combinations from the best to the worst known, in units natural for the load. One that
-            has a share of at most 5 % is identified although its parts are not.
-        slow_noise: names of the wrench channels whose noise remembers longer than the record can
-            tell (drift): the standard deviations are then lower bounds.
+        combinations: as many as the rank of [E V] (Gautier, Khalil, IEEE Trans. Robotics and
+            Automation 6(3), 1990; QR with pivoting: Gautier, ICRA 1990).
+        without_influence: names of parameters without influence on the wrench.
+        directions: principal combinations of determined but not identified parameters, from the
+            most to the least certain.
+        slow_noise: names of wrench channels with drift.
     """
 
     combinations: tuple[Combination, ...]
@@ -140,11 +112,11 @@ class BaseParameters:
 
     @property
     def rank(self) -> int:
-        """The number of independent combinations that the record determines, 16 at most."""
+        """Number of independent combinations that the record determines, at most 16."""
         return len(self.combinations)
 
     def lines(self) -> list[str]:
-        """What the record determines beyond single parameters, in words; one line for each."""
+        """Return the summary as lines of text."""
         lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)
@@ -165,14 +137,7 @@ class BaseParameters:
 
 
 def base_parameters(equations: NormalEquations) -> BaseParameters:
-    """What a record determines, exactly and within its noise.
-
-    Args:
-        equations: the sums over the record.
-
-    Raises:
-        DrakeTeleopError: as `NormalEquations.solve`.
-    """
+    """Return the base parameters of a record; raises as `NormalEquations.solve`."""
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scale(load.phi)
@@ -185,8 +150,8 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         words = _sum_in_words(c, leading, np.abs(c) * natural)
         return Combination(c, leading, float(c @ theta), deviation, deviation / size, words)
 
-    # Exactly: the dependent columns of [E V] as combinations of independent ones. Of equals, the
-    # load's columns are taken for independent, so that the words begin with its parameters.
+    # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
+    # the load as independent, so that the text begins with its parameters.
     gram, _ = equations.normal_equations()
     norm = np.sqrt(np.where(unexcited, 1.0, np.diag(gram)))
     scale = np.where(unexcited, 0.0, np.repeat([1.0, 2.0], [6, 10]) / norm)
@@ -207,7 +172,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         combinations.append(combination(c, int(i)))
     combinations.sort(key=lambda c: c.leading)
 
-    # Within the noise: principal directions of what is determined but not identified.
+    # Principal directions of determined but not identified parameters.
     weak = np.flatnonzero(~load.identifiable & np.isfinite(load.standard_deviations))
     scaled = covariance[np.ix_(weak, weak)] / np.outer(natural[weak], natural[weak])
     directions = []
@@ -235,22 +200,9 @@ def _sum_in_words(coefficients: Array, leading: int, weights: Array) -> str:
 def wrench_standard_deviations(
     load: Identification, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
 ) -> Array:
-    """How well an identified load predicts the wrench V phi of a motion.
+    """Return standard deviations (..., 6) of the predicted wrench V phi [N, N m].
 
-    The variance of row v of V is v C v^T with the covariance C of phi, products between parameters
-    included: a motion like that of the record is predicted better than the parameters are known.
-    Errors of the motion and the model are not in it, nor are the offsets.
-
-    Args:
-        load: the identification.
-        s, omega, alpha: (..., 3) motion, as for `regressor`.
-
-    Returns:
-        (..., 6) standard deviations of [f; tau] [N, N m]; inf where an undetermined parameter has a
-        part in the wrench.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+    Only phi is uncertain; inf where an undetermined parameter affects the wrench.
     """
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     covariance = load.covariance[6:, 6:]
