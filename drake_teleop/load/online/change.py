@@ -1,39 +1,11 @@
-"""Noticing online that the load has changed: an object was grasped or released (section V, Eq. 14).
+"""Online detection of a changed load: an object was grasped or released, Eqs. (T23), (T24).
 
-**What is watched.** Samples are averaged over blocks of `BLOCK` seconds. The mean of a block is
+    known       the known load explains the means of blocks of `BLOCK` seconds
+    disturbed   neither the known nor a new load does: contact, or the moment of a grasp
+    changed     a new load has explained them for `HOLD` seconds
+    identified  its mass and first moments are identified: it is the known load from here on
 
-    F = [E V] theta + noise,    Cov(noise) = (R + J Q J^T) / n
-
-with theta = [offsets; phi] known to be theta_0 with covariance P_0, R and Q the noise of wrench and
-motion, J the derivative of V phi by the motion, and n samples. R and Q are long-run variances (the
-variance of a mean of many samples, times their number): a block that is longer than the noise's
-memory makes coloured noise white, and a low-pass of unit gain leaves these variances as they were
-before it. Averaging also takes the noise out of V, which would bias least squares. Errors of gain,
-cross-talk and alignment are a share of the wrench that changes as slowly as the motion: they count
-as noise that remembers `MEMORY` seconds, and do not average out within a block.
-
-A Kalman filter that starts from (theta_0, P_0) and learns from the blocks has white innovations;
-each block's, normalised, is chi-squared with six degrees of freedom as long as the load is the
-known one. It starts anew every `WINDOW` seconds, so that it cannot follow a load that changes
-slowly. A cumulative sum (Page 1954) of what exceeds `_SLACK` times the mean alarms at `_ALARM`;
-noise of up to sqrt(2) times the stated one is thus tolerated.
-
-**Contact or load?** After the alarm a second filter explains the wrench by a new load: its prior
-are the known offsets and the known load, the latter widened by `WIDE`. Its innovations pass the
-same test::
-
-    known       the known load explains the wrench
-    disturbed   neither it nor a new load does: contact, or the very moment of a grasp. Whenever the
-                second filter's test alarms, it starts anew
-    changed     a new load has explained the wrench for `HOLD` seconds: what is fed back with the
-                old one is wrong
-    identified  its mass and first moments are known: from here on it is the known load
-
-From disturbed and changed the way leads back as soon as the old load explains the wrench again.
-A contact would have to follow the motion as a body's wrench does, in six channels and with
-known offsets: force along s, moments about a point that moves with S. Where nothing moves, a
-vertical push does that. It is then called changed until something moves or the push varies. It is
-never identified: the first moment along gravity needs motion.
+Method: docs/theory.md, "Another load".
 """
 
 from __future__ import annotations
@@ -62,43 +34,42 @@ from drake_teleop.load.sample import (
 )
 
 STATES = ("known", "disturbed", "changed", "identified")
-"""What `LoadChangeMonitor.state` may say."""
+"""States of the monitor, by index."""
 KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
 
 BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
-"""Durations in seconds (module docstring)."""
+"""Durations [s]: of a block, until a filter restarts, until a new load counts, of a model error."""
 BOUND = 0.0025
-"""Default of `LoadChangeMonitor`: 1 % of a new load's mass is then four standard deviations."""
+"""Default bound: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
-"""Default 1 sigma by which offsets may have drifted since the identification [N, N m]."""
+"""Default standard deviation of the offsets' drift since the identification [N, N m]."""
 
-# Standard deviations of what may be grasped or released [kg, kg m, kg m^2].
+# Standard deviations of a grasped or released object [kg, kg m, kg m^2].
 WIDE = PRIOR_STD[6:]
-# Cumulative sums of a block's chi-squared of six degrees of freedom. With the slack of twice the
-# mean, noise exceeds the alarm once in 1e10 blocks; the way back is that of five blocks of noise.
+# Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
+# the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
+# blocks of noise reach the return limit.
 _SLACK, _ALARM, _BACK = 12.0, 60.0, -30.0
-# First moments may be that much less certain than the mass, relative to what is natural for a load
-# of this size, at least that large [m].
+# Factor of the bound for first moments relative to that of the mass, and smallest size [m].
 _MOMENTS, _SMALLEST_SIZE = 10.0, 0.03
-# Standard deviations below zero from which on a new load cannot be a body.
+# Standard deviations below zero at which the mass of a new load is impossible.
 _IMPOSSIBLE = 4.0
 
-# Parts of the memory: status; squared residuals of the known and the new load; sums of a block;
-# then beliefs [theta (16); P (256)]: the known load, the filter that watches it, and the new one.
+# Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
+# then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
 _STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _BACK_SUM, _AGE, _START, _LEARNT, _POWER = range(10)
 _RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
 _WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
 
 SIZE = _KNOWN + 816
-"""Of the memory of `change_update`."""
+"""Length of the memory of `change_update`."""
 
 
 @njit(cache=True)
 def _explain(memory, belief, block, noise):
-    """A block into a belief; returns the chi-squared of what the belief does not explain.
+    """Update a filter by a block; return chi-squared of its innovation.
 
-    The test takes model errors for as large as they are, learning for as long-lived as they are.
-    The noise is that of the load as the belief has it: measured accelerations times mass.
+    Model errors count once for the test, and with their duration for the update.
     """
     phi = memory[belief + 6 : belief + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
@@ -115,7 +86,7 @@ def _explain(memory, belief, block, noise):
 
 @njit(cache=True)
 def _restart(memory, belief):
-    """Sets a filter back to the known load, the new load's with a wide prior, and its test."""
+    """Reset a filter to the known load (the new load's filter with a wide prior), and its test."""
     put(memory, belief, memory, _KNOWN, 272)
     if belief == _NEW:
         for j in range(10):
@@ -127,7 +98,7 @@ def _restart(memory, belief):
 
 @njit(cache=True)
 def _settled(memory, bound):
-    """Whether the new load's mass and first moments are known to `bound` of what has changed."""
+    """Return whether mass and first moments of the new load are certain to `bound`."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
@@ -138,10 +109,7 @@ def _settled(memory, bound):
 
 @njit(cache=True)
 def _doubt_inertias(memory, noise, block):
-    """Adds what noise of alpha may have taken from the new load's inertias to their variances.
-
-    Least squares shrinks them by the share of noise in the power of alpha.
-    """
+    """Increase the inertia variances of the new load by the bias that noise of alpha causes."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_POWER], 1e-300))
@@ -153,16 +121,16 @@ def _doubt_inertias(memory, noise, block):
 
 @njit(cache=True)
 def change_update(memory, sample, block, noise, window, hold, bound):
-    """One sample, in place; compiled, checks nothing.
+    """Update the memory by one sample; compiled, without checks.
 
     Args:
-        memory: of `LoadChangeMonitor.initial_memory`, updated.
-        sample: see `drake_teleop.load.sample`, its first 15 numbers.
+        memory: of `change_memory`, updated.
+        sample: (15 or more,) see `regressor`.
         block: samples of a block.
-        noise: (17,) long-run variances of a sample of the wrench (6) and the motion (9), square of
-            the model error, and how many blocks that lasts.
-        window, hold: blocks.
-        bound: of `LoadChangeMonitor`.
+        noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared model
+            error, and its duration [blocks].
+        window, hold: [blocks].
+        bound: see `change_parameters`.
     """
     V = np.empty((6, 10))
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
@@ -184,7 +152,7 @@ def change_update(memory, sample, block, noise, window, hold, bound):
 
 @njit(cache=True)
 def _judge(memory, block, noise, window, hold, bound):
-    """What a block's means say about the load."""
+    """Test the means of a block and update the state."""
     if memory[_STATE] == memory[_BASE]:
         if memory[_AGE] >= window:
             excess = memory[_SUM]
@@ -197,7 +165,7 @@ def _judge(memory, block, noise, window, hold, bound):
             memory[_STATE], memory[_BACK_SUM] = DISTURBED, 0.0
             _restart(memory, _NEW)
         return
-    # Does the old load explain this block by itself?
+    # Return to the known load if it explains the blocks without an update.
     put(memory, _WATCH, memory, _KNOWN, 272)
     chi = _explain(memory, _WATCH, block, noise)
     memory[_BACK_SUM] = min(0.0, memory[_BACK_SUM] + chi - _SLACK)
@@ -205,7 +173,7 @@ def _judge(memory, block, noise, window, hold, bound):
         memory[_STATE] = memory[_BASE]
         _restart(memory, _WATCH)
         return
-    # Does a new one explain it together with those before?
+    # Test whether one new load explains all blocks since its start.
     chi = _explain(memory, _NEW, block, noise)
     memory[_AGE] += 1.0
     for k in range(3):
@@ -216,7 +184,7 @@ def _judge(memory, block, noise, window, hold, bound):
             residual -= memory[_V + 10 * c + j] * memory[_NEW + 6 + j]
         memory[_SQUARES + c] += residual * residual
     memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
-    # A body has mass.
+    # A clearly negative mass is not a load.
     mass, deviation = memory[_NEW + 6], math.sqrt(memory[_NEW + 16 + 17 * 6])
     if memory[_SUM] > _ALARM or mass < -_IMPOSSIBLE * deviation:
         memory[_STATE] = DISTURBED
@@ -235,7 +203,6 @@ def _judge(memory, block, noise, window, hold, bound):
 
 @njit(cache=True)
 def _watch(memory, samples, states, block, noise, window, hold, bound):
-    """`change_update` for each row of samples (N, 15); writes the states (N,)."""
     for k in range(samples.shape[0]):
         change_update(memory, samples[k], block, noise, window, hold, bound)
         states[k] = int(memory[_STATE])
@@ -252,10 +219,17 @@ def change_parameters(
     model_error: float = 0.0,
     bound: float | None = None,
 ) -> Parameters:
-    """What `change_update` takes beside memory and sample; arguments as of `LoadChangeMonitor`.
+    """Return the last arguments of `change_update`.
+
+    Args:
+        wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
+        period: between samples [s].
+        model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
+        bound: required standard deviation of a new load's mass over the change of mass; default
+            `BOUND`, or twice the model error.
 
     Raises:
-        DrakeTeleopError: for other shapes or values.
+        DrakeTeleopError: for values outside their range.
     """
     positive("period", period)
     if not 0.0 <= model_error < 1.0:
@@ -269,12 +243,12 @@ def change_parameters(
 
 
 def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
-    """The memory (n,) of `change_update` before the first sample.
+    """Return the memory of `change_update` before the first sample.
 
     Args:
-        theta: (16,) known [offsets; phi].
-        covariance: (16, 16) of it; what is not determined counts as wide open.
-        offset_drift: of `LoadChangeMonitor`.
+        theta, covariance: (16,), (16, 16) known [offsets; phi]; `PRIOR_STD` replaces larger
+            deviations.
+        offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
     P = covariance.copy()
@@ -282,7 +256,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     P[unknown, :] = P[:, unknown] = 0.0
     P[unknown, unknown] = prior[unknown]
     P[range(6), range(6)] += np.square(offset_drift)
-    # Least inertias that the mass implies, as in `logs.processing.usable_phi`.
+    # Undetermined inertias: those of a point mass, as in `logs.processing.usable_phi`.
     phi = theta[6:].copy()
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
     phi[4:] = np.where(unknown[10:], point[4:], phi[4:])
@@ -295,51 +269,43 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
 
 @njit(cache=True)
 def known_load(memory):
-    """(16,) [offsets; phi] of the known load, a view: its offsets may be corrected."""
+    """Return [offsets; phi] (16,) of the known load as a view; its offsets may be corrected."""
     return memory[_KNOWN : _KNOWN + 16]
 
 
 @njit(cache=True)
 def change_state(memory):
-    """Index into `STATES`; once a load was identified, it is the known one: `KNOWN` again."""
+    """Return the index into `STATES`; `KNOWN` again after a new load was identified."""
     return KNOWN if memory[_STATE] == memory[_BASE] else int(memory[_STATE])
 
 
 @njit(cache=True)
 def new_load(memory):
-    """(16,) [offsets; phi] of the new load as far as it is known."""
+    """Return [offsets; phi] (16,) of the new load as a view."""
     return memory[_NEW : _NEW + 16]
 
 
 @njit(cache=True)
 def new_load_age(memory):
-    """Samples since the newest new load has explained the wrench, if the known one does not."""
+    """Return the samples since the start of the new load's filter."""
     return memory[_SAMPLES] - memory[_START]
 
 
 class LoadChangeMonitor:
-    """Watches whether the load is still the known one, sample by sample (module docstring).
-
-    What it knows is a `memory` (an array); it can be kept outside, as in the state of a Drake
-    system: `initial_memory`, `update_into`, `state_of`.
+    """Monitor of a known load, sample by sample (module docstring).
 
     Args:
-        known: the load at the start and the offsets, with their covariance. What it does not
-            determine counts as wide open.
-        wrench_std: (6,) noise of the wrench channels, square roots of long-run variances of a
-            sample (of white noise: its standard deviation) [N, N m].
+        known: load and offsets at the start, with covariance.
+        wrench_std: (6,) noise of the wrench, roots of long-run variances per sample [N, N m].
         motion_std: (9,) the same of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
         period: between samples [s].
-        model_error: what the sensor's gains and cross-talk, the alignment in time and the like make
-            of the load's wrench, as a share of it. 0 is for simulations: with as little as 1 % of
-            gain error a load that is known from another motion is soon taken for disturbed.
-        offset_drift: (6,) 1 sigma by which the offsets may have drifted since `known` [N, N m].
-        bound: standard deviation over change of mass at which a new load's mass is known; the
-            first moments ten times that of what is natural for the new load's size. Default:
+        model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
+        offset_drift: (6,) standard deviation of the offsets' drift since `known` [N, N m].
+        bound: required standard deviation of a new load's mass over the change of mass; default
             `BOUND`, or twice the model error.
 
     Raises:
-        DrakeTeleopError: for other shapes or values.
+        DrakeTeleopError: for wrong shapes or values.
     """
 
     def __init__(
@@ -361,33 +327,28 @@ class LoadChangeMonitor:
         self._memory = self.initial_memory()
 
     def initial_memory(self) -> Array:
-        """The memory before the first sample, (n,)."""
+        """Return the memory (n,) before the first sample."""
         theta = np.concatenate([self._first.offsets, self._first.phi])
         return change_memory(theta, self._first.covariance, self._drift)
 
     def update_into(self, memory: Array, sample: Array) -> None:
-        """The update of a memory that is kept elsewhere; compiled, checks nothing.
-
-        Args:
-            memory: as from `initial_memory`, updated in place.
-            sample: see `drake_teleop.load.sample`, its first 15 numbers.
-        """
+        """Update an external memory by one sample; compiled, without checks."""
         change_update(memory, sample, *self._parameters)
 
     @staticmethod
     def state_of(memory: Array) -> str:
-        """`state` of a memory that is kept elsewhere."""
+        """Return the state of an external memory."""
         return STATES[int(memory[_STATE])]
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> str:
-        """Takes one sample and returns the `state`.
+        """Update by one sample and return the state.
 
         Args:
             wrench: (6,) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
             s, omega, alpha: (3,) motion of S in S, as for `regressor`.
 
         Raises:
-            DrakeTeleopError: for other shapes or numbers that are not finite.
+            DrakeTeleopError: for wrong shapes or numbers that are not finite.
         """
         parts = {"wrench": (wrench, 6), "s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
         sample = np.concatenate([checked(name, x, n) for name, (x, n) in parts.items()])
@@ -397,17 +358,7 @@ class LoadChangeMonitor:
     def watch(
         self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
     ) -> NDArray[np.int_]:
-        """`update` with each of N samples of a log, in a compiled loop.
-
-        Args:
-            wrench, s, omega, alpha: (N, 6), (N, 3), (N, 3), (N, 3).
-
-        Returns:
-            (N,) indices into `STATES`, after each sample.
-
-        Raises:
-            DrakeTeleopError: as `update`.
-        """
+        """Update by N samples (N, 6), (N, 3)...; return the states (N,) as indices."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         states = np.empty(len(rows[0]), np.int_)
         _watch(self._memory, np.concatenate(rows, axis=1), states, *self._parameters)
@@ -415,22 +366,17 @@ class LoadChangeMonitor:
 
     @property
     def state(self) -> str:
-        """One of `STATES`."""
+        """State, one of `STATES`."""
         return self.state_of(self._memory)
 
     @property
     def changed_at(self) -> float:
-        """Since when the newest new load explains the wrench [s after the first sample]."""
+        """Time at which the newest new load began [s after the first sample]."""
         return float(self._memory[_START]) * self._period
 
     @property
     def load(self) -> Identification:
-        """The known load; once "identified", the new one.
-
-        Of a new load, `residual_rms` is that of the blocks' means times the root of a block's
-        samples. Inertias that its motion has not excited are those of the load before, with a
-        large standard deviation. `condition_number` and `delay_s` are those of the first load.
-        """
+        """Known load; the new one once it is identified."""
         memory = self._memory
         if memory[_BASE] == KNOWN:
             return self._first

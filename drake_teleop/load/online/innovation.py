@@ -1,4 +1,4 @@
-"""What a sample block's mean says beyond a belief about the load, in units of its own noise."""
+"""Kalman filter update of a load estimate by the mean of a block of samples."""
 
 from __future__ import annotations
 
@@ -8,13 +8,21 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import cholesky
 from drake_teleop.load.regressor import non_contact_wrench_into
 
-# As in `recursive`: the least variance of a row relative to those that it is made of.
+# Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _RESOLUTION = 1e-10
 
 
 @njit(cache=True)
 def whitening(motion, phi, noise, model_var, n):
-    """(6, 6) inverse of the Cholesky factor of the noise of a block's mean."""
+    """Return the inverse (6, 6) of the Cholesky factor of a block mean's noise covariance.
+
+    Args:
+        motion: (9,) mean [s, omega, alpha].
+        phi: (10,) load.
+        noise: (15 or more,) long-run variances per sample of wrench and motion.
+        model_var: squared model error.
+        n: samples of the block.
+    """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
     up, down, moved = np.empty(6), np.empty(6), motion.copy()
     non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, up)
@@ -25,7 +33,7 @@ def whitening(motion, phi, noise, model_var, n):
     for k in range(9):
         if noise[6 + k] == 0.0:
             continue
-        # The wrench is of second order in the motion: the central difference is exact.
+        # The wrench is quadratic in the motion, so the central difference is exact.
         moved[k] = motion[k] + 1.0
         non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, up)
         moved[k] = motion[k] - 1.0
@@ -47,7 +55,7 @@ def whitening(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def learn(belief, V, wrench, root):
-    """One block into a belief (272,), Eq. (T6); returns the innovation's chi-squared."""
+    """Update [theta (16); P (256)] by a block, Eq. (T6); return the innovation's chi-squared."""
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = belief[:16], belief[16:].reshape(16, 16), 0.0
     for c in range(6):

@@ -1,22 +1,15 @@
-"""Recursive instrumental variables for the load and the offsets: a second view of the motion.
+"""Recursive instrumental variables for load and offsets, Eq. (T19).
 
-Least squares correlates the equation errors with V of Eq. (5), which carries the noise that made
-them: hence its bias. Instrumental variables correlate them with V of another source whose noise is
-independent: the commanded motion, or derivatives of the encoders' readings (Kubus, Kroeger, Wahl:
-On-line rigid object recognition and pose estimation based on inertial parameters, IROS 2007; Ljung,
-System Identification, section 7.6). No noise level of the motion has to be known for the estimate
-to be free of bias, and the instruments may be off: a wrong instrument costs precision only, as long
-as its error has nothing to do with the noise of the measured motion.
+Least squares is biased because noise of the motion is in V and in the equation errors. Instruments
+are V of a second source with independent noise, such as the commanded motion or derivatives of
+encoder readings (Kubus, Kroeger, Wahl, IROS 2007; Ljung, System Identification, section 7.6). The
+noise level of the motion is not needed. With M = Y^T W Y, R = Y^T W X, g = Y^T W F, X = [E V] and
+Y = [E V(instruments)]:
 
-With the sums M = Y^T W Y, R = Y^T W X, g = Y^T W F over the samples, X = [E V] and
-Y = [E V(instruments)], the estimate is
+    (R^T M^-1 R + prior) theta = R^T M^-1 g + prior theta_0
 
-    (R^T M^-1 R + prior) theta = R^T M^-1 g + prior theta_0,
-
-which is R^-1 g as soon as the motion outweighs the prior, and unlike R^-1 g has no pole on the way.
-Weak instruments make R^T M^-1 R small: the estimate stays with the prior, and its variance large.
-W (6, 6) is the inverse covariance of the residuals so far, of all six rows together: three-stage
-least squares (Zellner, Theil: Econometrica 30, 1962), every sample anew, see `recursive_moments`.
+W (6, 6) is the inverse covariance of the residuals: three-stage least squares (Zellner, Theil,
+Econometrica 30, 1962).
 """
 
 from __future__ import annotations
@@ -42,21 +35,20 @@ from drake_teleop.load.online.recursive_moments import (
 )
 from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
 
-# Share of the instruments' own information by which M is raised, against rounding.
+# Relative increase of M's diagonal against rounding.
 _RIDGE = 1e-9
-# So many samples the stated noise of the wrench counts next to the residuals, which are too small
-# while there are hardly more of them than parameters.
+# Number of samples for which the specified wrench noise counts: first residuals are too small.
 _STATED = 20.0
-# Share of the squared wrench below which a squared residual is rounding.
+# Squared residual over squared wrench that is rounding.
 _ROUNDING = 1e-13
 
 
 @njit(cache=True)
 def riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A):
-    """Writes R^T M^-1 R + prior and R^T M^-1 g + prior theta_0 into A (16, 17).
+    """Write R^T M^-1 R + prior and R^T M^-1 g + prior theta_0 into A (16, 17).
 
     Args:
-        memory: (58, 19) sums of z z^T, y z^T, y y^T (y of the instruments), and prior theta_0.
+        memory: (58, 19) sums of z z^T, y z^T, y y^T (y of the instruments), and the prior's part.
         theta: (16,) estimate, for the weights.
         noise_std: (6,) of the wrench [N, N m].
         information: (16,) of the prior.
@@ -91,14 +83,13 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
 
 @njit(cache=True)
 def riv_update(theta, memory, samples, noise_std, forgetting, information, index, factors):
-    """One sample after the other, in place; compiled, checks nothing.
+    """Update the estimate by each sample; compiled, without checks.
 
     Args:
         theta: (16,) [offsets; phi], updated.
         memory: (58, 19), updated.
         samples: (N, 24) [wrench, s, omega, alpha, instruments (s, omega, alpha)].
         forgetting: factor per sample on the weight of the past.
-        noise_std, information, index, factors: as for `riv_normal_equations`.
     """
     space, MRg, A = scratch(), np.empty((16, 33)), np.empty((16, 17))
     y, z = np.empty(19), np.empty(19)
@@ -117,25 +108,14 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):
-    """Recursive instrumental variables: `update` and `learn` need instruments; see the module.
-
-    Args:
-        noise_std: (6,) standard deviations of the wrench channels [N, N m], for the first weights.
-        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of [offsets; phi] to begin with. With forgetting the
-            prior is about the present estimate and never vanishes.
-        bound: of `settled`.
-
-    Raises:
-        DrakeTeleopError: for other shapes or values.
-    """
+    """Recursive instrumental variables; `update` and `learn` require instruments."""
 
     method = "recursive instrumental variables"
     sample_size = 24
     _sums = 3
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """(16, 16) (R^T M^-1 R + prior)^-1: W is the inverse of the errors' covariance."""
+        """Return the covariance (16, 16), (R^T M^-1 R + prior)^-1."""
         A, MRg = np.empty((16, 17)), np.empty((16, 33))
         options = (self._noise_std, 1.0 / self._prior, *terms())
         riv_normal_equations(memory, theta, *options, scratch(), MRg, A)

@@ -1,4 +1,4 @@
-"""The recursive estimators that a station may learn its load with."""
+"""Recursive estimators by name, for the load estimator of a station."""
 
 from __future__ import annotations
 
@@ -9,4 +9,4 @@ METHODS: dict[str, type[RecursiveEstimator]] = {
     "rls": RecursiveLeastSquares,
     "rtls": RecursiveTotalLeastSquares,
 }
-"""The estimators by name: a line here enters one."""
+"""Recursive estimators by name; add a line for a new one."""

@@ -1,29 +1,11 @@
-"""Recursive total least squares for the load and the offsets: noise in the measured motion too.
+"""Recursive total least squares for load and offsets: noise in the measured motion too, Eq. (T18).
 
-Least squares takes the matrix V of Eq. (5) for exact. Measured accelerations are noisy, V with
-them, and the estimate is biased towards zero, the inertias most. Total least squares minimises
+Minimises lambda, the weighted squared residuals over their expected value (Kubus, Kroeger, Wahl,
+IROS 2008). G and g are the sums of least squares, N the expected noise in G. Each sample does one
+step G theta' = g + lambda N theta of the inverse iteration.
 
-    lambda = (sum of r^T W r, r = F - [E V] theta) / (what noise of the stated levels makes of it)
-           = (c - 2 g^T theta + theta^T G theta) / (n + theta^T N theta)
-
-(Kubus, Kroeger, Wahl: On-line estimation of inertial parameters using a recursive total
-least-squares approach, IROS 2008; Van Huffel, Vandewalle: The Total Least Squares Problem, SIAM
-1991). G, g, c are the sums of least squares, N the expected share of the noise in G. Every column
-has its own noise, and so do their correlations; exact columns (the offsets, the structural zeros of
-V) have none. Only the ratios of the noise levels matter: lambda is their common scale, about 1 if
-they are right, less behind a filter that takes noise off all channels alike. W (6, 6) is the
-inverse covariance of the six rows' errors for the present theta, see `recursive_moments`.
-
-At the minimum (G - lambda N) theta = g. Each sample does one step G theta' = g + lambda N theta
-of the inverse iteration, starting from the last estimate. As G >= N in the mean, for given W lambda
-never grows by it (it minimises a quadratic that touches the sum from above), so that a few samples
-suffice: from then on it is the batch's `total_least_squares` of the samples so far.
-
-**Poor excitation.** Where G holds nothing but noise, G - lambda N vanishes and total least squares
-knows no bound. Parameters are compensated only as far as the information of every combination of
-them exceeds that of the noise by more than the noise of the sums themselves (4 times
-sqrt(2 / samples), of the noise's information); a combination that does not has the prior's
-variance. Forgetting brings back the information of the prior, about the present estimate.
+Parameters are compensated only where the information exceeds that of the noise by 4
+sqrt(2 / samples) of it; other combinations have the prior's variance.
 """
 
 from __future__ import annotations
@@ -54,21 +36,19 @@ from drake_teleop.load.online.recursive_moments import (
 )
 from drake_teleop.load.sample import MOTION, WRENCH
 
-# Excess of information over noise, in units of sqrt(2 / samples), that compensation has to leave.
+# Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _EXCESS = 4.0
-# The least pivot relative to its diagonal element: below it is rounding.
+# Smallest pivot relative to its diagonal element that is not rounding.
 _PIVOT = 1e-13
-# Samples from which on the residuals tell the scale of the noise.
+# Fewest samples for the noise scale from residuals.
 _FEWEST = 20
 
 
 @njit(cache=True)
 def compensable(G, N, strength, K, taper):
-    """Marks in taper (16,) the parameters whose noise can be taken out of G: 1, else 0.
+    """Set taper (16,) to 1 for parameters with compensated noise, otherwise to 0.
 
-    They are such that G - strength N over them stays positive definite: its Cholesky factor is
-    built in K (16, 16), and a parameter at which it would break down is left out. If that does not
-    help, none is taken. All are tried at once first, by elimination, which is faster.
+    G - strength N over them is positive definite; K (16, 16) is scratch.
     """
     taper[:] = 1.0
     for i in range(16):
@@ -101,13 +81,11 @@ def compensable(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Writes G and g into G (16, >= 17), N into N (16, 16); returns lambda for theta.
+    """Write G and g into G (16, >= 17) and N into N (16, 16); return lambda for theta.
 
     Args:
         Z: (19, 19) sum of z z^T.
-        theta: (16,) estimate, for the weights.
-        noise_std: (6,) of the wrench [N, N m].
-        motion_std: (9,) of [s, omega, alpha].
+        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
         index, factors: from `terms`, space: from `scratch`, Q: (19, 19) scratch.
     """
     E, g, L, LZ, inverse, S, W = space
@@ -134,15 +112,13 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
 def rtls_update(
     theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
 ):
-    """One sample after the other, in place; compiled, checks nothing.
+    """Update the estimate by each sample; compiled, without checks.
 
     Args:
         theta: (16,) [offsets; phi], updated.
-        memory: (20, 19) sum of z z^T, and prior theta_0; updated.
-        samples: (N, at least 15) [wrench, s, omega, alpha].
-        forgetting: factor per sample on the weight of the past.
-        information: (16,) of the prior.
-        noise_std, motion_std, index, factors: as for `rtls_normal_equations`.
+        memory: (20, 19) sum of z z^T, and the prior's part; updated.
+        samples: (N, at least 15), see `regressor`.
+        forgetting, information: factor per sample, and (16,) of the prior.
     """
     space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
@@ -168,19 +144,11 @@ def rtls_update(
 
 
 class RecursiveTotalLeastSquares(MomentEstimator):
-    """Recursive total least squares: for noise in the measured motion, see the module.
-
-    The update takes the same number of operations for every sample.
+    """Recursive total least squares with constant cost per sample.
 
     Args:
-        noise_std: (6,) standard deviations of the wrench channels [N, N m].
+        noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
         motion_std: (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2]; zeros give least squares.
-        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of [offsets; phi] to begin with.
-        bound: of `settled`.
-
-    Raises:
-        DrakeTeleopError: for other shapes or values.
     """
 
     method = "recursive total least squares"
@@ -203,16 +171,19 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """One for noise of (6,) wrench and (9,) motion, as `__init__` takes them."""
+        """Return an estimator for noise of (6,) wrench and (9,) motion."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
     def noise_scale(self) -> float:
-        """lambda: the factor on the stated variances of all noise that the residuals show."""
+        """Ratio lambda of observed to specified noise variances."""
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """(16, 16) lambda H^-1 G H^-1, H = G - lambda N; the prior's where H holds no more."""
+        """Return lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
+
+        Directions without sufficient information get the prior's variance.
+        """
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
         root = np.linalg.inv(_root(G + information))
@@ -227,7 +198,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._within_prior(half @ half.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
-        """G and N (16, 16), without the prior, and lambda, 1 while there are too few samples."""
+        """Return G and N (16, 16) without prior, and lambda (1 for few samples)."""
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
@@ -241,5 +212,5 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
 
 def _root(A: Array) -> Array:
-    """The Cholesky factor of A, its diagonal raised by what is rounding."""
+    """Return the Cholesky factor of A with its diagonal raised by rounding."""
     return np.asarray(np.linalg.cholesky(A + _PIVOT * np.diag(np.diag(A))))

@@ -1,32 +1,13 @@
-"""A known load while it is watched: what the elimination is given of it, sample by sample.
+"""Load for the elimination while a known load is monitored, sample by sample.
 
-The load was learnt and is frozen. `change.change_update` tells whether it is still there; this
-module draws the conclusions::
+    settled     the known load explains the wrench and is used
+    disturbed   contact, or the moment of a grasp; the known load is used
+    changed     another load: the fallback (gripper or nothing) is used until the known load
+                explains the wrench again or the new one is identified
 
-    settled     the known load explains the wrench. It is handed out as it is
-    disturbed   something is touched, or it is the moment of a grasp. The known load is handed out:
-                a contact has to be felt
-    changed     another load than the known one has been there for a while (`change.HOLD`), and
-                has shown that it is none but a load (below): a request to identify again, by a
-                motion that excites mass and first moments. The load handed out fades to what is
-                known otherwise (the gripper alone, or nothing). The hand then feels of the unknown
-                load what the sensor feels, sigma = gamma in Fig. 2: nothing that is not there, as
-                eliminating a load that was put down would make it, and contacts too. It stays like
-                this until either the old load explains the wrench again or the new one is
-                identified, whatever is touched meanwhile; then "settled"
-
-Whatever happens, what is handed out goes over with the time constant `FADE`: the force takes no
-step, and is never outside what the two loads give.
-
-**A constant push** and another weight are the same, at rest and for as long as they do not change.
-What looks like another load is therefore taken for a contact until the force that it exerts has
-changed by `VARIES`, and the new load has explained that for `EXPLAINED` seconds: until the tool is
-turned or accelerated. Its centre of mass has to be within `REACH`; a friction that changes with the
-motion needs one that is metres away.
-
-**Offsets** drift with temperature. While S rests and the load is the known one, the known offsets
-follow the residual with the time constant `FOLLOW`, as long as it is below `LARGEST`; what is
-larger is a contact. A push of up to `LARGEST` at rest is therefore forgotten within seconds.
+Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight: a
+new load counts only if it explains a force that changed by `VARIES`, for `EXPLAINED` seconds, with
+a centre of mass within `REACH`. At rest, offsets follow residuals below `LARGEST`.
 """
 
 from __future__ import annotations
@@ -50,39 +31,34 @@ from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
-"""What the state of a load estimator means; learning is what comes before this module."""
+"""States of a load estimator, by index; "learning" precedes this module."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
 FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
-"""Durations in seconds (module docstring)."""
+"""Durations [s]: cross-fade, rest before offsets follow, their time constant, new load explains."""
 LARGEST = np.array([0.3] * 3 + [0.015] * 3)
-"""Three times `change.OFFSET_DRIFT` [N, N m]."""
+"""Largest residual that offsets follow, three times `change.OFFSET_DRIFT` [N, N m]."""
 VARIES = 0.5
-"""Noise never makes that much of a low-passed force [N]."""
+"""Smallest change of the low-passed force that noise cannot cause [N]."""
 REACH = 1.0
-"""How far from So the centre of mass of something that is grasped or put down may be [m]."""
+"""Largest distance of So from the centre of mass of a grasped or released object [m]."""
 
-# At rest, low-passed by _SMOOTH [s], S turns slower than that [rad/s] and its specific force stays
-# that near to where it was [m/s^2].
+# Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
+# force [m/s^2] at rest.
 _SMOOTH, _TURNING, _MOVED = 0.05, 0.02, 0.1
 
-# Parts of the memory, before that of `change`: state; samples at rest; low-passed specific force,
-# angular velocity, residual; specific force at the beginning of the rest; least and largest
-# residual force since a new load has explained it; samples since they are `VARIES` apart.
+# Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
+# force, angular velocity and residual; specific force at the start of the rest; smallest and
+# largest residual force of the new load; samples with a difference of `VARIES`.
 _STATE, _RESTED, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
 _WHERE, _LEAST, _MOST, _VARIED, _CHANGE = 14, 17, 20, 23, 24
 
 SIZE = _CHANGE + change.SIZE
-"""Of the memory of `watched_update`."""
+"""Length of the memory of `watched_update`."""
 
 
 def watched_memory(theta: Array, covariance: Array) -> Array:
-    """The memory (SIZE,) of `watched_update` when a load has settled.
-
-    Args:
-        theta: (16,) [offsets; phi] that is known.
-        covariance: (16, 16) of it.
-    """
+    """Return the memory of `watched_update` for identified [offsets; phi] and covariance."""
     rest = np.zeros(_CHANGE)
     rest[_STATE] = SETTLED
     return np.concatenate([rest, change.change_memory(theta, covariance)])
@@ -90,13 +66,12 @@ def watched_memory(theta: Array, covariance: Array) -> Array:
 
 @njit(cache=True)
 def watched_state(memory):
-    """Index into `LOAD_STATES`; that of a memory of zeros is `LEARNING`."""
+    """Return the index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
     return int(memory[_STATE])
 
 
 @njit(cache=True)
 def _rests(memory, sample, period):
-    """Whether S has been at rest for a while."""
     share = period / (_SMOOTH + period)
     s, omega = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
     moved, turning = 0.0, 0.0
@@ -114,7 +89,7 @@ def _rests(memory, sample, period):
 
 @njit(cache=True)
 def _varies(memory, residual, age, period):
-    """Whether a new load, `age` samples old, has explained a change of the residual force."""
+    """Return whether a new load, `age` samples old, has explained a changed residual force."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
     least, most = memory[_LEAST:_MOST], memory[_MOST:_VARIED]
     share = 1.0 if age == 0.0 else period / (_SMOOTH + period)
@@ -132,20 +107,19 @@ def _varies(memory, residual, age, period):
 
 @njit(cache=True)
 def _is_within_reach(known, new):
-    """Whether what has come or gone has its centre of mass within `REACH`."""
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
     return moment < (REACH * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """One sample, in place; compiled, checks nothing.
+    """Update by one sample; compiled, without checks.
 
     Args:
-        out: (16,) [offsets; phi] that is handed out, updated.
+        out: (16,) [offsets; phi] for the elimination, updated.
         memory: of `watched_memory`, updated.
-        sample: see `drake_teleop.load.sample`, its first 15 numbers.
-        fallback: (10,) phi of what is known of a load that has changed.
+        sample: (15 or more,) see `regressor`.
+        fallback: (10,) phi for a changed load.
         period: between samples [s].
         block, noise, window, hold, bound: of `change.change_parameters`.
     """
