@@ -1,9 +1,7 @@
-"""Noticing contact in the eliminated wrench, sample by sample, without calling fast motion contact.
+"""Contact detection in the eliminated wrench, sample by sample.
 
-Contact begins when the chosen one of the `statistics` reaches its threshold. It ends when for a
-while the level has stayed below a share of the level's own threshold, and the sum over that while
-is as low; then the sums start anew, because after a long contact they would take as long to come
-down.
+Contact begins when the selected statistic reaches its threshold. It ends when the level and the sum
+over the last samples have stayed below `leave` for `hold` samples; then the sums restart.
 """
 
 from __future__ import annotations
@@ -33,11 +31,11 @@ from drake_teleop.load.contact.statistics import LEAVE, SLACK, detection_update
 
 @njit(cache=True)
 def _last_sum(memory, hold, widths):
-    """The likelihood ratio of the longest window within `hold` samples, without a maximum."""
+    """Return the likelihood ratio of the longest window within `hold` samples."""
     m = 0
     while 2 << m <= min(hold, WINDOW // 2):
         m += 1
-    # The sample before that window; what no sample has filled is zero.
+    # Sum before that window; zero if there was no sample yet.
     before = RING + 6 * ((int(memory[COUNT]) + WINDOW - 1 - (1 << m)) % WINDOW)
     total = 0.0
     for i in range(6):
@@ -48,15 +46,14 @@ def _last_sum(memory, hold, widths):
 
 @njit(cache=True)
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Whether there is contact, after `detection_update`; compiled, checks nothing.
+    """Return whether there is contact, after `detection_update`; compiled, without checks.
 
     Args:
-        memory: the same, updated.
+        memory: of `detection_update`, updated.
         statistic: index into `STATISTICS`.
-        enter: threshold of that statistic.
-        leave: level below which contact may end, and sum of the longest window within `hold`.
-        hold: samples below it, after which it has ended.
-        widths: of the sums.
+        enter: its threshold.
+        leave, hold: level, and samples below it, before contact ends.
+        widths: of `NoiseFloor`.
     """
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
@@ -64,7 +61,7 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
     else:
         memory[QUIET_FOR] = memory[QUIET_FOR] + 1.0 if memory[FIRST_STATISTIC] < leave else 0.0
         if memory[QUIET_FOR] > hold and _last_sum(memory, hold, widths) < leave:
-            # The sums start anew, the noise goes on.
+            # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG] = 0.0
             memory[SUM:] = 0.0
             memory[COUNT] = 1.0
@@ -87,7 +84,7 @@ def flag_update(
     leave,
     hold,
 ):
-    """One sample, in place; whether there is contact. `ContactDetector.settings` are the last."""
+    """Update by one sample with `ContactDetector.settings`; return whether there is contact."""
     detection_update(
         memory, contact, s, omega, alpha, acceleration, *parameters, slack, following, leave
     )
@@ -104,23 +101,21 @@ def _flags(memory, rows, settings, out):
 
 
 class ContactDetector:
-    """Says at each sample whether something is touched (module docstring).
+    """Contact detector for a stream of samples.
 
-    What it knows is a `memory` (an array), which can be kept outside, as in the state of a Drake
-    system: `initial_memory`, `flag_update(memory, ..., *settings)`.
+    `flag_update(memory, ..., *settings)` works on external memory, such as a Drake state.
 
     Args:
         floor: of the free motion.
-        threshold: of the chosen statistic; see `free_threshold`.
+        threshold: of the statistic, such as `NoiseFloor.threshold`.
         statistic: one of `STATISTICS`.
-        leave: level below which contact may end.
-        hold: samples of quiet after which it has ended.
-        slack: of the cumulative sum.
-        following: share by which the mean of F_c, which is taken away, follows each sample while
-            the level is below `leave`: period over time constant, or 0 for no mean.
+        leave, hold: level, and samples below it, before contact ends.
+        slack: of the cumulative sum [standard deviations].
+        following: period over time constant of the subtracted mean of F_c, updated while the level
+            is below `leave`; 0 for no mean.
 
     Raises:
-        DrakeTeleopError: for another statistic or values that are not positive.
+        DrakeTeleopError: for an unknown statistic or values outside their range.
     """
 
     def __init__(
@@ -140,13 +135,13 @@ class ContactDetector:
             raise DrakeTeleopError(f"{following} is not within [0, 1)", where="following")
         sums = float(positive("slack", slack)), float(following)
         decision = column, enter, low, int(hold)
-        #: The last arguments of `flag_update`, the kernel of this class.
+        #: Last arguments of `flag_update`.
         self.settings = (floor.parameters, *sums, *decision)
         self._memory = self.initial_memory()
 
     @staticmethod
     def initial_memory() -> Array:
-        """The memory before the first sample, (n,)."""
+        """Return the memory (n,) before the first sample."""
         return np.zeros(SIZE)
 
     def update(
@@ -157,11 +152,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> bool:
-        """Takes one sample, (6,) and (3,) each as for `statistics`; whether there is contact.
-
-        Raises:
-            DrakeTeleopError: for other shapes or numbers that are not finite.
-        """
+        """Update by one sample as for `statistics`; return whether there is contact."""
         parts = {"s": s, "omega": omega, "alpha": alpha, "acceleration": acceleration}
         motion = [checked(name, value, 3) for name, value in parts.items()]
         wrench = checked("contact", contact, 6)
@@ -175,7 +166,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> NDArray[np.bool_]:
-        """`update` with each of N samples of a log, in a compiled loop; (N,) flags."""
+        """Return the flags (N,) of N samples of a log, updating as `update` does."""
         rows = checked_motion(
             contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration
         )

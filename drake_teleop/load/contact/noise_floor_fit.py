@@ -1,4 +1,4 @@
-"""Fitting the noise floor to a record of free motion."""
+"""Fit of the noise floor to a record of free motion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from drake_teleop.load.contact.memory import LENGTHS
 from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, write_sigmas
 from drake_teleop.load.contact.statistics import statistics
 
-# A noise floor below this counts as this [N, N m]: as in `logs.contact`.
+# Lower limit of a noise floor [N, N m], as in `logs.contact`.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 _FITS, _SETTLED = 20, 1e-4
 _HIGHEST_RHO, _NARROWEST, _RARE = 0.999, 0.1, 1e-3
@@ -29,20 +29,19 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """The noise floor of a record of free motion, the faster the better.
+    """Return the noise floor of a record of free motion, the faster the better.
 
-    The squares of each channel are explained by 1, |a|^2 and |alpha|^2 with coefficients >= 0, on
-    top of what the parameters' covariance explains; samples weigh by their own floor (as for normal
-    noise, whose squares vary in proportion), so the fit is repeated until that settles.
+    Squares of each channel are explained by 1, |a|^2 and |alpha|^2, in addition to P. Weights are
+    iterated, because squares of normal noise scatter in proportion to their mean.
 
     Args:
-        contact: (N, 6) F_c where nothing is touched, N samples in order [N, N m].
+        contact: (N, 6) F_c without contact [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
         covariance: (16, 16) as of `finite_covariance`.
         fade: of `NoiseFloor`.
 
     Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or fewer than 100 samples.
+        DrakeTeleopError: for fewer than 100 samples.
     """
     from scipy.optimize import nnls
 
@@ -68,7 +67,7 @@ def fit_noise_floor(
         for _ in range(_FITS):
             before = found[c].copy()
             weighted = np.column_stack([terms, square - given]) / variance[:, None]
-            R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem, of four rows
+            R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
             found[c] = nnls(R[:, :3], R[:, 3])[0]
             found[c, 0] = max(found[c, 0], _RESOLUTION[c] ** 2)
             variance = terms @ found[c] + given
@@ -81,7 +80,7 @@ def fit_noise_floor(
     deviations = np.sqrt(np.mean(scaled**2, axis=0))
     least = np.maximum(deviations, 1e-6)
     power = scaled.T @ scaled / len(scaled) / np.outer(least, least)
-    # A channel without noise of its own is still one of six.
+    # Keeps the correlation positive definite if a channel has no independent noise.
     correlation = 0.999 * power + 0.001 * np.eye(6)
     np.fill_diagonal(correlation, 1.0)
     z = scaled @ np.linalg.inv(np.linalg.cholesky(correlation)).T
@@ -93,7 +92,7 @@ def fit_noise_floor(
     squares = [np.sum((sums[n:] - sums[:-n]) ** 2, axis=1) / n for n in lengths]
     power = np.array([square.mean() for square in squares]) / 6.0
     rare = np.array([np.quantile(square, 1.0 - _RARE) for square in squares])
-    # Among the few long sums of a short record rare ones may be small by chance, the power is not.
+    # A short record has few long sums: their quantile can be small by chance, their power is not.
     rare /= max(rare[0], 1e-12)
     widths = np.sqrt(np.maximum(np.maximum(power, rare), _NARROWEST**2))
     floor = replace(floor, correlation=correlation, rho=rho, widths=widths)

@@ -1,4 +1,4 @@
-"""How good a detector is: thresholds, false alarms, detections and delays."""
+"""Quality of a detector: thresholds, false alarms, detections and delays."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 def free_threshold(free: ArrayLike, share: float = 0.0) -> float:
-    """The least threshold that at most this share of the samples of free motion reach.
+    """Return the least threshold reached by at most this share of free-motion samples.
 
     Args:
-        free: (N,) a statistic in free motion.
+        free: (N,) statistic in free motion.
         share: of false alarms, 0 to 1.
     """
     ordered = np.sort(np.asarray(free, float))[::-1]
     allowed = math.floor(share * len(ordered))
-    # An alarm is a statistic that reaches the threshold, so this is just above the next value.
+    # A statistic equal to the threshold is an alarm, so the threshold is just above the next value.
     return float(np.nextafter(ordered[allowed], np.inf)) if allowed < len(ordered) else -math.inf
 
 
 def roc(free: ArrayLike, touched: ArrayLike) -> tuple[Array, Array, Array]:
-    """The receiver operating characteristic of a statistic.
+    """Return the receiver operating characteristic of a statistic.
 
     Args:
-        free, touched: (N,), (M,) the statistic in free motion and in contact.
+        free, touched: (N,), (M,) statistic in free motion and in contact.
 
     Returns:
-        false_alarms, detections: (K,) shares that reach each threshold, both from 0 to 1.
-        thresholds: (K,) descending, the first inf.
+        Shares (K,) of false alarms and detections, and descending thresholds (K,), the first inf.
 
     Raises:
         DrakeTeleopError: if either is empty or not finite.
@@ -44,7 +43,7 @@ def roc(free: ArrayLike, touched: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def auc(free: ArrayLike, touched: ArrayLike) -> float:
-    """Area under `roc`: how often a sample in contact exceeds one in free motion, ties half."""
+    """Return the area under `roc`: share of pairs with contact above free motion, ties half."""
     false_alarms, detections, _ = roc(free, touched)
     return float(np.trapezoid(detections, false_alarms))
 
@@ -59,18 +58,14 @@ def _samples(name: str, value: ArrayLike) -> Array:
 def detection_delays(
     alarms: ArrayLike, starts: ArrayLike, stops: ArrayLike, period: float = 1.0
 ) -> Array:
-    """How long after the beginning of each contact the alarm is first on.
+    """Return the delays (K,) of the first alarm in each contact [s]; NaN for a missed contact.
 
-    An alarm that is on at the beginning already is a false one that happens to last: it counts with
-    delay 0 here, and as false where false alarms are counted.
+    An alarm that is already on at the start counts as delay 0.
 
     Args:
         alarms: (N,) flags.
         starts, stops: (K,) first sample of each contact, and the first after it.
         period: between samples [s].
-
-    Returns:
-        (K,) delays [s]; NaN for contacts that were missed.
     """
     on = np.asarray(alarms, bool)
     delays = np.full(len(np.atleast_1d(starts)), np.nan)

@@ -1,27 +1,12 @@
-"""What tells contact in the eliminated wrench, sample by sample, each compared with a threshold::
+"""Statistics for contact in the eliminated wrench (`noise_floor` defines z and e).
 
-    level    |z|, the plain threshold; its square is chi-squared of six degrees of freedom
-    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): the cumulative sum for a shift of the
-             mean in an unknown direction (Crosier, Technometrics 30, 1988). Shifts below the slack
-             [standard deviations] are never noticed, and never add up
-    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)): the generalised likelihood ratio
-             for a shift of unknown size, direction and onset (Lorden 1971; Willsky and Jones 1976),
-             the root of twice its logarithm. n are the powers of two up to `WINDOW`, so that a
-             sample costs little however long the window; one of them gives at least 2^(-1/4) of
-             what the best n would
+    level    |z|; its square is chi-squared with six degrees of freedom
+    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
+             30, 1988)
+    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
+             generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
 
-z is the wrench over its noise floor, decorrelated, and e are its innovations (`noise_floor`).
-
-The w_n are 1 if e is white. What is left of the load's wrench changes as slowly as the motion, more
-slowly than rho tells, and adds up over long sums: w_n is by how much such sums exceeded those of
-white noise in free motion, or rare ones a rare e, whichever is more. Without it the errors of the
-load would set the threshold for all n; with it all n reach about the same in free motion, n = 1 is
-the plain threshold, and the others notice weaker contacts at the same rate of false alarms
-(benchmarks/contact_detection.py).
-
-**Drift.** Long sums notice half a standard deviation, and in minutes a force sensor drifts as far.
-So r may be taken about a mean of its own past, which follows with a time constant of some seconds
-while the level is low: a push that is so weak and lasts so long cannot be told from drift.
+w_n is the width of such sums in free motion; it accounts for slow errors of the load.
 """
 
 from __future__ import annotations
@@ -55,8 +40,8 @@ from drake_teleop.load.contact.noise_floor import (
 )
 
 SLACK = 1.0
-"""Of the cumulative sum [standard deviations]. Half of the shift to be noticed is best in white
-noise; this much lets lasting errors of the load pass (benchmarks/contact_detection.py)."""
+"""Slack of the cumulative sum [standard deviations]. In white noise, half of the smallest shift to
+detect is best; this value tolerates lasting errors of the load."""
 RARE = 6.2
 """Level that normal noise reaches once in a million samples."""
 LEAVE = 0.7 * RARE
@@ -82,17 +67,14 @@ def detection_update(
     following,
     quiet,
 ):
-    """One sample, in place: memory[5:8] are then the three `STATISTICS`; compiled, checks nothing.
+    """Update by one sample and write the `STATISTICS` to memory[5:8]; compiled, without checks.
 
     Args:
         memory: (SIZE,), zeros before the first sample.
         contact: (6,) F_c of Eq. (13).
         s, omega, alpha, acceleration: (3,) as for `NoiseFloor.sigma`.
         variances, P, growth, root, rho, widths, fade: `NoiseFloor.parameters`.
-        slack: of the cumulative sum.
-        following: share by which the mean of F_c follows each sample while the level is below
-            `quiet`; 0 for no mean.
-        quiet: see there.
+        slack, following, quiet: as for `ContactDetector`, quiet for leave.
     """
     V, scaled = np.empty((6, 10)), np.empty(6)
     hold_peaks(memory, acceleration, alpha, fade)
@@ -107,7 +89,7 @@ def detection_update(
         z = 0.0
         for j in range(i + 1):
             z += root[i, j] * scaled[j]
-        # Nothing is known before the first sample: it stands by itself.
+        # The first sample has no predecessor.
         e = z if count == 0 else (z - rho[i] * memory[Z + i]) / math.sqrt(1.0 - rho[i] * rho[i])
         memory[Z + i] = z
         level += z * z
@@ -121,7 +103,7 @@ def detection_update(
     shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
     for i in range(6):
         memory[SUM + i] *= shrink
-    # Before the first sample of all the sum is zero, as is what the ring holds then.
+    # The sum before the first sample is zero, as is the initial ring.
     here = RING + 6 * (count % WINDOW)
     best, n = 0.0, 1
     for m in range(LENGTHS):
@@ -165,20 +147,12 @@ def statistics(
     slack: float = SLACK,
     following: float = 0.0,
 ) -> Array:
-    """The three `STATISTICS` of each sample of a log, without hysteresis.
+    """Return the `STATISTICS` (N, 3) of each sample of a log, without hysteresis.
 
     Args:
-        floor: of the free motion.
         contact: (N, 6) F_c of Eq. (13) [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
-        slack: of the cumulative sum [standard deviations].
-        following: share by which the mean of F_c follows each sample, see `ContactDetector`.
-
-    Returns:
-        (N, 3).
-
-    Raises:
-        DrakeTeleopError: for other shapes or numbers that are not finite.
+        floor, slack, following: as for `ContactDetector`.
     """
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     out = np.empty((len(rows[0]), 3))

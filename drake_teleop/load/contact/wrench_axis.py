@@ -1,4 +1,4 @@
-"""What a contact's wrench says about where the contact is."""
+"""Location of a contact from its wrench."""
 
 from __future__ import annotations
 
@@ -10,18 +10,9 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """The central axis of a wrench: f along it, and a moment parallel to f (Poinsot).
+    """Return direction (..., 3), nearest point (..., 3) [m] and pitch (...) [m] of a wrench's axis.
 
-    With the contact wrench of Eq. (13), which is what the sensor exerts beyond the load's motion,
-    the environment pushes the tool with -f along the same line.
-
-    Args:
-        wrench: (..., 6) about So in S [N, N m].
-
-    Returns:
-        direction: (..., 3) f / |f|; NaN where f = 0, as for the others;
-        point: (..., 3) of the axis nearest to So [m];
-        pitch: (...) f . tau / |f|^2 [m]: the couple in the contact or in the load's error.
+    Poinsot's central axis of (..., 6) in S; the point is nearest to So. NaN where f = 0.
     """
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]
@@ -32,21 +23,18 @@ def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def point_on_tool(wrench: ArrayLike, origin: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
-    """Where along the tool a pure force must act to explain a wrench best.
-
-    Least squares of the moments: the x in tau = (origin + x u) x f + rest with the least |rest|.
+    """Return where on the tool's axis a pure force explains a wrench best, and the moment left.
 
     Args:
         wrench: (..., 6) about So in S [N, N m].
         origin: (3,) a point of the tool's axis in S [m].
-        axis: (3,) its direction u in S, of any length.
+        axis: (3,) its direction in S, of any length.
 
     Returns:
-        x: (...) distance from `origin` along the axis [m]; NaN for a force along the axis;
-        rest: (...) |moment| that no point of the axis explains [N m].
+        Distance (...) from `origin` [m], NaN for a force along the axis; rest (...) [N m].
 
     Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or an axis of length 0.
+        DrakeTeleopError: for an axis of length 0.
     """
     w = checked("wrench", wrench, 6, leading=True)
     q, u = checked("origin", origin, 3), checked("axis", axis, 3)
