@@ -1,8 +1,6 @@
-"""The gripped object alone: phi_obj = phi_total - phi_gr with its uncertainty (section V, Eq. 14).
+"""Gripped object as the difference of two identifications, Eqs. (14), (T8) and (T9).
 
-Parameters of parts add as long as both are about the same origin in the same sensor frame S, and
-nothing in two identifications tells whether they were: a sensor that was turned or remounted
-between them gives a difference that may look like a body. Use two records of one mounting.
+Both must refer to the same So in the same S: use two records of one mounting.
 """
 
 from __future__ import annotations
@@ -18,29 +16,19 @@ from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.inertia import pseudo_inertia
 
 SIGNIFICANT = 3.0
-"""Standard deviations below zero from which on a quantity counts as negative."""
+"""Standard deviations below zero at which a mass counts as negative."""
 
 _PHI = np.arange(16) >= 6
 
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
-    """What was identified of the object, from gripper with object and gripper alone.
+    """Return the object's identification: gripper with object minus gripper alone.
 
-    The two come from different records, so that their errors are independent and covariances of
-    phi add. Offsets (with their covariances) are those of the sensor in the record with the object.
-    A parameter that one of the two leaves undetermined is undetermined in the difference; which
-    are identifiable is judged by the object's own mass and size, and a parameter that the total
-    does not show cannot be one of them. Degrees of freedom are Satterthwaite's for the sum of two
-    variances. Condition number, delay, residual, method and samples are those of the record with
-    the object.
-
-    Args:
-        total: gripper with object.
-        gripper: gripper alone, about the same origin in the same frame S (module docstring).
+    Covariances of phi add. All fields that do not concern phi are those of `total`.
 
     Raises:
-        DrakeTeleopError: if the object's mass is negative by more than `SIGNIFICANT` standard
-            deviations, or exactly zero.
+        DrakeTeleopError: if the object's mass is zero, or negative by more than `SIGNIFICANT`
+            standard deviations.
     """
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
@@ -68,7 +56,7 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
 
 
 def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
-    """(16,) of the sums of two variances, by Satterthwaite; offsets are those of the total."""
+    """Return (16,) Satterthwaite degrees of freedom; those of the total for offsets."""
     a, b = (np.diag(load.covariance) for load in (total, gripper))
     b = np.where(_PHI, b, 0.0)
     known = np.isfinite(a + b) & (a + b > 0.0)
@@ -79,18 +67,10 @@ def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """How far a load is inside (> 0) or outside the set of possible bodies, and how sure that is.
+    """Return the smallest eigenvalue of the pseudo-inertia and its standard deviation, Eq. (T9).
 
-    The smallest eigenvalue of the pseudo-inertia (Wensing, Kim, Slotine 2018), in units of the
-    load's mass and of its radius of gyration about So, and its standard deviation to first order:
-    with the eigenvector v the eigenvalue changes by v^T J(d phi) v.
-
-    Args:
-        load: about any origin.
-
-    Returns:
-        the eigenvalue and its standard deviation, both without unit; the latter is inf if
-        the record does not determine all of phi.
+    In units of mass and radius of gyration about So; positive for a consistent load. The standard
+    deviation is inf if phi is not fully determined.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

@@ -1,45 +1,9 @@
-"""The load and the sensor's offsets from a record: batch least squares, Eqs. (7)-(8).
+"""Load and sensor offsets of a record by batch least squares, Eqs. (7)-(8), (T3) and (T16).
 
-The measured wrench of a free motion is F = [E V] [F_o; phi] + residual. `NormalEquations` sums what
-least squares needs over any number of samples, chunk by chunk, and never builds the stacked matrix.
-
-**Directions.** Columns are scaled to unit norm and the Gram matrix is decomposed. Directions with
-an eigenvalue below 1e-12 of the largest are undetermined: that is 1e-6 in terms of the regressor,
-which no sensor resolves, and where the rounding of the sums begins. The solution has no component
-there (minimum norm), and a parameter that has one is undetermined: its variance is infinite.
-
-**Coloured residuals.** Residuals of real records are coloured (filters, vibration, drift), so that
-N samples are worth far fewer. With the noise of channel c stationary and independent of the motion,
-and its spectrum flat over the frequencies of the motion, the covariance of the solution is that of
-white noise with the long-run variance v_c (spectral density at zero) in place of the variance of a
-sample: C = G^+ (sum_c w_c^2 v_c G_c) G^+, G_c the Gram matrix of channel c and w_c its weight.
-Noise that is strongest at low frequency makes this cautious for fast motion. v_c comes from blocks
-of n samples whose sums were kept (batch means):
-
-- The residual's power between the B blocks, q_c = sum_b (sum of residual)^2 / n, would be B v_c on
-  average, but the fit has taken part of it away, most at the low frequencies of the motion, where
-  blocks look. With H_c the Gram matrix of the blocks' means, E q_c = v_c (B - 2 w_c tr(H_c G^+))
-  + sum_k w_k^2 v_k tr(H_c G^+ G_k G^+): six linear equations whose solution has no such bias.
-- The length is the first of 1, n, 2 n, 4 n, ... that is at least `_WINDOW` times the noise's memory
-  T = v_c / (variance of a sample), T estimated at that length: the automatic windowing of Sokal
-  (Monte Carlo Methods in Statistical Mechanics, 1997, section 3) applied to batch means. Blocks
-  miss what correlates across their borders; for an AR(1) process that is T / (2 n) of v_c, which is
-  put back. If no length with `_FEWEST_DEGREES` degrees of freedom is long enough (drift), the
-  largest v_c of all lengths is taken: it is then still a lower bound.
-- Noise may also be weaker at low frequencies than from sample to sample, as that of accelerations
-  that were fused with encoders. Short blocks do not see that. The longest blocks are therefore
-  looked at that leave `_MANY_DEGREES` and still see the motion (`_SEEN` of what the fit took away):
-  if their v_c is smaller by three of its standard deviations, it is the one.
-- v_c has about B - w_c tr(H_c G^+) degrees of freedom, few if the noise is slow. The variance of a
-  parameter is a weighted sum of the six v_c; Satterthwaite's formula gives its degrees of freedom
-  nu, and an interval is +- t_nu times the standard deviation (`uncertainty.intervals`).
-  benchmarks/intervals.py counts how often such intervals hold.
-
-**Poses at rest** are few, and in no order. The three forces then share one noise and the three
-torques another, from all of their residuals and the degrees of freedom that the fit leaves. Poses
-with the same orientation show what repeats: if the others deviate from the fit by significantly
-more (F test at `_ALPHA`), the error belongs to the orientation, and repeating it adds no
-information. The variance is then that between orientations. It is never below that of rounding.
+Scaled Gram eigenvalues below 1e-12 of the largest count as zero: the solution has minimum norm
+there, and affected parameters are undetermined. The covariance uses long-run variances from sums
+over blocks, or for poses at rest one variance for forces and one for torques. Derivation:
+docs/theory.md, "Details of the estimators".
 """
 
 from __future__ import annotations
@@ -54,35 +18,34 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.regressor import regressor_into
 
-# Rank: smallest eigenvalue of the scaled Gram over the largest, component of a parameter in the
-# null space, and excitation of a column [m/s^2, rad/s^2] below which it counts as none.
+# Smallest relative eigenvalue of the scaled Gram, largest component of a determined parameter in
+# the null space, and smallest excitation of a column [m/s^2, rad/s^2].
 _RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
-# Blocks kept, least length of a block in memories of the noise, degrees of freedom to be trusted.
+# Number of blocks, smallest block length over the noise's correlation time, fewest degrees of
+# freedom of a usable variance.
 _MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
-# For noise that is weaker at low frequencies: degrees of freedom, share of the motion that is seen.
+# For noise that is weaker at low frequencies: fewest degrees of freedom, and smallest share of the
+# fit's degrees of freedom that the blocks contain.
 _MANY_DEGREES, _SEEN = 20.0, 0.9
 _FEWEST_SAMPLES = 3
-# Poses of one orientation: difference of specific force [m/s^2]; level of the F test.
+# Largest difference of specific force in one orientation [m/s^2], and level of the F test.
 _SAME_POSE, _ALPHA = 0.05, 0.01
-# Residual over wrench that rounding of the sums may leave.
+# Largest relative residual that is rounding of the sums.
 _ROUNDING = 1e-6
-# Where the wrench and the factors of [offset, phi] stand in x of the sums.
+# Indices of the wrench and of the factors of [offset, phi] in x.
 _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
 
 
 class NormalEquations:
-    """Sums over a record from which the load follows, in memory that does not grow with it.
+    """Sums of a record that determine the load; memory does not depend on its length.
 
-    Samples have to come in the order of time: the variances are judged from consecutive blocks.
+    Samples must be added in the order of time.
 
     Args:
-        noise: (6,) standard deviations of the wrench channels [N, N m], for the weights. None
-            gives every row the same weight, in N and N m alike.
-        resolution: (2,) step of the numbers of forces and torques [N, N m], if the samples are
-            poses at rest; None for samples in the order of time.
-
-    Raises:
-        DrakeTeleopError: if a standard deviation is not a positive number.
+        noise: (6,) standard deviations of the wrench channels [N, N m], for the weights; None
+            gives every row the same weight.
+        resolution: (2,) quantisation step of forces and torques [N, N m] if the samples are poses
+            at rest.
     """
 
     def __init__(
@@ -90,39 +53,27 @@ class NormalEquations:
     ) -> None:
         self._resolution = resolution
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
-        # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)]; and its first row by blocks.
+        # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)], and its first row per block.
         self._moments = np.zeros((6, 12, 12))
         self._blocks = np.zeros((_MOST_BLOCKS, 6, 12))
-        # Block that is being filled, samples of a full block.
+        # Index of the open block, samples of a full block.
         self._state = np.array([0, 1])
 
     @property
     def samples(self) -> int:
-        """The number of samples so far."""
+        """Number of samples."""
         return int(self._moments[0, 0, 0])
 
     def add(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Adds samples.
-
-        Args:
-            wrench: (N, 6) or (6,) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-            s, omega, alpha: (N, 3) or (3,) specific force [m/s^2], angular velocity [rad/s] and
-                acceleration [rad/s^2] of S in S.
-
-        Raises:
-            DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
-        """
+        """Add samples (N, 6) and (N, 3), or one (6,) and (3,), as for `identify`."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         _accumulate(*rows, self._moments, self._blocks, self._state)
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Least squares with the six offsets.
-
-        Args:
-            delay_s: the delay that was taken out of the motion, for the record [s].
+        """Return the least squares solution; `delay_s` [s] is stored in it.
 
         Raises:
-            DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
+            DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
         """
         if self.samples < _FEWEST_SAMPLES:
             raise DrakeTeleopError(
@@ -154,22 +105,21 @@ class NormalEquations:
         )
 
     def covariance(self) -> Array:
-        """(16, 16) covariance of the least squares solution of minimum norm, columns scaled.
+        """Return the covariance C (16, 16) of the minimum-norm solution, without infinite entries.
 
-        Unlike `Identification.covariance` it has no infinite entries: the variance c^T C c of a
-        combination c that the record determines is right even if its parts are undetermined.
+        c^T C c is the variance of a determined combination c.
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
 
     def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
-        """(16, 16) covariance without infinities and (16,) degrees of freedom of its diagonal."""
+        """Return the finite covariance (16, 16) and its diagonal's degrees of freedom (16,)."""
         variances, degrees, _ = self._long_run_variances(theta, inverse)
-        # What each channel adds to the covariance, and Satterthwaite's degrees of freedom.
+        # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
         parts = inverse @ parts @ inverse
         shares = np.diagonal(parts, axis1=1, axis2=2)
-        if self._resolution is not None:  # three channels have one variance
+        if self._resolution is not None:  # three channels share one variance
             shares, degrees = shares.reshape(2, 3, 16).sum(axis=1), degrees[::3]
         total, of_squares = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
         known = (total > 0.0) & (of_squares > 0.0)
@@ -181,12 +131,7 @@ class NormalEquations:
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Gram (16, 16) and right-hand side (16,) of [E V], sums over the rows.
-
-        Args:
-            weights: (6,) of the squares of each wrench channel [1/N^2, 1/(N m)^2]; default: those
-                of the noise given at the start.
-        """
+        """Return the Gram matrix (16, 16) and right-hand side (16,), for channel weights (6,)."""
         weights = self._weights if weights is None else checked("weights", weights, 6)
         gram, right = np.tensordot(weights, self._channel_grams(), 1), np.zeros(16)
         for c, weight in enumerate(weights):
@@ -194,7 +139,7 @@ class NormalEquations:
         return gram, right
 
     def _channel_grams(self) -> Array:
-        """(6, 16, 16) Gram matrices of the rows of each channel."""
+        """Return the Gram matrices (6, 16, 16) of the channels' rows."""
         grams = np.zeros((6, 16, 16))
         for c in range(6):
             grams[c][np.ix_(_columns(c), _columns(c))] = self._moments[c][np.ix_(_MODEL, _MODEL)]
@@ -202,21 +147,17 @@ class NormalEquations:
 
     @property
     def unexcited(self) -> NDArray[np.bool_]:
-        """(16,) parameters that had no part in the wrench at all, up to rounding."""
+        """Bools (16,): parameters without any influence on the wrench."""
         squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
         return np.sqrt(squares) < _NO_EXCITATION
 
     @property
     def weights(self) -> Array:
-        """(6,) of the squares of each wrench channel, from the noise given at the start."""
+        """Weights (6,) of the squared wrench channels."""
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        """(6,) sums of squared residuals; rounding leaves 1e-7 of the wrench in their roots.
-
-        Args:
-            theta: (16,) [offsets; phi].
-        """
+        """Return the sums (6,) of squared residuals."""
         theta = checked("theta", theta, 16)
         squares = np.empty(6)
         for c in range(6):
@@ -225,24 +166,15 @@ class NormalEquations:
         return squares
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Long-run variances of the channels' residuals, for any estimate (module docstring).
+        """Return long-run variances (6,) of the residuals, and their degrees of freedom (6,).
 
-        Args:
-            theta: (16,) [offsets; phi].
-
-        Returns:
-            (6,) variances of a sample by which the mean of many scatters [N^2, N^2 m^2], corrected
-            for what least squares with the present weights takes from the residuals, and (6,) their
-            degrees of freedom.
+        They are corrected for the power that least squares removes.
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 
     def slow_noise(self) -> NDArray[np.bool_]:
-        """(6,) channels whose noise remembers longer than the record can tell, as drift does.
-
-        The standard deviations that follow from them are lower bounds.
-        """
+        """Return (6,) bools: noise is slower than the record resolves, deviations are too small."""
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
 
@@ -257,13 +189,13 @@ class NormalEquations:
             return *self._of_poses(power, absorbed, theta), np.zeros(6, dtype=bool)
         variances, degrees = self._unbiased(power, n, grams, grams, inverse)
         of_samples = variances
-        # Rounding in the sums is no noise of the wrench.
+        # Rounding in the sums must not count as noise of the wrench.
         wrench = self._moments[:, _WRENCH, _WRENCH]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
         absorbed_by_samples = self._absorbed(grams, inverse)
         of_longest, degrees_of_longest = variances, degrees
         blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
-        # An unfinished last block would count as much as a full one.
+        # An unfinished last block would have the weight of a full one.
         blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
         while len(blocks) > _FEWEST_DEGREES:
             model = blocks[:, :, 0] * theta[:6] + blocks[:, :, 2:] @ theta[6:]
@@ -291,20 +223,14 @@ class NormalEquations:
             slow = np.where(usable, significant & ~found, slow & ~found)
             even = len(blocks) // 2 * 2
             blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
-        # Logarithms of estimated variances scatter by sqrt(2 / degrees), and about normally.
+        # The logarithm of an estimated variance is nearly normal, with deviation sqrt(2 / degrees).
         weaker = found & (of_longest * np.exp(3.0 * np.sqrt(2.0 / degrees_of_longest)) < variances)
         variances = np.where(weaker, of_longest, variances)
         degrees = np.where(weaker, degrees_of_longest, degrees)
         return variances, degrees, slow & (n * of_samples > _ROUNDING**2 * wrench)
 
     def _of_poses(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
-        """(6,) variances of poses at rest and (6,) their degrees of freedom (module docstring).
-
-        Args:
-            power: (6,) sums of squared residuals.
-            absorbed: (6,) degrees of freedom that the fit takes from them.
-            theta: (16,) [offsets; phi].
-        """
+        """Return the variances (6,) of poses at rest, and their degrees of freedom (6,)."""
         assert self._resolution is not None
         squares, lost = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
         least = np.array(self._resolution) ** 2 / 12.0
@@ -329,17 +255,17 @@ class NormalEquations:
         return variances.repeat(3), degrees.repeat(3)
 
     def _absorbed(self, between: Array, inverse: Array) -> Array:
-        """(6,) degrees of freedom that the fit takes from the residuals between blocks."""
+        """Return the degrees of freedom (6,) that the fit removes from block residuals."""
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
     def _unbiased(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array]:
-        """(6,) v_c and (6,) degrees of freedom from the residual's power between `count` blocks.
+        """Return long-run variances v_c (6,) and degrees of freedom (6,).
 
         Args:
-            power: (6,) q_c of the module's docstring.
-            between: (6, 16, 16) H_c; grams: (6, 16, 16) G_c; inverse: (16, 16) G^+.
+            power: (6,) residual power between `count` blocks, q_c in docs/theory.md.
+            between, grams: (6, 16, 16) H_c and G_c; inverse: (16, 16) G^+.
         """
         w = self._weights
         absorbed = self._absorbed(between, inverse)
@@ -350,7 +276,7 @@ class NormalEquations:
         if not (degrees > 0.0).all() or np.linalg.cond(equations) > 1e6:
             return power / np.maximum(degrees, 1.0), degrees
         solution = np.linalg.solve(equations, power)
-        # Noise in q_c can make a small one negative, where the others' errors dominate it.
+        # Errors of the other channels can make a small solution negative.
         return np.maximum(solution, power / count), degrees
 
 
@@ -363,18 +289,16 @@ def identify(
     noise: ArrayLike | None = None,
     delay_s: float = 0.0,
 ) -> Identification:
-    """Load and sensor offsets of a free motion by batch least squares, Eqs. (7)-(8).
+    """Return load and offsets of a free motion by batch least squares, Eqs. (7)-(8).
 
     Args:
-        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        s, omega, alpha: (N, 3) specific force a - g [m/s^2], angular velocity [rad/s] and angular
-            acceleration [rad/s^2] of S in S, at the same instants; zeros (3,) for static poses.
-        noise: (6,) standard deviations of the wrench channels, for the weights; None: unweighted.
-        delay_s: the delay that was taken out of the motion, for the record [s].
+        wrench: (N, 6) measured [f; tau], sign of Eq. (1) [N, N m].
+        s, omega, alpha: (N, 3) as for `regressor`, or (3,) zeros for static poses.
+        noise: (6,) standard deviations of the wrench channels; None: unweighted.
+        delay_s: delay that was removed from the motion, stored in the result [s].
 
     Raises:
-        DrakeTeleopError: for arrays of another shape, numbers that are not finite, fewer than
-            3 samples, or a wrench that is zero throughout.
+        DrakeTeleopError: as `NormalEquations.solve`.
     """
     equations = NormalEquations(noise)
     equations.add(wrench, s, omega, alpha)
@@ -382,18 +306,17 @@ def identify(
 
 
 def _columns(channel: int) -> NDArray[np.int_]:
-    """Columns of [E V] that a row of this channel may use: its offset and phi."""
     return np.array([channel, *range(6, 16)])
 
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
-    """Adds sum x x^T, x = [1, wrench, row of V], by channel to moments (6, 12, 12), and the sums of
-    x by blocks of samples to blocks (_MOST_BLOCKS, 6, 12).
+    """Add sums of x x^T, x = [1, wrench, row of V], per channel and per block of samples.
 
-    Rows of force have no inertia in them: their sums end with the first moments. Sums are gathered
-    block by block, which keeps their rounding small. When the table of blocks is full, neighbours
-    are joined. state: the block that is being filled, and how many samples a full one has.
+    Args:
+        moments: (6, 12, 12), updated.
+        blocks: (n, 6, 12), updated; a full table is halved by joining pairs.
+        state: (2,) index of the open block, samples of a full block; updated.
     """
     V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
     x[0] = 1.0
@@ -426,7 +349,6 @@ def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
 
 @njit(cache=True)
 def _flush(part, moments, block):
-    """Adds the upper halves of part (6, 12, 12) to moments, their first rows to block; clears."""
     for c in range(6):
         for j in range(12):
             block[c, j] += part[c, 0, j]
@@ -440,7 +362,7 @@ def _flush(part, moments, block):
 def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_], float]:
-    """(inverse, undetermined (16,), condition number) of a Gram matrix, columns scaled."""
+    """Return pseudo-inverse, undetermined parameters (16,) and condition number of a Gram."""
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _RANK * eigenvalues[-1]

@@ -1,17 +1,7 @@
-"""The non-contact wrench of a load: the matrix V of Eq. (5) and the Newton-Euler Eqs. (1)-(2).
+"""Non-contact wrench of a load: matrix V of Eq. (5) and Newton-Euler Eqs. (1)-(2).
 
-Everything is expressed in the sensor frame S, about its origin So. The wrench is what the sensor
-exerts on the load: at rest f = -m g. The motion enters as
-
-- s: specific force a - g of So [m/s^2] (a real accelerometer's reading, moved to So),
-- omega: angular velocity [rad/s],
-- alpha: angular acceleration [rad/s^2],
-
-and the load as phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] [kg, kg m, kg m^2] with the
-inertia about So and the products as entries of the tensor of Eq. (3).
-
-The ``..._into`` kernels are compiled, allocate nothing and check nothing; the functions without
-that suffix check their input and run the same kernels over any number of samples.
+All vectors are in the sensor frame S about its origin So. The sensor exerts the wrench on the load;
+at rest f = -m g. Functions named `..._into` are compiled and do not check their input.
 """
 
 from __future__ import annotations
@@ -26,7 +16,7 @@ from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, ti
 
 @njit(cache=True)
 def regressor_into(s, omega, alpha, V):
-    """Writes V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
+    """Write V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
     sx, sy, sz = s[0], s[1], s[2]
     wx, wy, wz = omega[0], omega[1], omega[2]
     ax, ay, az = alpha[0], alpha[1], alpha[2]
@@ -49,7 +39,7 @@ def regressor_into(s, omega, alpha, V):
 
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Writes V phi, Eqs. (1)-(2), into out (6,) without building V. phi may be a tuple."""
+    """Write V phi, Eqs. (1)-(2), into out (6,) without V. phi may be a tuple."""
     s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
     m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
     force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
@@ -72,19 +62,12 @@ def _non_contact_wrenches(s, omega, alpha, phi, out):
 
 
 def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
-    """V of Eq. (5), with [f; tau] = V phi.
+    """Return V (..., 6, 10) of Eq. (5), with [f; tau] = V phi.
 
     Args:
         s: (..., 3) specific force a - g of So in S [m/s^2].
         omega: (..., 3) angular velocity of S in S [rad/s].
         alpha: (..., 3) angular acceleration of S in S [rad/s^2].
-
-    Returns:
-        (..., 6, 10). For many samples this is large: `non_contact_wrench` and
-        `normal_equations.NormalEquations` do without it.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
     """
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     V = np.empty((motion[0].shape[0], 6, 10))
@@ -93,17 +76,9 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
 
 
 def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: ArrayLike) -> Array:
-    """The wrench [f; tau] that moves the load, Eqs. (1)-(2) and (12).
+    """Return the wrench V phi (..., 6) of Eqs. (1)-(2) and (12) [N, N m].
 
-    Args:
-        s, omega, alpha: (..., 3) as for `regressor`.
-        phi: (10,) the load about So in S.
-
-    Returns:
-        (..., 6) wrench of the sensor on the load about So in S [N, N m].
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+    Arguments as for `regressor`, and phi (10,) about So in S.
     """
     phi = checked("phi", phi, 10)
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))

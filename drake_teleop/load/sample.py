@@ -1,11 +1,9 @@
-"""Where what lies in a sample, one row of numbers: what the sensor tells, and the estimators use.
+"""Columns of a sample, one row of numbers for sensor, estimators and logs.
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
-     whether a channel was saturated | joint angles (n) | when it was taken]
+     saturated or lost | joint positions (n) | time]
 
-The first 15 numbers are also a sample of a log, and of the truth; the rest is the wrist sensor's.
-The time stands in what leaves the sensor, and not while the sample is made.
-Units and frame as everywhere: N, N m, m/s^2, rad/s, rad/s^2, at So in S; rad.
+Logs use the first 15. Only the output of the wrist sensor contains the time. SI, at So in S.
 """
 
 from __future__ import annotations
@@ -14,22 +12,21 @@ WRENCH = slice(0, 6)
 SPECIFIC_FORCE = slice(6, 9)
 ANGULAR_VELOCITY = slice(9, 12)
 ANGULAR_ACCELERATION = slice(12, 15)
-MOTION = slice(6, 15)  #: of S: specific force, angular velocity, angular acceleration
+MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
 WRENCH_AND_MOTION = slice(0, 15)
-SATURATED = 15  #: above 0.5 the wrench is not to be trusted
-#: From here on nothing is: there was no reading, or none that can be, and the sample is an old one.
-#: What it is more counts the samples for which that still shows.
+SATURATED = 15  #: above 0.5 the wrench is not valid
+#: At this value of SATURATED and above, the reading was lost or impossible: the sample is an old
+#: one. The excess counts the samples with remaining effects.
 LOST = 2.0
 BEFORE_JOINTS = 16
 JOINT_POSITION = slice(BEFORE_JOINTS, None)
-TIME = -1  #: of what leaves the wrist sensor [s]
-#: In the place of what only the wrist sensor tells, `drake_teleop.load.online.instrumental` has the
-#: motion a second time, from another sensor.
+TIME = -1  #: [s], only in the output of the wrist sensor
+#: Motion from a second source, only for `drake_teleop.load.online.instrumental`.
 INSTRUMENTS = slice(15, 24)
 
 
 def sample_parts(num_joints: int) -> dict[str, int]:
-    """The parts of a wrist sensor's sample by the names of their signals, with their sizes."""
+    """Return the parts of a wrist sensor's sample: signal name -> size."""
     return {
         "measured_wrench_S": 6,
         "specific_force_S": 3,
@@ -41,5 +38,5 @@ def sample_parts(num_joints: int) -> dict[str, int]:
 
 
 def sample_size(num_joints: int) -> int:
-    """How many numbers a wrist sensor's sample has, without its time."""
+    """Return the length of a wrist sensor's sample without its time."""
     return BEFORE_JOINTS + num_joints
