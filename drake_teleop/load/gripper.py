@@ -18,7 +18,7 @@ from drake_teleop.load.inertia import pseudo_inertia
 SIGNIFICANT = 3.0
 """Standard deviations below zero at which a mass counts as negative."""
 
-_PHI = np.arange(16) >= 6
+_IS_PHI = np.arange(16) >= 6
 
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
@@ -33,9 +33,9 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
     covariance[6:, 6:] += gripper.covariance[6:, 6:]
-    unknown = np.isinf(np.diag(covariance))
-    covariance[unknown, :] = covariance[:, unknown] = 0.0
-    covariance[unknown, unknown] = np.inf
+    undetermined = np.isinf(np.diag(covariance))
+    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
+    covariance[undetermined, undetermined] = np.inf
     deviations = np.sqrt(np.diag(covariance))
     if phi[0] < -SIGNIFICANT * deviations[6] or phi[0] == 0.0:
         raise DrakeTeleopError(
@@ -43,7 +43,7 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
             where="gripper",
             remedy="give the gripper alone as gripper, and the record with the object as the load",
         )
-    identifiable = worth_stating(deviations, phi) & ~unknown
+    identifiable = worth_stating(deviations, phi) & ~undetermined
     identifiable[6:] &= total.identifiable[6:]
     return replace(
         total,
@@ -51,19 +51,19 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
         covariance=covariance,
         identifiable=identifiable,
         degrees_of_freedom=_degrees_of_freedom(total, gripper),
-        prior_dominated=total.prior_dominated | gripper.prior_dominated & _PHI,
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_PHI,
     )
 
 
 def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
     """Return (16,) Satterthwaite degrees of freedom; those of the total for offsets."""
     a, b = (np.diag(load.covariance) for load in (total, gripper))
-    b = np.where(_PHI, b, 0.0)
-    known = np.isfinite(a + b) & (a + b > 0.0)
-    a, b = np.where(known, a, 1.0), np.where(known, b, 0.0)
+    b = np.where(_IS_PHI, b, 0.0)
+    finite = np.isfinite(a + b) & (a + b > 0.0)
+    a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
     with np.errstate(divide="ignore"):
         sums = (a + b) ** 2 / (a**2 / total.degrees_of_freedom + b**2 / gripper.degrees_of_freedom)
-    return np.where(known, sums, np.inf)
+    return np.where(finite, sums, np.inf)
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:

@@ -39,9 +39,9 @@ METHODS = (
 WORTH_STATING = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
-_WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
-_LARGEST = 1e9  # of any value in SI units; fourth powers must not overflow
-_OPTIONAL = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
+_WEAK, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
+_MAX_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
+_OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,12 +183,12 @@ class Identification:
         document = _read_json(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
-        for name in sorted((known ^ document.keys()) - (_OPTIONAL - document.keys())):
-            what = "is missing" if name in known else "is not a field of an identification"
-            raise DrakeTeleopError(what, where=f"{path}:{name}")
+        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
+            problem = "is missing" if name in known else "is not a field of an identification"
+            raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
         def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
-            if not _holds_numbers(document[name]):
+            if not _only_numbers(document[name]):
                 raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
             array = checked(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
@@ -206,17 +206,17 @@ class Identification:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
-        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_LARGEST))
+        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise DrakeTeleopError("has no mass", where=f"{path}:phi")
         result = cls(
             phi=phi,
-            offsets=numbers("offsets", 6, largest=_LARGEST),
+            offsets=numbers("offsets", 6, largest=_MAX_VALUE),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
             condition_number=float(numbers("condition_number")),
-            delay_s=float(numbers("delay_s", largest=_LARGEST)),
-            residual_rms=numbers("residual_rms", 6, largest=_LARGEST),
+            delay_s=float(numbers("delay_s", largest=_MAX_VALUE)),
+            residual_rms=numbers("residual_rms", 6, largest=_MAX_VALUE),
             method=document["method"],
             samples=int(numbers("samples")),
             **optional,
@@ -277,7 +277,7 @@ def natural_scale(phi: Array) -> Array:
     centre. The mass must not be zero.
     """
     m = abs(phi[0])
-    L = max(float(np.linalg.norm(phi[1:4])) / m, _SMALLEST_SIZE)
+    L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
     return scale
 
@@ -295,10 +295,10 @@ def _read_json(path: str | Path) -> dict[str, Any]:
     return document
 
 
-def _holds_numbers(value: Any) -> bool:
+def _only_numbers(value: Any) -> bool:
     """Return whether JSON data contains numbers only; NumPy would also convert "1" and true."""
     if isinstance(value, list):
-        return all(map(_holds_numbers, value))
+        return all(map(_only_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
@@ -310,7 +310,7 @@ def _read_covariance(where: str, value: Any) -> Array:
     if raw.shape != (16, 16):
         raise DrakeTeleopError("is not a (16, 16) table of numbers", where=where)
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
-    if not _holds_numbers(raw[~unknown].tolist()):
+    if not _only_numbers(raw[~unknown].tolist()):
         raise DrakeTeleopError("holds no numbers", where=where)
     covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
@@ -327,7 +327,7 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
 
 
 def _read_degrees(where: str, value: Any) -> Array:
-    if not (isinstance(value, list) and _holds_numbers([v for v in value if v is not None])):
+    if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
         raise DrakeTeleopError("is not a list of 16 numbers or null", where=where)
     degrees = checked(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])

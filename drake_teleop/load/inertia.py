@@ -15,10 +15,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 # Tolerance for rounding, so that rods, plates and points are consistent.
 _ROUNDING = 1e-12
 # Squared radius of gyration [m^2] below which a body is a point.
-_LEAST_SPREAD = 1e-290
+_POINT_SPREAD_M2 = 1e-290
 
 
-def _second_moment(about: Array, mass: float) -> Array:
+def _point_inertia(about: Array, mass: float) -> Array:
     return mass * (about @ about * np.eye(3) - np.outer(about, about))
 
 
@@ -38,7 +38,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
     I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
     if np.abs(I - I.T).max() > 1e-9 * np.abs(I).max():
         raise DrakeTeleopError("the inertia tensor is not symmetric", where="I_BBcm_S")
-    about_origin = I + _second_moment(p, m)
+    about_origin = I + _point_inertia(p, m)
     return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
 
 
@@ -53,7 +53,7 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     if m == 0.0:
         raise DrakeTeleopError("a load without mass has no centre of mass", where="phi")
     p = phi[1:4] / m
-    return m, p, inertia_about_origin(phi) - _second_moment(p, m)
+    return m, p, inertia_about_origin(phi) - _point_inertia(p, m)
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
@@ -103,7 +103,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     if mass <= 0.0 or spread < 0.0:
         return False
     # Quotients of denormal numbers are inaccurate: treat such a body as a point.
-    length = np.sqrt(spread / mass) if spread > _LEAST_SPREAD * mass else 1.0
+    length = np.sqrt(spread / mass) if spread > _POINT_SPREAD_M2 * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
     return bool(eigenvalues[0] >= -(tolerance + _ROUNDING))

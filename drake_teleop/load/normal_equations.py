@@ -20,18 +20,18 @@ from drake_teleop.load.regressor import regressor_into
 
 # Smallest relative eigenvalue of the scaled Gram, largest component of a determined parameter in
 # the null space, and smallest excitation of a column [m/s^2, rad/s^2].
-_RANK, _NULL_COMPONENT, _NO_EXCITATION = 1e-12, 1e-6, 1e-9
+_MIN_EIGENVALUE, _MAX_NULL_COMPONENT, _MIN_EXCITATION = 1e-12, 1e-6, 1e-9
 # Number of blocks, smallest block length over the noise's correlation time, fewest degrees of
 # freedom of a usable variance.
-_MOST_BLOCKS, _WINDOW, _FEWEST_DEGREES = 1024, 4.0, 8.0
+_MAX_BLOCKS, _MIN_CORRELATION_TIMES, _MIN_DEGREES = 1024, 4.0, 8.0
 # For noise that is weaker at low frequencies: fewest degrees of freedom, and smallest share of the
 # fit's degrees of freedom that the blocks contain.
-_MANY_DEGREES, _SEEN = 20.0, 0.9
-_FEWEST_SAMPLES = 3
+_MIN_DEGREES_LONGEST, _MIN_ABSORBED_SHARE = 20.0, 0.9
+_MIN_SAMPLES = 3
 # Largest difference of specific force in one orientation [m/s^2], and level of the F test.
-_SAME_POSE, _ALPHA = 0.05, 0.01
+_SAME_POSE_M_S2, _F_TEST_LEVEL = 0.05, 0.01
 # Largest relative residual that is rounding of the sums.
-_ROUNDING = 1e-6
+_ROUNDING_RESIDUAL = 1e-6
 # Indices of the wrench and of the factors of [offset, phi] in x.
 _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
 
@@ -55,7 +55,7 @@ class NormalEquations:
         self._weights = np.ones(6) if noise is None else positive("noise", noise, 6) ** -2.0
         # Channel c: sum of x x^T, x = [1, wrench c, row c of V (10)], and its first row per block.
         self._moments = np.zeros((6, 12, 12))
-        self._blocks = np.zeros((_MOST_BLOCKS, 6, 12))
+        self._blocks = np.zeros((_MAX_BLOCKS, 6, 12))
         # Index of the open block, samples of a full block.
         self._state = np.array([0, 1])
 
@@ -75,10 +75,10 @@ class NormalEquations:
         Raises:
             DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
         """
-        if self.samples < _FEWEST_SAMPLES:
+        if self.samples < _MIN_SAMPLES:
             raise DrakeTeleopError(
                 f"{self.samples} samples cannot determine a load",
-                remedy=f"give at least {_FEWEST_SAMPLES}, in different orientations",
+                remedy=f"give at least {_MIN_SAMPLES}, in different orientations",
             )
         inverse, undetermined, condition_number = self._pseudo_inverse()
         theta = inverse @ self.normal_equations()[1]
@@ -121,10 +121,10 @@ class NormalEquations:
         shares = np.diagonal(parts, axis1=1, axis2=2)
         if self._resolution is not None:  # three channels share one variance
             shares, degrees = shares.reshape(2, 3, 16).sum(axis=1), degrees[::3]
-        total, of_squares = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
-        known = (total > 0.0) & (of_squares > 0.0)
+        total, square_sums = shares.sum(axis=0), (shares**2 / degrees[:, None]).sum(axis=0)
+        known = (total > 0.0) & (square_sums > 0.0)
         return parts.sum(axis=0), np.divide(
-            total**2, of_squares, out=np.full(16, np.inf), where=known
+            total**2, square_sums, out=np.full(16, np.inf), where=known
         )
 
     def _pseudo_inverse(self) -> tuple[Array, NDArray[np.bool_], float]:
@@ -149,7 +149,7 @@ class NormalEquations:
     def unexcited(self) -> NDArray[np.bool_]:
         """Bools (16,): parameters without any influence on the wrench."""
         squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
-        return np.sqrt(squares) < _NO_EXCITATION
+        return np.sqrt(squares) < _MIN_EXCITATION
 
     @property
     def weights(self) -> Array:
@@ -186,72 +186,72 @@ class NormalEquations:
         power = self.residual_squares(theta)
         if self._resolution is not None:
             absorbed = self._absorbed(grams, inverse)
-            return *self._of_poses(power, absorbed, theta), np.zeros(6, dtype=bool)
+            return *self._pose_variances(power, absorbed, theta), np.zeros(6, dtype=bool)
         variances, degrees = self._unbiased(power, n, grams, grams, inverse)
         of_samples = variances
         # Rounding in the sums must not count as noise of the wrench.
         wrench = self._moments[:, _WRENCH, _WRENCH]
         found, slow = np.zeros(6, dtype=bool), np.zeros(6, dtype=bool)
-        absorbed_by_samples = self._absorbed(grams, inverse)
-        of_longest, degrees_of_longest = variances, degrees
+        sample_absorbed = self._absorbed(grams, inverse)
+        longest, longest_degrees = variances, degrees
         blocks, length = self._blocks[: self._state[0] + 1], float(self._state[1])
         # An unfinished last block would have the weight of a full one.
         blocks = blocks[: len(blocks) - (blocks[-1, 0, 0] < length)]
-        while len(blocks) > _FEWEST_DEGREES:
+        while len(blocks) > _MIN_DEGREES:
             model = blocks[:, :, 0] * theta[:6] + blocks[:, :, 2:] @ theta[6:]
             power = np.sum((blocks[:, :, _WRENCH] - model) ** 2, axis=0) / length
             between = np.zeros((6, 16, 16))
             for c in range(6):
                 means = blocks[:, c, _MODEL]
                 between[c][np.ix_(_columns(c), _columns(c))] = means.T @ means / length
-            now, trusted = self._unbiased(power, len(blocks), between, grams, inverse)
-            usable = ~found & (trusted >= _FEWEST_DEGREES)
-            memory = np.divide(now, of_samples, out=np.ones(6), where=of_samples > 0.0)
-            missed = np.minimum(memory / (2.0 * length), 0.5 / _WINDOW)
-            corrected = now / (1.0 - np.where(memory > 1.5, missed, 0.0))
-            enough = usable & (length >= _WINDOW * memory)
+            estimated, counted = self._unbiased(power, len(blocks), between, grams, inverse)
+            usable = ~found & (counted >= _MIN_DEGREES)
+            correlation = np.divide(estimated, of_samples, out=np.ones(6), where=of_samples > 0.0)
+            at_borders = np.minimum(correlation / (2.0 * length), 0.5 / _MIN_CORRELATION_TIMES)
+            corrected = estimated / (1.0 - np.where(correlation > 1.5, at_borders, 0.0))
+            enough = usable & (length >= _MIN_CORRELATION_TIMES * correlation)
             larger = usable & ~enough & (corrected > variances)
             take = enough | larger
             variances = np.where(take, corrected, variances)
-            degrees = np.where(take, trusted, degrees)
+            degrees = np.where(take, counted, degrees)
             found |= enough
-            sees = self._absorbed(between, inverse) >= _SEEN * absorbed_by_samples
-            longest = sees & (trusted >= _MANY_DEGREES)
-            of_longest = np.where(longest, now, of_longest)
-            degrees_of_longest = np.where(longest, trusted, degrees_of_longest)
-            significant = memory > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(trusted, 1.0))
+            has_motion = self._absorbed(between, inverse) >= _MIN_ABSORBED_SHARE * sample_absorbed
+            is_longest = has_motion & (counted >= _MIN_DEGREES_LONGEST)
+            longest = np.where(is_longest, estimated, longest)
+            longest_degrees = np.where(is_longest, counted, longest_degrees)
+            significant = correlation > 1.0 + 3.0 * np.sqrt(2.0 / np.maximum(counted, 1.0))
             slow = np.where(usable, significant & ~found, slow & ~found)
             even = len(blocks) // 2 * 2
             blocks, length = blocks[0:even:2] + blocks[1:even:2], 2.0 * length
         # The logarithm of an estimated variance is nearly normal, with deviation sqrt(2 / degrees).
-        weaker = found & (of_longest * np.exp(3.0 * np.sqrt(2.0 / degrees_of_longest)) < variances)
-        variances = np.where(weaker, of_longest, variances)
-        degrees = np.where(weaker, degrees_of_longest, degrees)
-        return variances, degrees, slow & (n * of_samples > _ROUNDING**2 * wrench)
+        weaker = found & (longest * np.exp(3.0 * np.sqrt(2.0 / longest_degrees)) < variances)
+        variances = np.where(weaker, longest, variances)
+        degrees = np.where(weaker, longest_degrees, degrees)
+        return variances, degrees, slow & (n * of_samples > _ROUNDING_RESIDUAL**2 * wrench)
 
-    def _of_poses(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
+    def _pose_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
         """Return the variances (6,) of poses at rest, and their degrees of freedom (6,)."""
         assert self._resolution is not None
-        squares, lost = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
-        least = np.array(self._resolution) ** 2 / 12.0
+        squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
+        min_variance = np.array(self._resolution) ** 2 / 12.0
         blocks = self._blocks[: self._state[0] + 1]
         count = blocks[:, 0, 0]
         s = blocks[:, range(3), 2] / count[:, None]
-        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE).argmax(axis=1)
+        first = (np.linalg.norm(s[:, None] - s, axis=2) < _SAME_POSE_M_S2).argmax(axis=1)
         groups = (np.unique(first)[:, None] == first).astype(float)
         sums = groups @ (
             blocks[:, :, _WRENCH] - blocks[:, :, 0] * theta[:6] - blocks[:, :, 2:] @ theta[6:]
         )
         between = (sums**2 / (groups @ count)[:, None]).reshape(-1, 2, 3).sum(axis=(0, 2))
-        left, repeats = 3.0 * len(groups) - lost, 3.0 * (self.samples - len(groups))
-        within = np.maximum(squares - between, repeats * least) / max(repeats, 1.0)
-        apart = np.divide(
+        left, repeats = 3.0 * len(groups) - absorbed_sums, 3.0 * (self.samples - len(groups))
+        within = np.maximum(squares - between, repeats * min_variance) / max(repeats, 1.0)
+        f_ratio = np.divide(
             between, left * within, out=np.zeros(2), where=(left > 0.0) & (within > 0.0)
         )
-        differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), apart) < _ALPHA
+        differ = fdtrc(np.maximum(left, 1.0), max(repeats, 1.0), f_ratio) < _F_TEST_LEVEL
         degrees = np.where(differ, left, left + repeats)
         squares = np.where(differ, between, squares)
-        variances = np.maximum(squares / np.maximum(degrees, 1.0), least)
+        variances = np.maximum(squares / np.maximum(degrees, 1.0), min_variance)
         return variances.repeat(3), degrees.repeat(3)
 
     def _absorbed(self, between: Array, inverse: Array) -> Array:
@@ -321,10 +321,10 @@ def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
     V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
     x[0] = 1.0
     last, length = state[0], state[1]
-    room = length - int(blocks[last, 0, 0])
+    remaining = length - int(blocks[last, 0, 0])
     for i in range(wrench.shape[0]):
-        if room == 0:
-            _flush(part, moments, blocks[last])
+        if remaining == 0:
+            _add_block(part, moments, blocks[last])
             last += 1
             if last == blocks.shape[0]:
                 last //= 2
@@ -332,8 +332,8 @@ def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
                 for b in range(last):
                     blocks[b] = blocks[2 * b] + blocks[2 * b + 1]
                 blocks[last:] = 0.0
-            room = length
-        room -= 1
+            remaining = length
+        remaining -= 1
         regressor_into(s[i], omega[i], alpha[i], V)
         for c in range(6):
             size = 6 if c < 3 else 12
@@ -343,12 +343,12 @@ def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
             for j in range(size):
                 for k in range(j, size):
                     part[c, j, k] += x[j] * x[k]
-    _flush(part, moments, blocks[last])
+    _add_block(part, moments, blocks[last])
     state[0], state[1] = last, length
 
 
 @njit(cache=True)
-def _flush(part, moments, block):
+def _add_block(part, moments, block):
     for c in range(6):
         for j in range(12):
             block[c, j] += part[c, 0, j]
@@ -365,8 +365,8 @@ def _pseudo_inverse(
     """Return pseudo-inverse, undetermined parameters (16,) and condition number of a Gram."""
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _RANK * eigenvalues[-1]
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
     half = scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept])
-    undetermined = (np.abs(vectors[:, ~kept]) > _NULL_COMPONENT).any(axis=1)
+    undetermined = (np.abs(vectors[:, ~kept]) > _MAX_NULL_COMPONENT).any(axis=1)
     condition_number = float(np.sqrt(eigenvalues[-1] / eigenvalues[kept][0]))
     return half @ half.T, undetermined, condition_number

@@ -22,9 +22,9 @@ ENTRIES = {
 UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
 """Units for display."""
 
-_UNITS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
-_ONE = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
-_LEAST, _MOST = 1e-9, 10.0
+_FACTORS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
+_ENTRY_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
+_MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
@@ -41,14 +41,14 @@ class Tolerance(NamedTuple):
     inertia: float | None = None
 
     @property
-    def asked(self) -> tuple[str, ...]:
+    def required(self) -> tuple[str, ...]:
         """Required `QUANTITIES`."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
     def entries(self) -> tuple[str, ...]:
         """Names (k,) of the required numbers, in the order of `errors_of`."""
-        return tuple(entry for name in self.asked for entry in ENTRIES[name])
+        return tuple(entry for name in self.required for entry in ENTRIES[name])
 
     def __str__(self) -> str:
         """Return the text that `read_tolerance` reads."""
@@ -67,10 +67,10 @@ def read_tolerance(text: str) -> Tolerance:
     """
     found: dict[str, float] = {}
     for part in text.split(","):
-        match = _ONE.fullmatch(part)
+        match = _ENTRY_PATTERN.fullmatch(part)
         name, unit = (match[1], match[3]) if match else ("", "")
         try:
-            value = float(match[2]) * _UNITS[unit] if match else 0.0
+            value = float(match[2]) * _FACTORS[unit] if match else 0.0
         except ValueError:
             value = 0.0
         if name not in QUANTITIES or (unit == "%") == (name == "com") or name in found:
@@ -79,7 +79,7 @@ def read_tolerance(text: str) -> Tolerance:
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
-        if not _LEAST <= value <= _MOST:
+        if not _MIN_VALUE <= value <= _MAX_VALUE:
             raise DrakeTeleopError(f"{part.strip()!r} is out of reach", where=text)
         found[name] = value
     return Tolerance(**found)
@@ -101,9 +101,9 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
     rows[4:, 4:] = np.eye(6)
     # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
-    out, at = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
-    for name in tolerance.asked:
-        start, stop, size = at[name]
+    out, rows_of = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
+    for name in tolerance.required:
+        start, stop, size = rows_of[name]
         out.append(rows[start:stop] / (size * getattr(tolerance, name)))
     return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
 
@@ -113,21 +113,25 @@ def deviations_of(errors: Array, covariance: Array) -> Array:
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
-    lacking = (errors[:, unknown] != 0.0).any(axis=1)
-    return np.where(lacking, np.inf, np.sqrt(np.maximum(variances, 0.0)))
+    is_undetermined = (errors[:, unknown] != 0.0).any(axis=1)
+    return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
 def values_of(tolerance: Tolerance, phi: Array) -> Array:
     """Return the required numbers (k,) in the units of `UNITS`."""
     m, c, inertia = mass_com_inertia(phi)
-    all_ = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
-    return np.concatenate([all_[name] for name in tolerance.asked])
+    values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
+    return np.concatenate([values[name] for name in tolerance.required])
 
 
 def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
     """Return the tolerances (k,) in the units of `UNITS`."""
     m, _, inertia = mass_com_inertia(phi)
-    sizes = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
+    size = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     return np.array(
-        [sizes[name] * getattr(tolerance, name) for name in tolerance.asked for _ in ENTRIES[name]]
+        [
+            size[name] * getattr(tolerance, name)
+            for name in tolerance.required
+            for _ in ENTRIES[name]
+        ]
     )

@@ -14,8 +14,8 @@ from drake_teleop.common.writing import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 
-_FIELDS, _OF_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
-_LARGEST = 1e6  # of any number in a file [rad, Hz]
+_FIELDS, _JOINT_FIELDS = {"frequency", "joints"}, {"q0", "rho", "delta"}
+_MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class FourierTrajectory:
         data = read_yaml(path)
         try:
             joints = list(data["joints"].values())
-            for fields, known in [(data, _FIELDS), *((joint, _OF_JOINT) for joint in joints)]:
+            for fields, known in [(data, _FIELDS), *((joint, _JOINT_FIELDS) for joint in joints)]:
                 if unknown := sorted(fields.keys() - known):
                     raise DrakeTeleopError(
                         f"there is no field '{unknown[0]}'",
@@ -116,8 +116,8 @@ class FourierTrajectory:
                 "is not a trajectory: q0 is a number, rho and delta have one for each harmonic",
                 where=str(path),
             )
-        if np.abs(numbers).max() > _LARGEST:
-            raise DrakeTeleopError(f"there are numbers beyond {_LARGEST:g}", where=str(path))
+        if np.abs(numbers).max() > _MAX_NUMBER:
+            raise DrakeTeleopError(f"there are numbers beyond {_MAX_NUMBER:g}", where=str(path))
         return cls(q0, rho, delta, frequency)
 
 

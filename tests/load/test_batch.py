@@ -14,7 +14,7 @@ from load_cases import OFFSETS, TOOL, rich_motion, rotations
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.consistent import Prior
 from drake_teleop.load.batch.covariance import ARM
-from drake_teleop.load.batch.methods import METHODS, _loss, identify_batch
+from drake_teleop.load.batch.methods import METHODS, _std_growth, identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.batch.record import Options, Record
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
@@ -143,8 +143,8 @@ def test_a_quarter_of_the_samples_doubles_the_deviations():
     """Where nothing is rejected any more."""
     whole = Record(*record(2000, noise=1.0))
     fit = METHODS["whitened"].fit(whole, Options(Noise(WRENCH_NOISE)))
-    assert _loss(fit, whole.every(4).moments) == pytest.approx(2.0, rel=0.02)
-    assert _loss(fit, whole.moments) == pytest.approx(1.0)
+    assert _std_growth(fit, whole.every(4).moments) == pytest.approx(2.0, rel=0.02)
+    assert _std_growth(fit, whole.moments) == pytest.approx(1.0)
 
 
 def test_poses_share_a_noise():

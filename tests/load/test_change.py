@@ -15,7 +15,7 @@ from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.gripper import identified_object
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.online.change import HOLD, STATES, WIDE, LoadChangeMonitor
+from drake_teleop.load.online.change import HOLD, OBJECT_STD, STATES, LoadChangeMonitor
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "load_change.py"
@@ -237,7 +237,7 @@ def test_the_new_load_is_the_least_squares_solution_with_the_known_prior(bench, 
     rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
     weights = 16.0 / noise**2
     prior = tool.covariance.copy()
-    prior[np.arange(16), np.arange(16)] += np.concatenate([np.full(6, 1e-4), np.square(WIDE)])
+    prior[np.arange(16), np.arange(16)] += np.concatenate([np.full(6, 1e-4), np.square(OBJECT_STD)])
     information = np.linalg.inv(prior)
     gram = np.einsum("nci,c,ncj->ij", rows, weights, rows) + information
     right = np.einsum("nci,c,nc->i", rows, weights, means(F))

@@ -26,12 +26,12 @@ from drake_teleop.load.inertia import (
     pseudo_inertia,
 )
 
-_UNITS = [pseudo_inertia(unit) for unit in np.eye(10)]
-_CONSTRAINT = [np.zeros((4, 4)), *_UNITS]
-_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_UNITS, (10, 16)).T)  # (10, 16)
-_SMALLEST_LENGTH = 1e-3  # lower bound of the length unit L [m]
+_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
+_CONSTRAINT = [np.zeros((4, 4)), *_BASIS]
+_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_BASIS, (10, 16)).T)  # (10, 16)
+_MIN_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
 # Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
-_RANK, _RIDGE = 1e-12, 1e-12
+_MIN_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 _PRIORS = ("entropic", "geodesic")
 
 
@@ -61,7 +61,7 @@ class Prior:
 
     def information(self, samples: int) -> Array:
         """Return the inverse covariance (10, 10) of the prior for a number of samples."""
-        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _UNITS)
+        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _BASIS)
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
 
@@ -87,7 +87,7 @@ class Ellipsoid:
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
         E = np.block([[-A, (A @ c)[:, None]], [A @ c, 1.0 - c @ A @ c]])
-        return np.array([np.sum(unit * E) for unit in _UNITS])
+        return np.array([np.sum(unit * E) for unit in _BASIS])
 
 
 def consistent_least_squares(
@@ -110,25 +110,25 @@ def consistent_least_squares(
     inside = row is None or row @ theta[6:] >= 0.0
     if prior is None and inside and is_physically_consistent(theta[6:]):
         return theta
-    unit = _units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
+    unit = _parameter_units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
     cross = gram[:6, 6:]
     offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
-    whole = float((np.diag(gram)[6:] * unit**2).max())
-    if prior is None and np.abs(reduced).max() <= _RANK * whole:
+    largest_diagonal = float((np.diag(gram)[6:] * unit**2).max())
+    if prior is None and np.abs(reduced).max() <= _MIN_EIGENVALUE * largest_diagonal:
         return theta  # the record cannot separate load and offsets
     linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
     phi = unit * _solve(0.5 * (reduced + reduced.T), linear, unit, prior, row)
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
-def _units(phi: Array) -> Array:
+def _parameter_units(phi: Array) -> Array:
     """Return units (10,) (m0, m0 L, m0 L^2) that scale the program, L the radius about So."""
     m = abs(phi[0])
     if m == 0.0:
         raise DrakeTeleopError("no mass can be told from this wrench", where="wrench")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
-    L = max(_SMALLEST_LENGTH, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    L = max(_MIN_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
@@ -137,16 +137,16 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
-        scaled = [J0_inverse @ part for part in _UNITS]
+        scaled = [J0_inverse @ part for part in _BASIS]
         pull = prior.weight * np.array([np.trace(part) for part in scaled])
         if prior.kind == "geodesic":
             H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
         b = b + (-pull if entropic else pull)
     if not entropic and row is None:
-        prepared = _distance_program(get_ident())
+        problem = _distance_program(get_ident())
     else:
-        prepared = _new_program(distance=not entropic)
-    program, x, cone, solver = prepared
+        problem = _make_program(distance=not entropic)
+    program, x, cone, solver = problem
     if row is not None:
         normalised = row * unit / np.abs(row * unit).max()
         program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
@@ -156,7 +156,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
         program.AddQuadraticCost(scale * H, -scale * b, x, is_convex=True)
         _add_log_det(program, x, prior.weight * scale)
     else:
-        cone.UpdateCoefficients(*_distance(H, b))
+        cone.UpdateCoefficients(*_distance_cone(H, b))
     result = solver.Solve(program)
     if not result.is_success():
         raise DrakeTeleopError(
@@ -165,12 +165,12 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
             remedy="check the sign of the wrench, and that the load moves",
         )
     # The solver's tolerance leaves eigenvalues of about -1e-9.
-    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _UNITS, 1))
+    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
-def _new_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
+def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
     # Imported here because the rest of the package starts ten times faster without Drake.
     from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
@@ -188,10 +188,10 @@ def _new_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 @cache
 def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
     """Return the reusable program of a thread; building it takes as long as solving it."""
-    return _new_program(distance=True)
+    return _make_program(distance=True)
 
 
-def _distance(H: Array, b: Array) -> tuple[Array, Array]:
+def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
     """Return the cone t >= |R x - d| with R^T R = H, R^T d = b: (11, 11) and (11,) for [x; t].
 
     With the squared distance, the solver's tolerance of 1e-8 would become an error of 1e-4.
@@ -199,10 +199,10 @@ def _distance(H: Array, b: Array) -> tuple[Array, Array]:
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale
-    root = np.sqrt(np.maximum(values, _RIDGE))
+    root = np.sqrt(np.maximum(values, _RIDGE_EIGENVALUE))
     cone, constants = np.zeros((11, 11)), np.zeros(11)
     cone[0, 10], cone[1:, :10] = 1.0, root[:, None] * vectors.T
-    constants[1:] = -np.where(values > _RANK, vectors.T @ b / root, 0.0) / scale
+    constants[1:] = -np.where(values > _MIN_EIGENVALUE, vectors.T @ b / root, 0.0) / scale
     return cone, constants
 
 

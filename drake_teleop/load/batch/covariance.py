@@ -33,21 +33,21 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
     With information D of the data and P of the prior (10, 10), the data's share is the diagonal of
     (D + P)^-1 D.
     """
-    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
-    used = known | (np.arange(16) >= 6)
+    determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
+    used = determined | (np.arange(16) >= 6)
     # Scaled so that all entries have similar size.
-    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
+    scale = np.sqrt(np.where(determined, np.diag(covariance), 1.0))
     scale[6:] = np.diag(information) ** -0.5
     data, total = np.zeros((2, 16, 16))
-    both, part = np.ix_(known, known), np.ix_(used, used)
-    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
+    block, used_block = np.ix_(determined, determined), np.ix_(used, used)
+    data[block] = np.linalg.inv(covariance[block] / np.outer(scale, scale)[block])
     total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
     total += data
     posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
-    inverse = np.linalg.inv(total[part])
-    posterior[part] = inverse * np.outer(scale, scale)[part]
+    inverse = np.linalg.inv(total[used_block])
+    posterior[used_block] = inverse * np.outer(scale, scale)[used_block]
     prior_share = np.zeros(16)
-    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
+    prior_share[used] = 1.0 - np.diag(inverse @ data[used_block])
     return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
@@ -82,11 +82,11 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
     backwards, used = record.every(-1), kept[::-1]
     after = np.zeros((6, 16))
     for start in range(0, len(used), CHUNK):
-        part = slice(start, start + CHUNK)
-        rows = np.zeros((len(used[part]), 6, 16))
+        used_block = slice(start, start + CHUNK)
+        rows = np.zeros((len(used[used_block]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
-        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
-        rows = fit.form.weights @ (rows * used[part, None, None])
+        rows[:, :, 6:] = regressor(*(table[used_block] for table in backwards.arrays[1:]))
+        rows = fit.form.weights @ (rows * used[used_block, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows

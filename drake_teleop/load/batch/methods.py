@@ -44,17 +44,17 @@ from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 
 # Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
-_ROUNDING = 1e-7
+_MIN_RELATIVE_NOISE = 1e-7
 # Smallest share of the residual's variance that is wrench noise, not noise of the motion.
-_LEAST_SHARE = 0.01
+_NOISE_SHARE = 0.01
 # Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
 # fits, and largest number of samples for the median.
-_HUBER, _REJECT, _FITS, _MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
+_HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
 _NORMAL_MAD = 1.4826
 # Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
 # standard deviation by rejected samples.
-_FEWEST_TO_REJECT, _SOME, _MOST_LOSS = 12, 50_000, 2.0
-_NOTHING_REJECTED = (
+_MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
+_NOTE_NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " cannot be told from errors of the motion (delay, scale, mounting): no sample was rejected"
 )
@@ -85,11 +85,11 @@ def _ordinary(record: Record, options: Options) -> Fit:
 
 
 def _whitened(record: Record, options: Options) -> Fit:
-    return _weighted(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
+    return _fit_moments(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
 
 
 def _total(record: Record, options: Options) -> Fit:
-    return _weighted(record.moments, options, record)
+    return _fit_moments(record.moments, options, record)
 
 
 def _consistent(record: Record, options: Options) -> Fit:
@@ -105,32 +105,32 @@ def _consistent(record: Record, options: Options) -> Fit:
 def _robust(record: Record, options: Options) -> Fit:
     whole = _total(record, options)
     n = len(record.s)
-    if n < _FEWEST_TO_REJECT:
+    if n < _MIN_SAMPLES_TO_REJECT:
         return whole
     # A subset of the samples is sufficient as a starting point.
-    form = _huber(record.every(max(1, n // _SOME)), options)
+    form = _huber(record.every(max(1, n // _MAX_START_SAMPLES)), options)
     rejected = np.zeros(n, bool)
-    for _ in range(_FITS):
-        last = rejected
-        rejected = _distances(record, form.theta, options.shared_noise) > _REJECT
+    for _ in range(_MAX_FITS):
+        previous = rejected
+        rejected = _relative_residuals(record, form.theta, options.shared_noise) > _REJECTION_LIMIT
         moments = Moments()
         moments.add(*record.arrays, weights=~rejected)
-        if _loss(whole, moments) > _MOST_LOSS:
-            return replace(whole, note=_NOTHING_REJECTED)
-        fit = _weighted(moments, options, record)
+        if _std_growth(whole, moments) > _MAX_STD_GROWTH:
+            return replace(whole, note=_NOTE_NOTHING_REJECTED)
+        fit = _fit_moments(moments, options, record)
         form = fit.form
-        if (rejected == last).all():
+        if (rejected == previous).all():
             break
     return replace(fit, rejected=rejected)
 
 
 def _huber(record: Record, options: Options) -> NormalForm:
     moments, weights = record.moments, np.ones(len(record.s))
-    for _ in range(_FITS):
+    for _ in range(_MAX_FITS):
         before = weights
-        form = _weighted(moments, options, record).form
-        distances = _distances(record, form.theta, options.shared_noise)
-        weights = np.minimum(1.0, _HUBER / np.maximum(distances, _HUBER))
+        form = _fit_moments(moments, options, record).form
+        distances = _relative_residuals(record, form.theta, options.shared_noise)
+        weights = np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
         if np.abs(weights - before).max() < 0.01:
             break
         moments = Moments()
@@ -138,9 +138,9 @@ def _huber(record: Record, options: Options) -> NormalForm:
     return form
 
 
-def _loss(whole: Fit, kept: Moments) -> float:
+def _std_growth(whole: Fit, kept: Moments) -> float:
     """Return the largest ratio of standard deviations, fewer samples over all samples."""
-    if kept.samples < _FEWEST_TO_REJECT:
+    if kept.samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
     used = excited_columns(whole.moments.mean)
     variances = []
@@ -250,14 +250,14 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
+def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
     """Return total least squares with the specified noise, or that of the residual."""
     noise, Z = options.noise, moments.mean
     if noise.wrench is not None:
         std = np.asarray(noise.wrench, np.float64)
     else:
         std = np.ones(6)
-        floor = _ROUNDING * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = _MIN_RELATIVE_NOISE * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
         floor = np.where(floor > 0.0, floor, 1.0)
         for known in (Noise(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
@@ -268,20 +268,20 @@ def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
                 squares, explained = (
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
-            std = np.sqrt(np.maximum(squares - explained, _LEAST_SHARE * squares).clip(floor**2))
+            std = np.sqrt(np.maximum(squares - explained, _NOISE_SHARE * squares).clip(floor**2))
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return Fit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _distances(record: Record, theta: Array, shared: bool) -> Array:
+def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
     """Return (N,) largest residual of a sample over the channel's robust deviation."""
     n = len(record.s)
-    some = np.abs(record.residual(theta, slice(0, n, max(1, n // _MEDIAN_SAMPLES))))
-    median = np.median(some, axis=0)
+    magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
+    median = np.median(magnitudes, axis=0)
     if shared:
-        median = np.median(some.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
+        median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_NORMAL_MAD * median, _ROUNDING * rms)
+    scale = np.maximum(_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, CHUNK):

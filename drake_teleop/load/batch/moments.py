@@ -24,7 +24,7 @@ from drake_teleop.load.regressor import regressor
 _CHUNK = 2**15
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
 # `normal_equations`.
-_RANK, _NO_EXCITATION = 1e-12, 1e-9
+_MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
 # Indices of the products w_i w_j in z.
 _PRODUCTS = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
@@ -129,14 +129,14 @@ class Moments:
 @cache
 def coefficients() -> Array:
     """Return T (6, 16, 19) with [E V] = T z, computed from the regressor."""
-    T, unit, none = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
+    T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
-    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, none, none), 0, -1)
-    T[:, 6:, 10:13] = np.moveaxis(regressor(none, none, unit), 0, -1)
-    T[:, 6:, 13:16] = np.moveaxis(regressor(none, unit, none), 0, -1)
+    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)
+    T[:, 6:, 10:13] = np.moveaxis(regressor(zero, zero, unit), 0, -1)
+    T[:, 6:, 13:16] = np.moveaxis(regressor(zero, unit, zero), 0, -1)
     for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
-        both = regressor(none, unit[i] + unit[j], none)
-        T[:, 6:, 16 + k] = both - regressor(none, unit[[i, j]], none).sum(axis=0)
+        both = regressor(zero, unit[i] + unit[j], zero)
+        T[:, 6:, 16 + k] = both - regressor(zero, unit[[i, j]], zero).sum(axis=0)
     T.flags.writeable = False
     return T
 
@@ -164,7 +164,7 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
     """Return (16,) bools: columns of [E V] above rounding."""
-    return np.diag(normal_equations(Z, np.eye(6))[0]) > _NO_EXCITATION**2
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
@@ -174,7 +174,7 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
     """
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _RANK * eigenvalues[-1]
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept]), np.float64)
 
 

@@ -29,8 +29,8 @@ from drake_teleop.load.batch.moments import (
 
 # Largest number of weight updates, relative change of theta at convergence, smallest relative
 # distance of a root from a pole, and standard deviations of noise that a signal must exceed.
-_ITERATIONS, _CONVERGED, _ROUNDING, _SIGNIFICANT = 10, 1e-8, 1e-12, 5.0
-_NOTHING = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
+_MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _NOISE_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
+_MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
@@ -70,27 +70,27 @@ def total_least_squares(
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
-    if np.diag(Z)[1:7].max() <= _NOTHING:
+    if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
         raise DrakeTeleopError(
             "no mass can be told from this wrench",
             where="wrench",
             remedy="is the sensor connected, and does its orientation change?",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    excess = _SIGNIFICANT * np.sqrt(2.0 / moments.samples)
-    before, least = np.zeros(16), excess / (1.0 + excess)
-    for _ in range(_ITERATIONS):
-        form = _step(Z, Q, W, offsets, least)
-        change = np.linalg.norm(form.theta - before)
-        if not noise.motion.any() or change <= _CONVERGED * np.linalg.norm(before):
+    excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.samples)
+    previous, min_gain = np.zeros(16), excess / (1.0 + excess)
+    for _ in range(_MAX_ITERATIONS):
+        form = _solve(Z, Q, W, offsets, min_gain)
+        change = np.linalg.norm(form.theta - previous)
+        if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
         W = np.asarray(np.linalg.inv(residual_covariance(Q, form.theta)), np.float64)
-        before = form.theta
+        previous = form.theta
     return form
 
 
-def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalForm:
-    """Return mixed TLS with the weight W, without directions with a signal share below `least`."""
+def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> NormalForm:
+    """Return mixed TLS for W, without directions with a signal share below `min_gain`."""
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
@@ -100,18 +100,18 @@ def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalFo
     # In these coordinates G is the identity; nu is the noise share of each direction.
     nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
-    scale = _ratio(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
+    scale = _min_root(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
     gain = 1.0 - scale * nu
-    kept = gain > (least if nu[-1] > 0.0 else 0.0)
+    kept = gain > (min_gain if nu[-1] > 0.0 else 0.0)
     inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T
     theta = inverse @ right
     if not offsets:
         theta[:6] = 0.0
-    along = gram @ basis[:, kept]
+    gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
     return NormalForm(
-        gram=(along * gain[kept]) @ along.T,
-        right=along @ (basis[:, kept].T @ right),
+        gram=(gram_basis * gain[kept]) @ gram_basis.T,
+        right=gram_basis @ (basis[:, kept].T @ right),
         theta=theta,
         weights=W,
         scale=scale,
@@ -120,7 +120,7 @@ def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalFo
     )
 
 
-def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
+def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
     """Return the smallest lambda that makes [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise]
     singular: the only root below 1 / max(nu) of the secular equation.
     """
@@ -130,7 +130,7 @@ def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
 
     highest = squares / noise
     if highest * nu[-1] >= 1.0:
-        highest = (1.0 - _ROUNDING) / nu[-1]
+        highest = (1.0 - _POLE_DISTANCE) / nu[-1]
     if excess(0.0) <= 0.0:  # no residual
         return 0.0
     return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))

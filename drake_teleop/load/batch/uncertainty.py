@@ -20,16 +20,16 @@ from drake_teleop.load.identification import (
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
-_MANY_DEGREES = 1e6  # Student's t is then normal to six digits
+_NORMAL_DEGREES = 1e6  # Student's t is then normal to six digits
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
 _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 # Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
 # coefficient that is rounding.
-_RANK, _NO_COEFFICIENT = 1e-12, 1e-6
+_MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
-_WORTH_A_NUMBER, _WORTH_A_MENTION = 0.1, 0.01
+_NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 _CHUNK = 2**13  # samples per pass, 4 MB of V
 
 
@@ -43,7 +43,7 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     """
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(f"{level} is not within (0, 1)", where="level")
-    degrees = np.minimum(load.degrees_of_freedom, _MANY_DEGREES)
+    degrees = np.minimum(load.degrees_of_freedom, _NORMAL_DEGREES)
     half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
     return theta - half, theta + half
@@ -126,8 +126,8 @@ class BaseParameters:
         ]
         for c in self.directions:
             if np.count_nonzero(c.coefficients) == 1 or c.share > WORTH_STATING:
-                much = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
-                lines.append(f"weak: {c} ({much} what is natural for the load)")
+                percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
+                lines.append(f"weak: {c} ({percentage} what is natural for the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
         if self.slow_noise:
@@ -147,7 +147,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         c = coefficients / coefficients[leading]
         deviation = float(np.sqrt(max(0.0, c @ covariance @ c)))
         size = float(np.linalg.norm(c * natural))
-        words = _sum_in_words(c, leading, np.abs(c) * natural)
+        words = _combination_text(c, leading, np.abs(c) * natural)
         return Combination(c, leading, float(c @ theta), deviation, deviation / size, words)
 
     # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
@@ -156,11 +156,11 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     norm = np.sqrt(np.where(unexcited, 1.0, np.diag(gram)))
     scale = np.where(unexcited, 0.0, np.repeat([1.0, 2.0], [6, 10]) / norm)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _RANK * eigenvalues[-1]
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
     rank = int(kept.sum())
     R, order = qr(np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T, mode="r", pivoting=True)
     dependence = solve_triangular(R[:, :rank], R[:, rank:])
-    dependence[np.abs(dependence) < _NO_COEFFICIENT] = 0.0
+    dependence[np.abs(dependence) < _MIN_COEFFICIENT] = 0.0
     combinations = []
     for row, i in enumerate(order[:rank]):
         c = np.zeros(16)
@@ -185,15 +185,15 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
-def _sum_in_words(coefficients: Array, leading: int, weights: Array) -> str:
+def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = PARAMETERS[leading]
-    for i in np.flatnonzero(weights >= _WORTH_A_NUMBER):
+    for i in np.flatnonzero(weights >= _NUMBER_SHARE):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETERS[i]}"
-    small = (weights < _WORTH_A_NUMBER) & (weights >= _WORTH_A_MENTION)
+    small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
     return text + " + ..." if small.any() else text
 
 

@@ -130,11 +130,11 @@ class ContactDetector:
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)
-        enter, low = float(positive("threshold", threshold)), float(positive("leave", leave))
+        enter, exit_level = float(positive("threshold", threshold)), float(positive("leave", leave))
         if not 0.0 <= following < 1.0:
             raise DrakeTeleopError(f"{following} is not within [0, 1)", where="following")
         sums = float(positive("slack", slack)), float(following)
-        decision = column, enter, low, int(hold)
+        decision = column, enter, exit_level, int(hold)
         #: Last arguments of `flag_update`.
         self.settings = (floor.parameters, *sums, *decision)
         self._memory = self.initial_memory()

@@ -169,9 +169,9 @@ def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> 
     """
     P, natural = covariance.copy(), natural_scale(phi)
     # Undetermined offsets must have been tared; otherwise the elimination is useless.
-    unknown = ~(np.diag(P) <= natural**2)
-    P[unknown, :] = P[:, unknown] = 0.0
-    P[unknown, unknown] = natural[unknown] ** 2
+    undetermined = ~(np.diag(P) <= natural**2)
+    P[undetermined, :] = P[:, undetermined] = 0.0
+    P[undetermined, undetermined] = natural[undetermined] ** 2
     if tared:
         P[:6, :] = P[:, :6] = 0.0
     return P

@@ -23,7 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import put
 from drake_teleop.load.identification import METHODS, Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.innovation import learn, whitening
+from drake_teleop.load.online.innovation import update_estimate, whitening
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import regressor_into
 from drake_teleop.load.sample import (
@@ -45,19 +45,19 @@ OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
 
 # Standard deviations of a grasped or released object [kg, kg m, kg m^2].
-WIDE = PRIOR_STD[6:]
+OBJECT_STD = PRIOR_STD[6:]
 # Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
 # the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
 # blocks of noise reach the return limit.
-_SLACK, _ALARM, _BACK = 12.0, 60.0, -30.0
+_SLACK, _ALARM, _RETURN = 12.0, 60.0, -30.0
 # Factor of the bound for first moments relative to that of the mass, and smallest size [m].
-_MOMENTS, _SMALLEST_SIZE = 10.0, 0.03
+_MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
 # Standard deviations below zero at which the mass of a new load is impossible.
-_IMPOSSIBLE = 4.0
+_IMPOSSIBLE_DEVIATIONS = 4.0
 
 # Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
 # then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
-_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _BACK_SUM, _AGE, _START, _LEARNT, _POWER = range(10)
+_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _RETURN_SUM, _AGE, _START, _NEW_COUNT, _POWER = range(10)
 _RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
 _WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
 
@@ -66,49 +66,49 @@ SIZE = _KNOWN + 816
 
 
 @njit(cache=True)
-def _explain(memory, belief, block, noise):
+def _update_filter(memory, place, block, noise):
     """Update a filter by a block; return chi-squared of its innovation.
 
     Model errors count once for the test, and with their duration for the update.
     """
-    phi = memory[belief + 6 : belief + 16].copy()
+    phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
     V = memory[_V:_KNOWN].reshape(6, 10)
-    before = memory[belief : belief + 272].copy()
-    chi = learn(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
+    before = memory[place : place + 272].copy()
+    chi = update_estimate(before, V, wrench, whitening(motion, phi, noise, noise[15], block))
     if noise[15] == 0.0:
-        put(memory, belief, before, 0, 272)
+        put(memory, place, before, 0, 272)
     else:
-        lasting = whitening(motion, phi, noise, noise[15] * noise[16], block)
-        learn(memory[belief : belief + 272], V, wrench, lasting)
+        long_term_root = whitening(motion, phi, noise, noise[15] * noise[16], block)
+        update_estimate(memory[place : place + 272], V, wrench, long_term_root)
     return chi
 
 
 @njit(cache=True)
-def _restart(memory, belief):
+def _restart(memory, place):
     """Reset a filter to the known load (the new load's filter with a wide prior), and its test."""
-    put(memory, belief, memory, _KNOWN, 272)
-    if belief == _NEW:
+    put(memory, place, memory, _KNOWN, 272)
+    if place == _NEW:
         for j in range(10):
-            memory[belief + 16 + 17 * (6 + j)] += WIDE[j] ** 2
+            memory[place + 16 + 17 * (6 + j)] += OBJECT_STD[j] ** 2
         memory[_START] = memory[_SAMPLES]
         memory[_SQUARES:_WRENCH] = memory[_POWER] = 0.0
     memory[_SUM] = memory[_AGE] = 0.0
 
 
 @njit(cache=True)
-def _settled(memory, bound):
+def _is_identified(memory, bound):
     """Return whether mass and first moments of the new load are certain to `bound`."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
-    moment = bound * change * max(size, _SMALLEST_SIZE) * _MOMENTS
+    moment = bound * change * max(size, _MIN_SIZE_M) * _MOMENT_FACTOR
     largest = max(P[7, 7], P[8, 8], P[9, 9])
     return math.sqrt(P[6, 6]) <= bound * change and math.sqrt(largest) <= moment
 
 
 @njit(cache=True)
-def _doubt_inertias(memory, noise, block):
+def _inflate_inertia_variances(memory, noise, block):
     """Increase the inertia variances of the new load by the bias that noise of alpha causes."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
@@ -145,13 +145,13 @@ def change_update(memory, sample, block, noise, window, hold, bound):
     memory[_IN_BLOCK] += 1.0
     if memory[_IN_BLOCK] >= block:
         memory[_WRENCH:_KNOWN] /= block
-        _judge(memory, block, noise, window, hold, bound)
+        _test_block(memory, block, noise, window, hold, bound)
         memory[_WRENCH:_KNOWN] = 0.0
         memory[_IN_BLOCK] = 0.0
 
 
 @njit(cache=True)
-def _judge(memory, block, noise, window, hold, bound):
+def _test_block(memory, block, noise, window, hold, bound):
     """Test the means of a block and update the state."""
     if memory[_STATE] == memory[_BASE]:
         if memory[_AGE] >= window:
@@ -159,22 +159,22 @@ def _judge(memory, block, noise, window, hold, bound):
             _restart(memory, _WATCH)
             memory[_SUM] = excess
         memory[_AGE] += 1.0
-        chi = _explain(memory, _WATCH, block, noise)
+        chi = _update_filter(memory, _WATCH, block, noise)
         memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
         if memory[_SUM] > _ALARM:
-            memory[_STATE], memory[_BACK_SUM] = DISTURBED, 0.0
+            memory[_STATE], memory[_RETURN_SUM] = DISTURBED, 0.0
             _restart(memory, _NEW)
         return
     # Return to the known load if it explains the blocks without an update.
     put(memory, _WATCH, memory, _KNOWN, 272)
-    chi = _explain(memory, _WATCH, block, noise)
-    memory[_BACK_SUM] = min(0.0, memory[_BACK_SUM] + chi - _SLACK)
-    if memory[_BACK_SUM] < _BACK:
+    chi = _update_filter(memory, _WATCH, block, noise)
+    memory[_RETURN_SUM] = min(0.0, memory[_RETURN_SUM] + chi - _SLACK)
+    if memory[_RETURN_SUM] < _RETURN:
         memory[_STATE] = memory[_BASE]
         _restart(memory, _WATCH)
         return
     # Test whether one new load explains all blocks since its start.
-    chi = _explain(memory, _NEW, block, noise)
+    chi = _update_filter(memory, _NEW, block, noise)
     memory[_AGE] += 1.0
     for k in range(3):
         memory[_POWER] += memory[_MOTION + 6 + k] ** 2
@@ -186,16 +186,16 @@ def _judge(memory, block, noise, window, hold, bound):
     memory[_SUM] = max(0.0, memory[_SUM] + chi - _SLACK)
     # A clearly negative mass is not a load.
     mass, deviation = memory[_NEW + 6], math.sqrt(memory[_NEW + 16 + 17 * 6])
-    if memory[_SUM] > _ALARM or mass < -_IMPOSSIBLE * deviation:
+    if memory[_SUM] > _ALARM or mass < -_IMPOSSIBLE_DEVIATIONS * deviation:
         memory[_STATE] = DISTURBED
         _restart(memory, _NEW)
     elif memory[_STATE] == DISTURBED and memory[_AGE] >= hold:
         memory[_STATE] = CHANGED
-    elif memory[_STATE] == CHANGED and _settled(memory, bound):
+    elif memory[_STATE] == CHANGED and _is_identified(memory, bound):
         memory[_STATE] = memory[_BASE] = IDENTIFIED
-        _doubt_inertias(memory, noise, block)
+        _inflate_inertia_variances(memory, noise, block)
         put(memory, _KNOWN, memory, _NEW, 272)
-        memory[_LEARNT] = memory[_AGE] * block
+        memory[_NEW_COUNT] = memory[_AGE] * block
         for i in range(_SQUARES - _RESIDUAL):
             memory[_RESIDUAL + i] = memory[_SQUARES + i] * (block / memory[_AGE])
         _restart(memory, _WATCH)
@@ -236,10 +236,10 @@ def change_parameters(
         raise DrakeTeleopError(f"{model_error} is not within [0, 1)", where="model_error")
     bound = max(BOUND, 2.0 * model_error) if bound is None else float(positive("bound", bound))
     block = max(1, round(BLOCK / period))
-    window, hold, lasts = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
+    window, hold, memory = (max(1, round(x / (block * period))) for x in (WINDOW, HOLD, MEMORY))
     std = positive("wrench_std", wrench_std, 6), checked("motion_std", motion_std, 9)
     noise = np.concatenate([*std, [model_error]]) ** 2
-    return block, np.append(noise, lasts), window, hold, bound
+    return block, np.append(noise, memory), window, hold, bound
 
 
 def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
@@ -390,7 +390,7 @@ class LoadChangeMonitor:
             identifiable=worth_stating(np.sqrt(np.diag(covariance)), phi),
             residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
             method=METHODS[1],
-            samples=int(memory[_LEARNT]),
+            samples=int(memory[_NEW_COUNT]),
             degrees_of_freedom=np.full(16, np.inf),
             prior_dominated=np.zeros(16, dtype=bool),
         )

@@ -24,9 +24,10 @@ def whitening(motion, phi, noise, model_var, n):
         n: samples of the block.
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
-    up, down, moved = np.empty(6), np.empty(6), motion.copy()
-    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, up)
-    f, tau = up[0] ** 2 + up[1] ** 2 + up[2] ** 2, up[3] ** 2 + up[4] ** 2 + up[5] ** 2
+    above, below, shifted = np.empty(6), np.empty(6), motion.copy()
+    non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], phi, above)
+    f = above[0] ** 2 + above[1] ** 2 + above[2] ** 2
+    tau = above[3] ** 2 + above[4] ** 2 + above[5] ** 2
     arm = (phi[1] ** 2 + phi[2] ** 2 + phi[3] ** 2) / max(phi[0] ** 2, 1e-12)
     for c in range(6):
         N[c, c] = noise[c] + n * model_var * (f if c < 3 else tau + arm * f)
@@ -34,14 +35,14 @@ def whitening(motion, phi, noise, model_var, n):
         if noise[6 + k] == 0.0:
             continue
         # The wrench is quadratic in the motion, so the central difference is exact.
-        moved[k] = motion[k] + 1.0
-        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, up)
-        moved[k] = motion[k] - 1.0
-        non_contact_wrench_into(moved[:3], moved[3:6], moved[6:], phi, down)
-        moved[k] = motion[k]
+        shifted[k] = motion[k] + 1.0
+        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, above)
+        shifted[k] = motion[k] - 1.0
+        non_contact_wrench_into(shifted[:3], shifted[3:6], shifted[6:], phi, below)
+        shifted[k] = motion[k]
         for i in range(6):
             for j in range(i + 1):
-                N[i, j] += 0.25 * noise[6 + k] * (up[i] - down[i]) * (up[j] - down[j])
+                N[i, j] += 0.25 * noise[6 + k] * (above[i] - below[i]) * (above[j] - below[j])
     N /= n
     cholesky(N, 6)
     for i in range(6):
@@ -54,10 +55,10 @@ def whitening(motion, phi, noise, model_var, n):
 
 
 @njit(cache=True)
-def learn(belief, V, wrench, root):
+def update_estimate(estimate, V, wrench, root):
     """Update [theta (16); P (256)] by a block, Eq. (T6); return the innovation's chi-squared."""
     row, gain = np.empty(16), np.empty(16)
-    theta, P, chi = belief[:16], belief[16:].reshape(16, 16), 0.0
+    theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
         innovation = 0.0
         row[:] = 0.0

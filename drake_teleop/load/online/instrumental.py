@@ -21,26 +21,26 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
 from drake_teleop.load.online.recursive_moments import (
     MomentEstimator,
-    add_product,
+    add_outer_product,
     eliminate,
     forget,
     invert,
-    observe,
     residual_products,
     scratch,
     solve,
     terms,
     weighted_gram,
     weighted_right,
+    write_z,
 )
 from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
 
 # Relative increase of M's diagonal against rounding.
 _RIDGE = 1e-9
 # Number of samples for which the specified wrench noise counts: first residuals are too small.
-_STATED = 20.0
+_NOISE_SAMPLES = 20.0
 # Squared residual over squared wrench that is rounding.
-_ROUNDING = 1e-13
+_ROUNDING_SQUARE = 1e-13
 
 
 @njit(cache=True)
@@ -58,9 +58,9 @@ def riv_normal_equations(memory, theta, noise_std, information, index, factors, 
     measured, mixed, instruments = memory[:19], memory[19:38], memory[38:57]
     residual_products(measured, theta, index, factors, L, LZ, S)
     for c in range(6):
-        S[c, c] += _STATED * noise_std[c] ** 2 + _ROUNDING * measured[13 + c, 13 + c]
+        S[c, c] += _NOISE_SAMPLES * noise_std[c] ** 2 + _ROUNDING_SQUARE * measured[13 + c, 13 + c]
         for d in range(6):
-            S[c, d] /= measured[0, 0] + _STATED
+            S[c, d] /= measured[0, 0] + _NOISE_SAMPLES
     invert(S, inverse, W)
     weighted_gram(instruments, W, index, factors, E, MRg, 0)
     weighted_gram(mixed, W, index, factors, E, MRg, 16)
@@ -97,11 +97,11 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
         if forgetting < 1.0:
             forget(memory, theta, information, forgetting)
         wrench = samples[n, WRENCH]
-        observe(wrench, samples[n, MOTION], z)
-        observe(wrench, samples[n, INSTRUMENTS], y)
-        add_product(z, z, memory[:19])
-        add_product(y, z, memory[19:38])
-        add_product(y, y, memory[38:57])
+        write_z(wrench, samples[n, MOTION], z)
+        write_z(wrench, samples[n, INSTRUMENTS], y)
+        add_outer_product(z, z, memory[:19])
+        add_outer_product(y, z, memory[19:38])
+        add_outer_product(y, y, memory[38:57])
         riv_normal_equations(memory, theta, noise_std, information, index, factors, space, MRg, A)
         solve(A)
         put(theta, 0, A[:, 16], 0, 16)

@@ -34,10 +34,10 @@ SETTLED = 0.05
 # Smallest relative eigenvalue that is not rounding.
 _ROUNDING = 1e-16
 # Parts of a sample with their sizes.
-_PARTS = {"wrench": 6, "s": 3, "omega": 3, "alpha": 3, "instruments": 9}
+_SAMPLE_PARTS = {"wrench": 6, "s": 3, "omega": 3, "alpha": 3, "instruments": 9}
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
-_RESOLUTION = 1e-10
+_MIN_RELATIVE_VARIANCE = 1e-10
 
 
 @njit(cache=True)
@@ -83,7 +83,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
                 innovation -= v * theta[6 + j]
                 predicted += v * gain[6 + j]
                 uncorrelated += v * v * P[6 + j, 6 + j]
-            variance = max(noise_std[c] * noise_std[c], _RESOLUTION * uncorrelated)
+            variance = max(noise_std[c] * noise_std[c], _MIN_RELATIVE_VARIANCE * uncorrelated)
             inverse = 1.0 / (variance + predicted)
             share = innovation * inverse
             squares[c] += variance * innovation * share
@@ -169,7 +169,7 @@ class RecursiveEstimator(ABC):
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
-        return bool(self._known(deviations, theta, self._bound).all())
+        return bool(self._is_certain(deviations, theta, self._bound).all())
 
     @abstractmethod
     def initial_memory(self, theta: Array) -> Array:
@@ -215,8 +215,8 @@ class RecursiveEstimator(ABC):
         """
         parts = self._parts([wrench, s, omega, alpha], instruments)
         shapes = [np.shape(part) for part in parts]
-        if shapes != [(size,) for size in _PARTS.values()][: len(parts)]:
-            names = ", ".join(list(_PARTS)[: len(parts)])
+        if shapes != [(size,) for size in _SAMPLE_PARTS.values()][: len(parts)]:
+            names = ", ".join(list(_SAMPLE_PARTS)[: len(parts)])
             raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample")
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
@@ -234,8 +234,8 @@ class RecursiveEstimator(ABC):
     ) -> None:
         """Update by N samples (N, 6), (N, 3)... with one compiled loop; see `update`."""
         parts = self._parts([wrench, s, omega, alpha], instruments)
-        columns = zip(_PARTS, parts, strict=False)
-        _, rows = checked_rows(**{name: (part, _PARTS[name]) for name, part in columns})
+        columns = zip(_SAMPLE_PARTS, parts, strict=False)
+        _, rows = checked_rows(**{name: (part, _SAMPLE_PARTS[name]) for name, part in columns})
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
@@ -259,7 +259,7 @@ class RecursiveEstimator(ABC):
             phi=self.phi,
             offsets=self.offsets,
             covariance=covariance,
-            identifiable=self._known(deviations, self._theta, WORTH_STATING),
+            identifiable=self._is_certain(deviations, self._theta, WORTH_STATING),
             condition_number=self._condition_number(),
             delay_s=0.0,
             residual_rms=self._residual_rms(),
@@ -268,10 +268,10 @@ class RecursiveEstimator(ABC):
             prior_dominated=prior_dominated(deviations, np.sqrt(self._prior)),
         )
 
-    def _known(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
+    def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
         """Return (16,) bools: not mostly the prior's, and certain to `bound`."""
-        learnt = ~prior_dominated(deviations, np.sqrt(self._prior))
-        return learnt & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
+        certain = ~prior_dominated(deviations, np.sqrt(self._prior))
+        return certain & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
 
     def _condition_number(self) -> float:
         information = np.linalg.inv(self.covariance)

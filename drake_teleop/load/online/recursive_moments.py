@@ -51,7 +51,7 @@ def scratch():
 
 
 @njit(cache=True)
-def observe(wrench, motion, z):
+def write_z(wrench, motion, z):
     """Write z of a wrench (6,) and a motion (9,) [s, omega, alpha]."""
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
@@ -65,7 +65,7 @@ def observe(wrench, motion, z):
 
 
 @njit(cache=True)
-def add_product(y, z, total):
+def add_outer_product(y, z, total):
     """Add y z^T to total (19, 19)."""
     for i in range(19):
         for j in range(19):

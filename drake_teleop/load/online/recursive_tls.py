@@ -21,31 +21,31 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.online.recursive import PRIOR_STD, SETTLED
 from drake_teleop.load.online.recursive_moments import (
     MomentEstimator,
-    add_product,
+    add_outer_product,
     eliminate,
     forget,
     invert,
     noise_products,
-    observe,
     residual_products,
     scratch,
     solve,
     terms,
     weighted_gram,
     weighted_right,
+    write_z,
 )
 from drake_teleop.load.sample import MOTION, WRENCH
 
 # Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
 _EXCESS = 4.0
 # Smallest pivot relative to its diagonal element that is not rounding.
-_PIVOT = 1e-13
+_MIN_PIVOT = 1e-13
 # Fewest samples for the noise scale from residuals.
-_FEWEST = 20
+_MIN_SCALE_SAMPLES = 20
 
 
 @njit(cache=True)
-def compensable(G, N, strength, K, taper):
+def select_compensated(G, N, strength, K, taper):
     """Set taper (16,) to 1 for parameters with compensated noise, otherwise to 0.
 
     G - strength N over them is positive definite; K (16, 16) is scratch.
@@ -57,7 +57,7 @@ def compensable(G, N, strength, K, taper):
     eliminate(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _PIVOT * G[i, i]
+        definite &= K[i, i] > _MIN_PIVOT * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -71,9 +71,9 @@ def compensable(G, N, strength, K, taper):
             total = G[i, i] - strength * taper[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _PIVOT * G[i, i]:
+            if total > _MIN_PIVOT * G[i, i]:
                 break
-        if not total > _PIVOT * G[i, i]:
+        if not total > _MIN_PIVOT * G[i, i]:
             taper[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -126,15 +126,15 @@ def rtls_update(
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget(memory, theta, information, forgetting)
-        observe(samples[n, WRENCH], samples[n, MOTION], z)
-        add_product(z, z, Z)
+        write_z(samples[n, WRENCH], samples[n, MOTION], z)
+        add_outer_product(z, z, Z)
         scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        kept = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
-        if kept > 0.0:
-            compensable(G, N, scale / kept, K, taper)
+        gain = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
+        if gain > 0.0:
+            select_compensated(G, N, scale / gain, K, taper)
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
@@ -186,16 +186,16 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         """
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
-        root = np.linalg.inv(_root(G + information))
+        root = np.linalg.inv(_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
+        excited = (shares < _MIN_PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
-        half = inverse @ _root(scale * G + information)
+        factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        return self._within_prior(half @ half.T + unknown @ unknown.T)
+        return self._within_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
         """Return G and N (16, 16) without prior, and lambda (1 for few samples)."""
@@ -204,13 +204,13 @@ class RecursiveTotalLeastSquares(MomentEstimator):
             return G[:, :16], N, 1.0
         options = (self._noise_std, self._motion_std, *terms(), scratch(), Q)
         scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
-        return G[:, :16], N, scale if memory[0, 0] > _FEWEST else 1.0
+        return G[:, :16], N, scale if memory[0, 0] > _MIN_SCALE_SAMPLES else 1.0
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)
         rtls_update(theta, memory, samples, *options, *terms())
 
 
-def _root(A: Array) -> Array:
+def _cholesky(A: Array) -> Array:
     """Return the Cholesky factor of A with its diagonal raised by rounding."""
-    return np.asarray(np.linalg.cholesky(A + _PIVOT * np.diag(np.diag(A))))
+    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))

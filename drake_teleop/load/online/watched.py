@@ -6,8 +6,9 @@
                 explains the wrench again or the new one is identified
 
 Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight: a
-new load counts only if it explains a force that changed by `VARIES`, for `EXPLAINED` seconds, with
-a centre of mass within `REACH`. At rest, offsets follow residuals below `LARGEST`.
+new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
+seconds, with a centre of mass within `MAX_COM_DISTANCE_M`. At rest, offsets follow residuals below
+`MAX_OFFSET_RESIDUAL`.
 """
 
 from __future__ import annotations
@@ -36,22 +37,22 @@ LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
 FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
 """Durations [s]: cross-fade, rest before offsets follow, their time constant, new load explains."""
-LARGEST = np.array([0.3] * 3 + [0.015] * 3)
+MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT` [N, N m]."""
-VARIES = 0.5
+MIN_FORCE_CHANGE_N = 0.5
 """Smallest change of the low-passed force that noise cannot cause [N]."""
-REACH = 1.0
+MAX_COM_DISTANCE_M = 1.0
 """Largest distance of So from the centre of mass of a grasped or released object [m]."""
 
 # Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
 # force [m/s^2] at rest.
-_SMOOTH, _TURNING, _MOVED = 0.05, 0.02, 0.1
+_LOW_PASS_S, _MAX_RATE, _MAX_SHIFT = 0.05, 0.02, 0.1
 
 # Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
 # force, angular velocity and residual; specific force at the start of the rest; smallest and
-# largest residual force of the new load; samples with a difference of `VARIES`.
-_STATE, _RESTED, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
-_WHERE, _LEAST, _MOST, _VARIED, _CHANGE = 14, 17, 20, 23, 24
+# largest residual force of the new load; samples with a difference of `MIN_FORCE_CHANGE_N`.
+_STATE, _REST_SAMPLES, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
+_REST_S, _LOWEST, _HIGHEST, _CHANGED_SAMPLES, _CHANGE = 14, 17, 20, 23, 24
 
 SIZE = _CHANGE + change.SIZE
 """Length of the memory of `watched_update`."""
@@ -71,44 +72,44 @@ def watched_state(memory):
 
 
 @njit(cache=True)
-def _rests(memory, sample, period):
-    share = period / (_SMOOTH + period)
+def _is_at_rest(memory, sample, period):
+    share = period / (_LOW_PASS_S + period)
     s, omega = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
-    moved, turning = 0.0, 0.0
+    shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_S + i] += share * (s[i] - memory[_S + i])
         memory[_OMEGA + i] += share * (omega[i] - memory[_OMEGA + i])
-        moved += (memory[_S + i] - memory[_WHERE + i]) ** 2
-        turning += memory[_OMEGA + i] ** 2
-    if moved > _MOVED**2 or turning > _TURNING**2:
-        memory[_RESTED] = 0.0
-        put(memory, _WHERE, memory, _S, 3)
-    memory[_RESTED] += 1.0
-    return memory[_RESTED] * period > REST
+        shift += (memory[_S + i] - memory[_REST_S + i]) ** 2
+        rate += memory[_OMEGA + i] ** 2
+    if shift > _MAX_SHIFT**2 or rate > _MAX_RATE**2:
+        memory[_REST_SAMPLES] = 0.0
+        put(memory, _REST_S, memory, _S, 3)
+    memory[_REST_SAMPLES] += 1.0
+    return memory[_REST_SAMPLES] * period > REST
 
 
 @njit(cache=True)
-def _varies(memory, residual, age, period):
+def _force_has_changed(memory, residual, age, period):
     """Return whether a new load, `age` samples old, has explained a changed residual force."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
-    least, most = memory[_LEAST:_MOST], memory[_MOST:_VARIED]
-    share = 1.0 if age == 0.0 else period / (_SMOOTH + period)
+    lowest, highest = memory[_LOWEST:_HIGHEST], memory[_HIGHEST:_CHANGED_SAMPLES]
+    share = 1.0 if age == 0.0 else period / (_LOW_PASS_S + period)
     for i in range(_RESIDUAL, _RESIDUAL + 6):
         memory[i] += share * (residual[i - _RESIDUAL] - memory[i])
-    if age * period < 2.0 * _SMOOTH:
-        put(least, 0, low_passed, 0, 3)
-        put(most, 0, low_passed, 0, 3)
-    put(least, 0, np.minimum(least, low_passed), 0, 3)
-    put(most, 0, np.maximum(most, low_passed), 0, 3)
-    apart = ((most - least) ** 2).sum() > VARIES**2
-    memory[_VARIED] = memory[_VARIED] + 1.0 if apart else 0.0
-    return memory[_VARIED] * period > EXPLAINED
+    if age * period < 2.0 * _LOW_PASS_S:
+        put(lowest, 0, low_passed, 0, 3)
+        put(highest, 0, low_passed, 0, 3)
+    put(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
+    put(highest, 0, np.maximum(highest, low_passed), 0, 3)
+    differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
+    memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
+    return memory[_CHANGED_SAMPLES] * period > EXPLAINED
 
 
 @njit(cache=True)
 def _is_within_reach(known, new):
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
-    return moment < (REACH * (new[6] - known[6])) ** 2
+    return moment < (MAX_COM_DISTANCE_M * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
@@ -131,16 +132,16 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     wrench = sample[WRENCH]
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    rests, verdict = _rests(memory, sample, period), change_state(watch)
-    varies = _varies(memory, residual, new_load_age(watch), period)
+    at_rest, verdict = _is_at_rest(memory, sample, period), change_state(watch)
+    force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == KNOWN:
         memory[_STATE] = SETTLED
-        if rests and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= LARGEST).all():
+        if at_rest and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / FOLLOW * residual[i]
     elif memory[_STATE] != OTHER_LOAD:
-        another = verdict == CHANGED and varies and _is_within_reach(known, new_load(watch))
-        memory[_STATE] = OTHER_LOAD if another else DISTURBED
+        other = verdict == CHANGED and force_changed and _is_within_reach(known, new_load(watch))
+        memory[_STATE] = OTHER_LOAD if other else DISTURBED
     put(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
         put(target, 6, fallback, 0, 10)
