@@ -192,15 +192,15 @@ class Identification:
                 raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
             array = checked(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
-                raise DrakeTeleopError(f"is beyond {largest:g}", where=f"{path}:{name}")
+                raise DrakeTeleopError(f"is above {largest:g} in magnitude", where=f"{path}:{name}")
             return array
 
         if not isinstance(document["method"], str):
-            raise DrakeTeleopError("is no text", where=f"{path}:method")
+            raise DrakeTeleopError("is not a text", where=f"{path}:method")
         optional: dict[str, Any] = {}
         if (name := "weight_removed") in document:
             if not isinstance(document[name], bool):
-                raise DrakeTeleopError("is neither true nor false", where=f"{path}:{name}")
+                raise DrakeTeleopError("is not true or false", where=f"{path}:{name}")
             optional[name] = document[name]
         if (name := "degrees_of_freedom") in document:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
@@ -291,7 +291,7 @@ def _read_json(path: str | Path) -> dict[str, Any]:
         )
     document = read_json(path)
     if not isinstance(document, dict):
-        raise DrakeTeleopError("holds no JSON object", where=str(path))
+        raise DrakeTeleopError("is not a JSON object", where=str(path))
     return document
 
 

@@ -84,9 +84,9 @@ class NormalEquations:
         theta = inverse @ self.normal_equations()[1]
         if theta[6] == 0.0:
             raise DrakeTeleopError(
-                "no mass can be told from this wrench",
+                "the mass cannot be identified from this wrench",
                 where="wrench",
-                remedy="is the sensor connected, and does its orientation change?",
+                remedy="check that the sensor is connected and that its orientation changes",
             )
         covariance, degrees = self._covariance(theta, inverse)
         covariance[undetermined, :] = covariance[:, undetermined] = 0.0

@@ -117,7 +117,7 @@ class FourierTrajectory:
                 where=str(path),
             )
         if np.abs(numbers).max() > _MAX_NUMBER:
-            raise DrakeTeleopError(f"there are numbers beyond {_MAX_NUMBER:g}", where=str(path))
+            raise DrakeTeleopError(f"contains numbers above {_MAX_NUMBER:g}", where=str(path))
         return cls(q0, rho, delta, frequency)
 
 

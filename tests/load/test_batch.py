@@ -414,7 +414,7 @@ def test_bad_input_is_named():
         identify_batch(*arrays, gain_std=-0.01)
     with pytest.raises(DrakeTeleopError, match="2 samples cannot determine"):
         identify_batch(*(x[:2] for x in arrays))
-    with pytest.raises(DrakeTeleopError, match="no mass can be told"):
+    with pytest.raises(DrakeTeleopError, match="the mass cannot be identified"):
         identify_batch(np.zeros((20, 6)), *arrays[1:])
     with pytest.raises(DrakeTeleopError, match=r"^wrench: is not finite at index"):
         identify_batch(np.full((20, 6), np.nan), *arrays[1:])

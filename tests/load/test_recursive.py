@@ -204,5 +204,5 @@ def test_bad_input_is_named_and_leaves_the_estimate():
         RecursiveLeastSquares(-NOISE)
     with pytest.raises(DrakeTeleopError, match=r"^prior_std: has shape \(10,\)"):
         RecursiveLeastSquares(NOISE, prior_std=np.ones(10))
-    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
         RecursiveLeastSquares(NOISE).identification()

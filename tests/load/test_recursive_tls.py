@@ -240,5 +240,5 @@ def test_bad_input_is_named():
         RecursiveTotalLeastSquares(NOISE, MOTION).update(
             OFFSETS, REST, REST, REST, instruments=np.zeros(9)
         )
-    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
         RecursiveTotalLeastSquares(NOISE, MOTION).identification()

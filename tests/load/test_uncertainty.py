@@ -256,9 +256,9 @@ def test_prior_dominated_is_what_the_data_did_not_tell():
     assert prior_dominated([0.1, 0.5, 1.0, 1.0], [1.0, 1.0, 1.0, np.inf]).tolist() == [
         *(False, True, True, False)
     ]
-    with pytest.raises(DrakeTeleopError, match=r"^prior_std: takes positive numbers"):
+    with pytest.raises(DrakeTeleopError, match=r"^prior_std: needs positive numbers"):
         prior_dominated([1.0, 1.0], [1.0, 0.0])
-    with pytest.raises(DrakeTeleopError, match=r"^prior_std: takes positive numbers"):
+    with pytest.raises(DrakeTeleopError, match=r"^prior_std: needs positive numbers"):
         prior_dominated([1.0, 1.0], [1.0])
     prior = np.full(16, 10.0)
     estimator = RecursiveLeastSquares(NOISE, prior_std=prior)

@@ -55,9 +55,7 @@ class Prior:
         if not 0.0 < self.weight < np.inf:
             raise DrakeTeleopError(f"{self.weight} is not positive", where="prior.weight")
         if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
-            raise DrakeTeleopError(
-                "has no extent in some direction, or is no body", where="prior.phi"
-            )
+            raise DrakeTeleopError("is not a body with extent in all directions", where="prior.phi")
 
     def information(self, samples: int) -> Array:
         """Return the inverse covariance (10, 10) of the prior for a number of samples."""
@@ -126,7 +124,7 @@ def _parameter_units(phi: Array) -> Array:
     """Return units (10,) (m0, m0 L, m0 L^2) that scale the program, L the radius about So."""
     m = abs(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError("no mass can be told from this wrench", where="wrench")
+        raise DrakeTeleopError("the mass cannot be identified from this wrench", where="wrench")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
     L = max(_MIN_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])

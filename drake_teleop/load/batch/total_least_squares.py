@@ -72,9 +72,9 @@ def total_least_squares(
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
     if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
         raise DrakeTeleopError(
-            "no mass can be told from this wrench",
+            "the mass cannot be identified from this wrench",
             where="wrench",
-            remedy="is the sensor connected, and does its orientation change?",
+            remedy="check that the sensor is connected and that its orientation changes",
         )
     W: Array = np.diag(wrench_noise**-2.0)
     excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.samples)

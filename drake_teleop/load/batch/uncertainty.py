@@ -60,7 +60,7 @@ def prior_dominated(
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
-            f"takes positive numbers, one for each of {deviations.shape} parameters",
+            f"needs positive numbers of shape {deviations.shape}",
             where="prior_std",
         )
     return np.asarray(deviations >= share * prior)
@@ -127,7 +127,7 @@ class BaseParameters:
         for c in self.directions:
             if np.count_nonzero(c.coefficients) == 1 or c.share > WORTH_STATING:
                 percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
-                lines.append(f"weak: {c} ({percentage} what is natural for the load)")
+                lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
         if self.slow_noise:

@@ -48,7 +48,7 @@ def fit_noise_floor(
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     if len(rows[0]) < 100:
         raise DrakeTeleopError(
-            f"{len(rows[0])} samples say too little about noise",
+            f"{len(rows[0])} samples are too few for a noise floor",
             where="contact",
             remedy="give 100 samples of free motion or more",
         )

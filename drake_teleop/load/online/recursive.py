@@ -252,7 +252,7 @@ class RecursiveEstimator(ABC):
             DrakeTeleopError: before the first update.
         """
         if self._theta[6] == 0.0:
-            raise DrakeTeleopError("no sample has been learnt from", where="estimator")
+            raise DrakeTeleopError("there was no update yet", where="estimator")
         covariance = self.covariance
         deviations = np.sqrt(np.diag(covariance))
         return Identification(
