@@ -25,9 +25,8 @@ from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.load.contact.memory import SIZE
-from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.contact.statistics import detection_update
+from drake_teleop.load.contact.detection import detection_update
+from drake_teleop.load.contact.noise_floor import SIZE, NoiseFloor
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.presets import PRESETS

@@ -2,6 +2,11 @@
 
 All vectors are in the sensor frame S about its origin So. The sensor exerts the wrench on the load;
 at rest f = -m g. Functions named `..._into` are compiled and do not check their input.
+
+A sample is one row of numbers for sensor, estimators and logs (logs use the first 15, SI at So):
+
+    [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
+     saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
 """
 
 from __future__ import annotations
@@ -12,6 +17,22 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.arrays import Array, checked, checked_rows
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, times
+
+WRENCH = slice(0, 6)
+SPECIFIC_FORCE = slice(6, 9)
+ANGULAR_VELOCITY = slice(9, 12)
+ANGULAR_ACCELERATION = slice(12, 15)
+MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
+WRENCH_AND_MOTION = slice(0, 15)
+SATURATED = 15  #: above 0.5 the wrench is not valid
+#: At this value of SATURATED and above, the reading was lost or impossible: the sample is an old
+#: one. The excess counts the samples with remaining effects.
+LOST = 2.0
+BEFORE_JOINTS = 16
+JOINT_POSITION = slice(BEFORE_JOINTS, None)
+TIME = -1  #: [s], only in the output of the wrist sensor
+#: Motion from a second source, only for `drake_teleop.load.online.instrumental`.
+INSTRUMENTS = slice(15, 24)
 
 
 @njit(cache=True)
@@ -85,3 +106,20 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
     out = np.empty((motion[0].shape[0], 6))
     _non_contact_wrenches(*motion, phi, out)
     return out.reshape(*leading, 6)
+
+
+def sample_parts(num_joints: int) -> dict[str, int]:
+    """Return the parts of a wrist sensor's sample: signal name -> size."""
+    return {
+        "measured_wrench_S": 6,
+        "specific_force_S": 3,
+        "angular_velocity_S": 3,
+        "angular_acceleration_S": 3,
+        "saturated": 1,
+        "joint_position": num_joints,
+    }
+
+
+def sample_size(num_joints: int) -> int:
+    """Return the length of a wrist sensor's sample without its time."""
+    return BEFORE_JOINTS + num_joints

@@ -16,7 +16,7 @@ from drake_teleop.load.batch.consistent import Prior
 from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.batch.methods import METHODS, _std_growth, identify_batch
 from drake_teleop.load.batch.moments import Noise
-from drake_teleop.load.batch.record import Options, Record
+from drake_teleop.load.batch.total_least_squares import Options, Record
 from drake_teleop.load.identification import METHODS as KNOWN_NAMES
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import (

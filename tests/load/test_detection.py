@@ -15,13 +15,24 @@ from scipy.stats import chi2, norm
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
-from drake_teleop.load.contact.detection import ContactDetector
-from drake_teleop.load.contact.memory import SIZE, WINDOW
-from drake_teleop.load.contact.noise_floor import STATISTICS, NoiseFloor, finite_covariance
+from drake_teleop.load.contact.detection import (
+    LEAVE,
+    SLACK,
+    ContactDetector,
+    detection_update,
+    point_on_tool,
+    statistics,
+    wrench_axis,
+)
+from drake_teleop.load.contact.noise_floor import (
+    SIZE,
+    STATISTICS,
+    WINDOW,
+    NoiseFloor,
+    finite_covariance,
+)
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.contact.roc import auc, detection_delays, free_threshold, roc
-from drake_teleop.load.contact.statistics import LEAVE, SLACK, detection_update, statistics
-from drake_teleop.load.contact.wrench_axis import point_on_tool, wrench_axis
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 

@@ -17,8 +17,7 @@ from drake_teleop.load.batch.moments import (
     inverse_root,
     normal_equations,
 )
-from drake_teleop.load.batch.record import CHUNK, Fit, Record
-from drake_teleop.load.batch.total_least_squares import NormalForm
+from drake_teleop.load.batch.total_least_squares import CHUNK, Fit, NormalForm, Record
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor

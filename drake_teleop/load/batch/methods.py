@@ -38,8 +38,14 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
-from drake_teleop.load.batch.record import CHUNK, Fit, Options, Record
-from drake_teleop.load.batch.total_least_squares import NormalForm, total_least_squares
+from drake_teleop.load.batch.total_least_squares import (
+    CHUNK,
+    Fit,
+    NormalForm,
+    Options,
+    Record,
+    total_least_squares,
+)
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 

@@ -10,6 +10,8 @@ motion is not distinguishable from its noise.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from scipy.optimize import brentq
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.batch.moments import (
     Moments,
     Noise,
@@ -26,6 +29,7 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
+from drake_teleop.load.regressor import non_contact_wrench
 
 # Largest number of weight updates, relative change of theta at convergence, smallest relative
 # distance of a root from a pole, and standard deviations of noise that a signal must exceed.
@@ -134,3 +138,60 @@ def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
     if excess(0.0) <= 0.0:  # no residual
         return 0.0
     return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))
+
+
+CHUNK = 2**15
+"""Samples per pass over a long record."""
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """Options of an estimator, as for `identify_batch`."""
+
+    noise: Noise
+    offsets: bool = True
+    shared_noise: bool = False
+    prior: Prior | None = None
+    ellipsoid: Ellipsoid | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Checked record: wrench (N, 6), s, omega and alpha (N, 3)."""
+
+    wrench: Array
+    s: Array
+    omega: Array
+    alpha: Array
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Wrench (N, 6), s, omega and alpha (N, 3)."""
+        return self.wrench, self.s, self.omega, self.alpha
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Second moments of the record."""
+        moments = Moments()
+        moments.add(*self.arrays)
+        return moments
+
+    def every(self, step: int) -> Record:
+        """Return every `step`-th sample."""
+        return Record(*(table[::step] for table in self.arrays))
+
+    def residual(self, theta: Array, part: slice) -> Array:
+        """Return F - [E V] theta (n, 6) of a part of the samples [N, N m]."""
+        F, s, omega, alpha = (table[part] for table in self.arrays)
+        return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Normal form, wrench noise (6,), moments, rejected samples (N,) and a note for the user."""
+
+    form: NormalForm
+    wrench_noise: Array
+    moments: Moments
+    rejected: NDArray[np.bool_]
+    note: str = ""

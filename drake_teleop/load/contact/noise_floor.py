@@ -19,9 +19,19 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.arrays import Array, checked, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.memory import HELD_A, HELD_ALPHA, LENGTHS
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into
+
+WINDOW = 128
+"""Longest sum of the likelihood ratio [samples], a power of two."""
+LENGTHS = WINDOW.bit_length()
+"""Number of sums: over 1, 2, 4 ... WINDOW samples."""
+
+COUNT, HELD_A, HELD_ALPHA, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 1, 2, 3, 4, 5
+Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
+SIZE = RING + 6 * WINDOW
+"""Length of the memory of `detection_update`."""
+
 
 STATISTICS = ("level", "cusum", "glr")
 """Columns of `statistics`, and choices of `ContactDetector`."""

@@ -9,9 +9,8 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.memory import LENGTHS
-from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, write_sigmas
-from drake_teleop.load.contact.statistics import statistics
+from drake_teleop.load.contact.detection import statistics
+from drake_teleop.load.contact.noise_floor import LENGTHS, NoiseFloor, checked_motion, write_sigmas
 
 # Lower limit of a noise floor [N, N m], as in `logs.contact`.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)

@@ -19,7 +19,7 @@ import numpy as np
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.load.online.recursive_moments import (
+from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,
     add_outer_product,
     eliminate,
@@ -33,7 +33,7 @@ from drake_teleop.load.online.recursive_moments import (
     weighted_right,
     write_z,
 )
-from drake_teleop.load.sample import INSTRUMENTS, MOTION, WRENCH
+from drake_teleop.load.regressor import INSTRUMENTS, MOTION, WRENCH
 
 # Relative increase of M's diagonal against rounding.
 _RIDGE = 1e-9

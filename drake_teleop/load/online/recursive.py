@@ -17,12 +17,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.identification import WORTH_STATING, Identification, worth_stating
-from drake_teleop.load.regressor import regressor_into
-from drake_teleop.load.sample import (
+from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     SPECIFIC_FORCE,
     WRENCH,
+    regressor_into,
 )
 
 PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6

@@ -28,8 +28,13 @@ from drake_teleop.load.online.change import (
     new_load,
     new_load_age,
 )
-from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.load.regressor import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    SPECIFIC_FORCE,
+    WRENCH,
+    non_contact_wrench_into,
+)
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
 """States of a load estimator, by index; "learning" precedes this module."""
