@@ -29,13 +29,6 @@ PARAMETERS = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
-METHODS = (
-    *("batch least squares", "recursive least squares"),
-    *("whitened least squares", "robust least squares", "physically consistent least squares"),
-    *("total least squares", "recursive instrumental variables", "recursive total least squares"),
-)
-"""Values of `Identification.method` for the included estimators."""
-
 WORTH_STATING = 0.05
 """Largest standard deviation of an identified parameter, relative to its natural scale."""
 # Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
@@ -58,7 +51,7 @@ class Identification:
             unit norm, over the determined directions.
         delay_s: delay of the motion relative to the wrench [s].
         residual_rms: (6,) of the wrench channels [N, N m].
-        method: as in `METHODS`.
+        method: name of the estimator.
         samples: number of samples.
         weight_removed: whether the robot had removed the load's weight from the wrench.
         degrees_of_freedom: (16,) of the variances; inf (null) for specified noise.

@@ -15,7 +15,7 @@ from scipy.special import fdtrc
 from drake_teleop.common.arrays import Array, checked, checked_rows, number, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.identification import METHODS, Identification, worth_stating
+from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.regressor import regressor_into
 
 # Smallest relative eigenvalue of the scaled Gram, largest component of a determined parameter in
@@ -99,7 +99,7 @@ class NormalEquations:
             condition_number=condition_number,
             delay_s=number("delay_s", delay_s),
             residual_rms=np.sqrt(self.residual_squares(theta) / self.samples),
-            method=METHODS[0],
+            method="batch least squares",
             samples=self.samples,
             degrees_of_freedom=degrees,
         )

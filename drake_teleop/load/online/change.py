@@ -21,7 +21,7 @@ from drake_teleop.common.arrays import Array, checked, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cholesky, put
-from drake_teleop.load.identification import METHODS, Identification, worth_stating
+from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import PRIOR_STD
 from drake_teleop.load.regressor import (
@@ -332,7 +332,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     unknown = np.diag(P) > prior
     P[unknown, :] = P[:, unknown] = 0.0
     P[unknown, unknown] = prior[unknown]
-    P[range(6), range(6)] += np.square(offset_drift)
+    P[range(6), range(6)] += np.square(checked("offset_drift", offset_drift, 6))
     # Undetermined inertias: those of a point mass, as in `logs.processing.usable_phi`.
     phi = theta[6:].copy()
     point = phi_from_mass_com_inertia(phi[0], phi[1:4] / phi[0], np.zeros((3, 3)))
@@ -368,106 +368,46 @@ def new_load_age(memory):
     return memory[_SAMPLES] - memory[_START]
 
 
-class LoadChangeMonitor:
-    """Monitor of a known load, sample by sample (module docstring).
+def watch_load(
+    memory: Array,
+    parameters: Parameters,
+    wrench: ArrayLike,
+    s: ArrayLike,
+    omega: ArrayLike,
+    alpha: ArrayLike,
+) -> NDArray[np.int_]:
+    """Update the memory by N samples of a log; return the states (N,) as indices into `STATES`.
 
     Args:
-        known: load and offsets at the start, with covariance.
-        wrench_std: (6,) noise of the wrench, roots of long-run variances per sample [N, N m].
-        motion_std: (9,) the same of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
-        period: between samples [s].
-        model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
-        offset_drift: (6,) standard deviation of the offsets' drift since `known` [N, N m].
-        bound: required standard deviation of a new load's mass over the change of mass; default
-            `BOUND`, or twice the model error.
-
-    Raises:
-        DrakeTeleopError: for wrong shapes or values.
+        memory: of `change_memory`, updated.
+        parameters: of `change_parameters`.
+        wrench, s, omega, alpha: (N, 6), (N, 3)... as for `identify`.
     """
+    _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
+    states = np.empty(len(rows[0]), np.int_)
+    _watch(memory, np.concatenate(rows, axis=1), states, *parameters)
+    return states
 
-    def __init__(
-        self,
-        known: Identification,
-        wrench_std: ArrayLike,
-        motion_std: ArrayLike,
-        period: float,
-        *,
-        model_error: float = 0.0,
-        offset_drift: ArrayLike = OFFSET_DRIFT,
-        bound: float | None = None,
-    ) -> None:
-        self._parameters = change_parameters(
-            wrench_std, motion_std, period, model_error=model_error, bound=bound
-        )
-        self._drift = checked("offset_drift", offset_drift, 6)
-        self._first, self._period = known, float(period)
-        self._memory = self.initial_memory()
 
-    def initial_memory(self) -> Array:
-        """Return the memory (n,) before the first sample."""
-        theta = np.concatenate([self._first.offsets, self._first.phi])
-        return change_memory(theta, self._first.covariance, self._drift)
+def identified_load(memory: Array, known: Identification) -> Identification:
+    """Return the new load once it is identified, and `known` before.
 
-    def update_into(self, memory: Array, sample: Array) -> None:
-        """Update an external memory by one sample; compiled, without checks."""
-        change_update(memory, sample, *self._parameters)
-
-    @staticmethod
-    def state_of(memory: Array) -> str:
-        """Return the state of an external memory."""
-        return STATES[int(memory[_STATE])]
-
-    def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> str:
-        """Update by one sample and return the state.
-
-        Args:
-            wrench: (6,) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-            s, omega, alpha: (3,) motion of S in S, as for `regressor`.
-
-        Raises:
-            DrakeTeleopError: for wrong shapes or numbers that are not finite.
-        """
-        parts = {"wrench": (wrench, 6), "s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
-        sample = np.concatenate([checked(name, x, n) for name, (x, n) in parts.items()])
-        self.update_into(self._memory, sample)
-        return self.state
-
-    def watch(
-        self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
-    ) -> NDArray[np.int_]:
-        """Update by N samples (N, 6), (N, 3)...; return the states (N,) as indices."""
-        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-        states = np.empty(len(rows[0]), np.int_)
-        _watch(self._memory, np.concatenate(rows, axis=1), states, *self._parameters)
-        return states
-
-    @property
-    def state(self) -> str:
-        """State, one of `STATES`."""
-        return self.state_of(self._memory)
-
-    @property
-    def changed_at(self) -> float:
-        """Time at which the newest new load began [s after the first sample]."""
-        return float(self._memory[_START]) * self._period
-
-    @property
-    def load(self) -> Identification:
-        """Known load; the new one once it is identified."""
-        memory = self._memory
-        if memory[_BASE] == KNOWN:
-            return self._first
-        phi, P = memory[_KNOWN + 6 : _KNOWN + 16].copy(), memory[_KNOWN + 16 : _WATCH]
-        covariance = P.reshape(16, 16).copy()
-        return replace(
-            self._first,
-            phi=phi,
-            offsets=memory[_KNOWN : _KNOWN + 6].copy(),
-            covariance=covariance,
-            identifiable=worth_stating(np.sqrt(np.diag(covariance)), phi),
-            residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
-            method=METHODS[1],
-            samples=int(memory[_NEW_COUNT]),
-            degrees_of_freedom=np.full(16, np.inf),
-            prior_dominated=np.zeros(16, dtype=bool),
-        )
+    Its `residual_rms` is per sample. Inertias without excitation keep their former values with a
+    large standard deviation; `condition_number` and `delay_s` are those of `known`.
+    """
+    if memory[_BASE] == KNOWN:
+        return known
+    phi, P = memory[_KNOWN + 6 : _KNOWN + 16].copy(), memory[_KNOWN + 16 : _WATCH]
+    covariance = P.reshape(16, 16).copy()
+    return replace(
+        known,
+        phi=phi,
+        offsets=memory[_KNOWN : _KNOWN + 6].copy(),
+        covariance=covariance,
+        identifiable=worth_stating(np.sqrt(np.diag(covariance)), phi),
+        residual_rms=np.sqrt(memory[_RESIDUAL:_SQUARES]),
+        method="recursive least squares",
+        samples=int(memory[_NEW_COUNT]),
+        degrees_of_freedom=np.full(16, np.inf),
+        prior_dominated=np.zeros(16, dtype=bool),
+    )
