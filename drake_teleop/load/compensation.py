@@ -140,19 +140,6 @@ def scaled_wrench(
     return out.reshape(*leading, 6)
 
 
-def modified_phi(phi_gripper: ArrayLike, phi_object: ArrayLike, eta: float) -> Array:
-    """Return the load (10,) to subtract so that the share eta of the object remains, Eq. (14).
-
-    Raises:
-        DrakeTeleopError: if eta is outside [0, 1].
-    """
-    gripper, gripped = (
-        checked("phi_gripper", phi_gripper, 10),
-        checked("phi_object", phi_object, 10),
-    )
-    return gripper + (1.0 - scales_from_eta(eta)[1]) * gripped
-
-
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
     """Return (sigma_gripper, sigma_object, gamma) = (0, eta, 1), equivalent to Eq. (14).
 

@@ -128,20 +128,3 @@ def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Arr
     T[:3, 3] = checked("p_AoBo_A", p_AoBo_A, 3)
     J = T @ pseudo_inertia(phi_B) @ T.T
     return phi_from_pseudo_inertia(0.5 * (J + J.T))
-
-
-def split_object(phi_total: ArrayLike, phi_gripper: ArrayLike) -> Array:
-    """Return phi_obj = phi_total - phi_gr (10,), about the same So in the same S (section V).
-
-    Raises:
-        DrakeTeleopError: if the difference is not physically consistent.
-    """
-    phi = checked("phi_total", phi_total, 10) - checked("phi_gripper", phi_gripper, 10)
-    if not is_physically_consistent(phi):
-        raise DrakeTeleopError(
-            f"total minus gripper is not physically consistent (mass {phi[0]:.4g} kg)",
-            where="phi_object",
-            remedy="identify both about the same sensor frame, with the object in the gripper "
-            "for the total only",
-        )
-    return phi

@@ -31,8 +31,6 @@ LOST = 2.0
 BEFORE_JOINTS = 16
 JOINT_POSITION = slice(BEFORE_JOINTS, None)
 TIME = -1  #: [s], only in the output of the wrist sensor
-#: Motion from a second source, only for `drake_teleop.load.online.instrumental`.
-INSTRUMENTS = slice(15, 24)
 
 
 @njit(cache=True)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
-from drake_teleop.common.arrays import Array, checked_rows
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import (
     PARAMETERS,
@@ -18,7 +18,6 @@ from drake_teleop.load.identification import (
     natural_scale,
 )
 from drake_teleop.load.normal_equations import NormalEquations
-from drake_teleop.load.regressor import regressor
 
 _NORMAL_DEGREES = 1e6  # Student's t is then normal to six digits
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
@@ -195,24 +194,3 @@ def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETERS[i]}"
     small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
     return text + " + ..." if small.any() else text
-
-
-def wrench_standard_deviations(
-    load: Identification, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
-) -> Array:
-    """Return standard deviations (..., 6) of the predicted wrench V phi [N, N m].
-
-    Only phi is uncertain; inf where an undetermined parameter affects the wrench.
-    """
-    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-    covariance = load.covariance[6:, 6:]
-    unknown = np.isinf(np.diag(covariance))
-    finite = np.where(np.isinf(covariance), 0.0, covariance)
-    samples = motion[0].shape[0]
-    deviations = np.empty((samples, 6))
-    for start in range(0, samples, _CHUNK):
-        V = regressor(*(table[start : start + _CHUNK] for table in motion))
-        variances = np.einsum("nci,nci->nc", V @ finite, V)
-        variances[(V[:, :, unknown] != 0.0).any(axis=2)] = np.inf
-        deviations[start : start + _CHUNK] = np.sqrt(np.maximum(variances, 0.0))
-    return deviations.reshape(*leading, 6)

@@ -33,8 +33,6 @@ SETTLED = 0.05
 
 # Smallest relative eigenvalue that is not rounding.
 _ROUNDING = 1e-16
-# Parts of a sample with their sizes.
-_SAMPLE_PARTS = {"wrench": 6, "s": 3, "omega": 3, "alpha": 3, "instruments": 9}
 # Smallest variance of a row relative to the sum of its terms; rounding would make P indefinite. It
 # slows only the first samples of sensors with noise below about 1 mN (for the default prior).
 _MIN_RELATIVE_VARIANCE = 1e-10
@@ -112,8 +110,6 @@ class RecursiveEstimator(ABC):
 
     #: Value of `Identification.method`.
     method: str
-    #: Fewest numbers of a sample.
-    sample_size = 15
     #: Whether the covariance includes noise of the measured motion.
     allows_for_noisy_motion = False
 
@@ -191,32 +187,22 @@ class RecursiveEstimator(ABC):
 
     @abstractmethod
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
-        """Update an estimate by each row of samples (N, at least `sample_size`)."""
+        """Update an estimate by each row of samples (N, at least 15)."""
 
     @abstractmethod
     def _residual_rms(self) -> Array:
         """Return the RMS (6,) of the residuals, weighted by forgetting."""
 
-    def update(
-        self,
-        wrench: ArrayLike,
-        s: ArrayLike,
-        omega: ArrayLike,
-        alpha: ArrayLike,
-        instruments: ArrayLike | None = None,
-    ) -> None:
+    def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
         """Update by one sample of a free motion, arguments as for `identify`.
-
-        Args:
-            instruments: (9,) [s; omega; alpha] from a second source, if the estimator uses it.
 
         Raises:
             DrakeTeleopError: for invalid input; the estimate is then unchanged.
         """
-        parts = self._parts([wrench, s, omega, alpha], instruments)
+        parts = (wrench, s, omega, alpha)
         shapes = [np.shape(part) for part in parts]
-        if shapes != [(size,) for size in _SAMPLE_PARTS.values()][: len(parts)]:
-            names = ", ".join(list(_SAMPLE_PARTS)[: len(parts)])
+        if shapes != [(6,), (3,), (3,), (3,)]:
+            names = "wrench, s, omega, alpha"
             raise DrakeTeleopError(f"{names} have shapes {shapes}", where="sample")
         sample = np.concatenate(parts, dtype=np.float64)
         if not math.isfinite(sample.sum()):
@@ -224,26 +210,11 @@ class RecursiveEstimator(ABC):
         self.update_into(self._theta, self._memory, sample)
         self._samples += 1
 
-    def learn(
-        self,
-        wrench: ArrayLike,
-        s: ArrayLike,
-        omega: ArrayLike,
-        alpha: ArrayLike,
-        instruments: ArrayLike | None = None,
-    ) -> None:
+    def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
         """Update by N samples (N, 6), (N, 3)... with one compiled loop; see `update`."""
-        parts = self._parts([wrench, s, omega, alpha], instruments)
-        columns = zip(_SAMPLE_PARTS, parts, strict=False)
-        _, rows = checked_rows(**{name: (part, _SAMPLE_PARTS[name]) for name, part in columns})
+        _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
-
-    def _parts(self, parts: list[ArrayLike], instruments: ArrayLike | None) -> list[ArrayLike]:
-        if (instruments is None) == (self.sample_size > 15):
-            needs = "needs" if instruments is None else "takes no"
-            raise DrakeTeleopError(f"{self.method} {needs} instruments", where="sample")
-        return parts if instruments is None else [*parts, instruments]
 
     def identification(self) -> Identification:
         """Return the present estimate.

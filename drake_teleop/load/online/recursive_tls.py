@@ -222,12 +222,9 @@ def invert(S, A, W):
 class MomentEstimator(RecursiveEstimator):
     """Recursive estimator whose memory is sums of z z^T and the prior's part of the equations."""
 
-    # Number of (19, 19) sums; the first is that of the measured z.
-    _sums = 1
-
     def initial_memory(self, theta: Array) -> Array:
-        """Return the memory (19 n + 1, 19): n sums, and the prior's information times theta."""
-        memory = np.zeros((19 * self._sums + 1, 19))
+        """Return the memory (20, 19): sum of z z^T, and the prior's information times theta."""
+        memory = np.zeros((20, 19))
         memory[-1, :16] = theta / self._prior
         return memory
 

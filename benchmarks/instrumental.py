@@ -15,8 +15,9 @@ Econometrica 30, 1962).
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.arrays import Array, checked_rows
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
 from drake_teleop.load.online.recursive_tls import (
@@ -33,7 +34,10 @@ from drake_teleop.load.online.recursive_tls import (
     weighted_right,
     write_z,
 )
-from drake_teleop.load.regressor import INSTRUMENTS, MOTION, WRENCH
+from drake_teleop.load.regressor import MOTION, WRENCH
+
+INSTRUMENTS = slice(15, 24)  # motion from a second source, after the sample
+
 
 # Relative increase of M's diagonal against rounding.
 _RIDGE = 1e-9
@@ -108,11 +112,15 @@ def riv_update(theta, memory, samples, noise_std, forgetting, information, index
 
 
 class RecursiveInstrumentalVariables(MomentEstimator):
-    """Recursive instrumental variables; `update` and `learn` require instruments."""
+    """Recursive instrumental variables; `learn` requires instruments."""
 
     method = "recursive instrumental variables"
-    sample_size = 24
-    _sums = 3
+
+    def initial_memory(self, theta: Array) -> Array:
+        """Return the memory (58, 19): three sums, and the prior's information times theta."""
+        memory = np.zeros((58, 19))
+        memory[-1, :16] = theta / self._prior
+        return memory
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
         """Return the covariance (16, 16), (R^T M^-1 R + prior)^-1."""
@@ -120,6 +128,20 @@ class RecursiveInstrumentalVariables(MomentEstimator):
         options = (self._noise_std, 1.0 / self._prior, *terms())
         riv_normal_equations(memory, theta, *options, scratch(), MRg, A)
         return self._within_prior(np.linalg.inv(0.5 * (A[:, :16] + A[:, :16].T)))
+
+    def learn(
+        self,
+        wrench: ArrayLike,
+        s: ArrayLike,
+        omega: ArrayLike,
+        alpha: ArrayLike,
+        instruments: ArrayLike,
+    ) -> None:
+        """Update by N samples; instruments (N, 9) are [s; omega; alpha] from a second source."""
+        motion = {"s": (s, 3), "omega": (omega, 3), "alpha": (alpha, 3)}
+        _, rows = checked_rows(wrench=(wrench, 6), **motion, instruments=(instruments, 9))
+        self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
+        self._samples += len(rows[0])
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._forgetting, 1.0 / self._prior, *terms())
