@@ -23,6 +23,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.detection import (
     LEAVE,
+    SIZE,
     SLACK,
     ContactDetector,
     detection_update,
@@ -30,7 +31,6 @@ from drake_teleop.load.contact.detection import (
     wrench_axis,
 )
 from drake_teleop.load.contact.noise_floor import (
-    SIZE,
     STATISTICS,
     WINDOW,
     NoiseFloor,
@@ -345,7 +345,7 @@ def test_fast_motion_is_no_contact_and_a_push_in_it_is():
 def test_an_update_is_one_sample():
     memory, floor = np.zeros(SIZE), white(0.5)
     for count in (1.0, 2.0):
-        detection_update(memory, NOISE, *STILL, *floor.parameters, SLACK, 0.0, LEAVE)
+        detection_update(memory, NOISE, *STILL, floor.parameters, SLACK, 0.0, LEAVE)
         assert memory[0] == count
 
 

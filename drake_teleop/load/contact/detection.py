@@ -22,27 +22,24 @@ from drake_teleop.common.arrays import Array, checked, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.noise_floor import (
-    COUNT,
-    FIRST_STATISTIC,
-    FLAG,
     HELD_A,
     HELD_ALPHA,
     LENGTHS,
-    MEAN,
-    QUIET_FOR,
-    RING,
-    SIZE,
-    SUM,
-    TOTAL,
     WINDOW,
     NoiseFloor,
-    Z,
     checked_motion,
     hold_peaks,
     parameter_variance,
     statistic_index,
 )
 
+# Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
+# below `leave`; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6); sum of all
+# e (6); ring of its last WINDOW values.
+COUNT, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 3, 4, 5
+Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
+SIZE = RING + 6 * WINDOW
+"""Length of the memory of `detection_update`."""
 SLACK = 1.0
 """Slack of the cumulative sum [standard deviations]. In white noise, half of the smallest shift to
 detect is best; this value tolerates lasting errors of the load."""
@@ -54,22 +51,7 @@ LEAVE = 0.7 * RARE
 
 @njit(cache=True)
 def detection_update(
-    memory,
-    contact,
-    s,
-    omega,
-    alpha,
-    acceleration,
-    variances,
-    P,
-    growth,
-    root,
-    rho,
-    widths,
-    fade,
-    slack,
-    following,
-    quiet,
+    memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
     """Update by one sample and write the `STATISTICS` to memory[5:8]; compiled, without checks.
 
@@ -77,9 +59,10 @@ def detection_update(
         memory: (SIZE,), zeros before the first sample.
         contact: (6,) F_c of Eq. (13).
         s, omega, alpha, acceleration: (3,) as for `NoiseFloor.sigma`.
-        variances, P, growth, root, rho, widths, fade: `NoiseFloor.parameters`.
+        parameters: `NoiseFloor.parameters`.
         slack, following, quiet: as for `ContactDetector`, quiet for leave.
     """
+    variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
     hold_peaks(memory, acceleration, alpha, fade)
     parameter_variance(s, omega, alpha, P, V, scaled)
@@ -133,10 +116,8 @@ def _statistics(rows, parameters, slack, following, quiet, out):
     contact, s, omega, alpha, acceleration = rows
     memory = np.zeros(SIZE)
     for k in range(contact.shape[0]):
-        detection_update(
-            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *parameters, slack,
-            following, quiet,
-        )  # fmt: skip
+        sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
+        detection_update(memory, *sample, parameters, slack, following, quiet)
         out[k] = memory[FIRST_STATISTIC : FIRST_STATISTIC + 3]
 
 
@@ -205,24 +186,11 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 
 @njit(cache=True)
-def flag_update(
-    memory,
-    contact,
-    s,
-    omega,
-    alpha,
-    acceleration,
-    parameters,
-    slack,
-    following,
-    statistic,
-    enter,
-    leave,
-    hold,
-):
+def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
     """Update by one sample with `ContactDetector.settings`; return whether there is contact."""
+    slack, following, statistic, enter, leave, hold = decision
     detection_update(
-        memory, contact, s, omega, alpha, acceleration, *parameters, slack, following, leave
+        memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
     )
     return hysteresis_update(memory, statistic, enter, leave, hold, parameters[5])
 
@@ -231,9 +199,8 @@ def flag_update(
 def _flags(memory, rows, settings, out):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
-        out[k] = flag_update(
-            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *settings
-        )
+        sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
+        out[k] = flag_update(memory, *sample, *settings)
 
 
 class ContactDetector:
@@ -272,7 +239,7 @@ class ContactDetector:
         sums = float(positive("slack", slack)), float(following)
         decision = column, enter, exit_level, int(hold)
         #: Last arguments of `flag_update`.
-        self.settings = (floor.parameters, *sums, *decision)
+        self.settings = (floor.parameters, (*sums, *decision))
         self._memory = self.initial_memory()
 
     @staticmethod

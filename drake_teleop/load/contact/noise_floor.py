@@ -27,11 +27,7 @@ WINDOW = 128
 LENGTHS = WINDOW.bit_length()
 """Number of sums: over 1, 2, 4 ... WINDOW samples."""
 
-COUNT, HELD_A, HELD_ALPHA, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 1, 2, 3, 4, 5
-Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
-SIZE = RING + 6 * WINDOW
-"""Length of the memory of `detection_update`."""
-
+HELD_A, HELD_ALPHA = 1, 2  # indices of held squares in the memory of a detector
 
 STATISTICS = ("level", "cusum", "glr")
 """Columns of `statistics`, and choices of `ContactDetector`."""

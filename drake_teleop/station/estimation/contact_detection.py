@@ -17,8 +17,8 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.load.compensation import scaled_wrench_into
-from drake_teleop.load.contact.detection import ContactDetector, flag_update
-from drake_teleop.load.contact.noise_floor import FLAG, MARGIN, STATISTICS, NoiseFloor
+from drake_teleop.load.contact.detection import FLAG, ContactDetector, flag_update
+from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
