@@ -80,7 +80,7 @@ class Identification:
 
     @property
     def mass(self) -> float:
-        """Mass [kg]; negative if the wrench has the opposite sign of Eq. (1)."""
+        """Mass [kg]; negative for a wrench of opposite sign."""
         return float(self.phi[0])
 
     @property
@@ -114,7 +114,6 @@ class Identification:
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        """Return eight lines; +- is the largest standard deviation of a line."""
         deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
@@ -371,7 +370,6 @@ def identified_object(total: Identification, gripper: Identification) -> Identif
 
 
 def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
-    """Return (16,) Satterthwaite degrees of freedom; those of the total for offsets."""
     a, b = (np.diag(load.covariance) for load in (total, gripper))
     b = np.where(_IS_PHI, b, 0.0)
     finite = np.isfinite(a + b) & (a + b > 0.0)

@@ -37,15 +37,12 @@ _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
 
 
 class NormalEquations:
-    """Sums of a record that determine the load; memory does not depend on its length.
-
-    Samples must be added in the order of time.
+    """Sums of a record, in the order of time, that determine the load.
 
     Args:
         noise: (6,) standard deviations of the wrench channels [N, N m], for the weights; None
             gives every row the same weight.
-        resolution: (2,) quantisation step of forces and torques [N, N m] if the samples are poses
-            at rest.
+        resolution: (2,) quantisation step of forces and torques [N, N m] for poses at rest.
     """
 
     def __init__(
@@ -139,7 +136,6 @@ class NormalEquations:
         return gram, right
 
     def _channel_grams(self) -> Array:
-        """Return the Gram matrices (6, 16, 16) of the channels' rows."""
         grams = np.zeros((6, 16, 16))
         for c in range(6):
             grams[c][np.ix_(_columns(c), _columns(c))] = self._moments[c][np.ix_(_MODEL, _MODEL)]
@@ -255,7 +251,6 @@ class NormalEquations:
         return variances.repeat(3), degrees.repeat(3)
 
     def _absorbed(self, between: Array, inverse: Array) -> Array:
-        """Return the degrees of freedom (6,) that the fit removes from block residuals."""
         return np.asarray(self._weights * np.einsum("cij,ji->c", between, inverse))
 
     def _unbiased(

@@ -119,5 +119,5 @@ def sample_parts(num_joints: int) -> dict[str, int]:
 
 
 def sample_size(num_joints: int) -> int:
-    """Return the length of a wrist sensor's sample without its time."""
+    """Return the length of a wrist sensor's sample without time."""
     return BEFORE_JOINTS + num_joints

@@ -122,7 +122,6 @@ class FourierTrajectory:
 
 
 def _rest_bases(harmonics: int) -> tuple[Array, Array]:
-    """Return the maps (N - 1, N) from free coefficients to rho and to delta."""
     k = np.arange(1.0, harmonics + 1)
     bases = [np.linalg.qr(row[:, np.newaxis], mode="complete")[0][:, 1:] for row in (k**0, k)]
     return (bases[0] / k[:, np.newaxis]).T, (bases[1] / k[:, np.newaxis]).T

@@ -37,12 +37,11 @@ _PRIORS = ("entropic", "geodesic")
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior of the load.
+    """Prior of the load; `kind` is "entropic" or "geodesic".
 
     Attributes:
         phi: (10,) about So in S, of a body with extent in all directions.
         weight: residual variance per sample.
-        kind: "entropic" or "geodesic".
     """
 
     phi: ArrayLike
@@ -205,7 +204,6 @@ def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _add_log_det(program: Any, x: Any, weight: float) -> None:
-    """Add -weight log det J(x) to the cost."""
     m, hx, hy, hz, xx, xy, xz, yy, yz, zz = x
     half = 0.5 * (xx + yy + zz)
     J = np.array(

@@ -67,7 +67,6 @@ def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Arra
 
 
 def _inverse_gram(fit: Fit) -> Array:
-    """Return the pseudo-inverse (16, 16) of the sum of [E V]^T W [E V]."""
     Z = fit.moments.mean
     root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
     return np.asarray(root @ root.T / fit.moments.samples)

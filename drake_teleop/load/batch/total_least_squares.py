@@ -181,7 +181,7 @@ class Record:
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        """Return F - [E V] theta (n, 6) of a part of the samples [N, N m]."""
+        """Return F - [E V] theta (n, 6) of a part of the samples."""
         F, s, omega, alpha = (table[part] for table in self.arrays)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 

@@ -72,8 +72,6 @@ class Combination:
     Attributes:
         coefficients: (16,); 1 for the leading parameter, which gives the unit.
         leading: its index in `PARAMETERS`.
-        value: estimate.
-        standard_deviation: of the estimate.
         share: standard deviation over the natural scale.
         words: the sum as text; "..." stands for terms below a tenth of the largest.
     """
@@ -99,8 +97,7 @@ class BaseParameters:
         combinations: as many as the rank of [E V] (Gautier, Khalil, IEEE Trans. Robotics and
             Automation 6(3), 1990; QR with pivoting: Gautier, ICRA 1990).
         without_influence: names of parameters without influence on the wrench.
-        directions: principal combinations of determined but not identified parameters, from the
-            most to the least certain.
+        directions: principal combinations of determined but not identified parameters.
         slow_noise: names of wrench channels with drift.
     """
 

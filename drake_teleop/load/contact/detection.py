@@ -137,7 +137,6 @@ def statistics(
     Args:
         contact: (N, 6) F_c of Eq. (13) [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
-        floor, slack, following: as for `ContactDetector`.
     """
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     out = np.empty((len(rows[0]), 3))
@@ -209,7 +208,6 @@ class ContactDetector:
     `flag_update(memory, ..., *settings)` works on external memory, such as a Drake state.
 
     Args:
-        floor: of the free motion.
         threshold: of the statistic, such as `NoiseFloor.threshold`.
         statistic: one of `STATISTICS`.
         leave, hold: level, and samples below it, before contact ends.

@@ -30,8 +30,8 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     """Return the noise floor of a record of free motion, the faster the better.
 
-    Squares of each channel are explained by 1, |a|^2 and |alpha|^2, in addition to P. Weights are
-    iterated, because squares of normal noise scatter in proportion to their mean.
+    Squares of each channel are explained by 1, |a|^2, |alpha|^2 and P. Weights are iterated:
+    squares of normal noise scatter in proportion to their mean.
 
     Args:
         contact: (N, 6) F_c without contact [N, N m].

@@ -46,8 +46,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
         theta: (16,) [offsets; phi], updated.
         P: (16, 16) covariance, exactly symmetric, updated.
         samples: (N, at least 15), see `regressor`.
-        noise_std: (6,) of the wrench [N, N m].
-        forgetting: factor per sample on the weight of the past.
+        noise_std, forgetting: as for `RecursiveEstimator`.
         largest: (16,) upper bound for the variances during forgetting.
         squares: (6,) sums of squared residuals, updated [N^2, N^2 m^2].
     """
@@ -95,13 +94,12 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 class RecursiveEstimator(ABC):
     """Recursive estimate of [offsets; phi].
 
-    The state is theta (16,) and a `memory` array; both can be external, as in the state of a Drake
-    system.
+    The state is theta (16,) and a `memory` array; both can be external, as in a Drake system.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
+        prior_std: (16,) of the prior; an upper bound during forgetting.
         bound: of `settled`.
 
     Raises:
@@ -154,10 +152,7 @@ class RecursiveEstimator(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether all standard deviations are at most `bound` of the natural scale.
-
-        Parameters that are mostly the prior's do not count as settled.
-        """
+        """Whether all parameters are certain to `bound` of the natural scale, not by the prior."""
         return self.settled_at(self._theta, self._memory)
 
     def settled_at(self, theta: Array, memory: Array) -> bool:
@@ -186,12 +181,11 @@ class RecursiveEstimator(ABC):
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
     @abstractmethod
-    def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
-        """Update an estimate by each row of samples (N, at least 15)."""
+    def _learn(self, theta: Array, memory: Array, samples: Array) -> None: ...
 
     @abstractmethod
     def _residual_rms(self) -> Array:
-        """Return the RMS (6,) of the residuals, weighted by forgetting."""
+        """Return the RMS (6,) of the residuals [N, N m]."""
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
         """Update by one sample of a free motion, arguments as for `identify`.
@@ -240,7 +234,6 @@ class RecursiveEstimator(ABC):
         )
 
     def _is_certain(self, deviations: Array, theta: Array, bound: float) -> NDArray[np.bool_]:
-        """Return (16,) bools: not mostly the prior's, and certain to `bound`."""
         certain = ~prior_dominated(deviations, np.sqrt(self._prior))
         return certain & worth_stating(deviations * (WORTH_STATING / bound), theta[6:])
 
@@ -271,7 +264,7 @@ class RecursiveLeastSquares(RecursiveEstimator):
         return np.diag(self._prior)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return a copy of the memory (16, 16), which is the covariance."""
+        """Return a copy of the memory, which is the covariance (16, 16)."""
         return memory.copy()
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
