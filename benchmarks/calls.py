@@ -25,9 +25,8 @@ from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.sampled_wall import passive_stiffness, stable_stiffness
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.load.contact.memory import SIZE
+from drake_teleop.load.contact.detection import SIZE, detection_update
 from drake_teleop.load.contact.noise_floor import NoiseFloor
-from drake_teleop.load.contact.statistics import detection_update
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.sensor.presets import PRESETS
@@ -82,7 +81,7 @@ def reading(config: WristSensorConfig) -> tuple[float, float]:
 @njit
 def _detect_often(memory, wrenches, motion, parameters):  # type: ignore[no-untyped-def]
     for i in range(len(wrenches)):
-        detection_update(memory, wrenches[i], *motion, *parameters, 1.0, 0.0, 0.0)
+        detection_update(memory, wrenches[i], *motion, parameters, 1.0, 0.0, 0.0)
 
 
 def detection() -> tuple[float, float]:
@@ -95,7 +94,7 @@ def detection() -> tuple[float, float]:
     memory, parameters = np.zeros(SIZE), tuple(floor.parameters)
     ours = seconds(lambda: _detect_often(memory, wrenches, motion, parameters), 3) / len(wrenches)
     update = detection_update.py_func
-    slow = seconds(lambda: update(memory, wrenches[0], *motion, *parameters, 1.0, 0.0, 0.0), 20)
+    slow = seconds(lambda: update(memory, wrenches[0], *motion, parameters, 1.0, 0.0, 0.0), 20)
     return ours, slow
 
 

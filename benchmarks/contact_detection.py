@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -38,10 +39,9 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
+from drake_teleop.load.contact.detection import statistics
 from drake_teleop.load.contact.noise_floor import STATISTICS, NoiseFloor, finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
-from drake_teleop.load.contact.roc import auc, free_threshold
-from drake_teleop.load.contact.statistics import statistics
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -58,6 +58,21 @@ RIGHT = np.ones(6)
 GAINS = np.array([1.003, 0.997, 1.002, 0.998, 1.003, 0.997])
 
 Array = NDArray[np.float64]
+
+
+def free_threshold(free: Array, share: float) -> float:
+    """Return the least threshold that at most this share of free-motion values (N,) reach."""
+    ordered = np.sort(free)[::-1]
+    allowed = math.floor(share * len(ordered))
+    # A statistic equal to the threshold is an alarm, so the threshold is just above the next value.
+    return float(np.nextafter(ordered[allowed], np.inf)) if allowed < len(ordered) else -math.inf
+
+
+def auc(free: Array, touched: Array) -> float:
+    """Return the share of pairs with contact (M,) above free motion (N,); ties count half."""
+    ordered = np.sort(free)
+    lower, upper = (np.searchsorted(ordered, touched, side) for side in ("left", "right"))
+    return float(np.mean(lower + upper) / (2.0 * len(ordered)))
 
 
 def motion(samples: int, rng: np.random.Generator) -> tuple[Array, ...]:

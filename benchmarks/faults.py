@@ -36,7 +36,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.identification import true_load
-from drake_teleop.load.sample import TIME
+from drake_teleop.load.regressor import TIME
 from drake_teleop.station import master_side as master
 from drake_teleop.station import slave_side as slave
 from drake_teleop.station import station as station_module

@@ -27,10 +27,17 @@ import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
-from drake_teleop.load.gripper import identified_object
-from drake_teleop.load.identification import Identification
+from drake_teleop.load.identification import Identification, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.change import (
+    OFFSET_DRIFT,
+    STATES,
+    change_memory,
+    change_parameters,
+    identified_load,
+    new_load_age,
+    watch_load,
+)
 from drake_teleop.load.online.recursive import RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench
 
@@ -125,10 +132,43 @@ def known(sensor: str, load: np.ndarray = TOOL, seed: int = 10**6) -> Identifica
     return identify_batch(*rows, method="total", noise=noise).identification
 
 
-def monitor(sensor: str, load: Identification) -> LoadChangeMonitor:
-    """As somebody would set it up who knows the sensor."""
-    wrench_std, motion_std = (np.repeat(std, 3) for std in SENSORS[sensor])
-    return LoadChangeMonitor(load, wrench_std, motion_std, PERIOD)
+class Monitor:
+    """Memory and parameters of `drake_teleop.load.online.change` for one known load."""
+
+    def __init__(
+        self,
+        known: Identification,
+        wrench_std: np.ndarray,
+        motion_std: np.ndarray,
+        period: float = PERIOD,
+        *,
+        offset_drift: Any = OFFSET_DRIFT,
+        **options: float,
+    ) -> None:
+        self.known, self.period, self.samples = known, period, 0
+        self.parameters = change_parameters(wrench_std, motion_std, period, **options)
+        theta = np.concatenate([known.offsets, known.phi])
+        self.memory = change_memory(theta, known.covariance, offset_drift)
+
+    def watch(self, *rows: np.ndarray) -> np.ndarray:
+        """Return the states (N,) for wrench, s, omega and alpha of N samples."""
+        self.samples += len(rows[0])
+        return watch_load(self.memory, self.parameters, *rows)
+
+    @property
+    def load(self) -> Identification:
+        """Known load; the new one once it is identified."""
+        return identified_load(self.memory, self.known)
+
+    @property
+    def changed_at(self) -> float:
+        """Start of the newest new load [s after the first sample]."""
+        return float(self.samples - new_load_age(self.memory)) * self.period
+
+
+def monitor(sensor: str, load: Identification) -> Monitor:
+    """Return a monitor with the noise of this sensor."""
+    return Monitor(load, *(np.repeat(std, 3) for std in SENSORS[sensor]))
 
 
 def study(sensor: str, kind: str, seeds: int) -> dict[str, Any]:

@@ -45,7 +45,7 @@ SAID = {
     "robot-1e300_m.urdf": "origin 1e300 is no finite number up to 1e+06",
     "scenario-tag_of_a_block.yaml": "rates: the tag !Rates means nothing here",
     "scenario-whole_tag.yaml": "the tag tag:yaml.org,2002:int means nothing here",
-    "trajectory-1e308_rad.yaml": "there are numbers beyond 1e+06",
+    "trajectory-1e308_rad.yaml": "contains numbers above 1e+06",
     "scenario-tag_of_nothing.yaml": "operator.task: '!!' is not known",
     "sdf-colour.sdf": "",
     "sdf-logged_error.sdf": "cannot be read as a robot",

@@ -11,7 +11,13 @@ import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.change import (
+    STATES,
+    change_memory,
+    change_parameters,
+    identified_load,
+    watch_load,
+)
 from drake_teleop.load.regressor import non_contact_wrench
 
 tool = phi_from_mass_com_inertia(3.13, [0, 0, 0.085], np.diag([12e-3, 11e-3, 4e-3]))
@@ -29,10 +35,13 @@ noise = np.repeat([0.25, 0.012], 3)
 known = identify_batch(free + noise * rng.normal(size=free.shape), s, omega, alpha).identification
 
 wrench = free + (t > 5.0)[:, None] * non_contact_wrench(s, omega, alpha, held)
-watch = LoadChangeMonitor(known, noise, np.full(9, 1e-3), dt)
-states = watch.watch(wrench + noise * rng.normal(size=free.shape), s, omega, alpha)
-print(f"held: {watch.load.phi[0] - known.phi[0]:.3f} kg")
+parameters = change_parameters(noise, np.full(9, 1e-3), dt)
+memory = change_memory(np.concatenate([known.offsets, known.phi]), known.covariance)
+measured = wrench + noise * rng.normal(size=free.shape)
+states = watch_load(memory, parameters, measured, s, omega, alpha)
+mass = identified_load(memory, known).mass
+print(f"held: {mass - known.mass:.3f} kg")
 figure, axes = plt.subplots(figsize=(7, 2.8))
 axes.step(t, states)
 axes.set_yticks(range(len(STATES)), STATES)
-axes.set(xlabel="t [s]", title=f"the load counts as, in the end {watch.load.phi[0]:.3f} kg")
+axes.set(xlabel="t [s]", title=f"the load counts as, in the end {mass:.3f} kg")

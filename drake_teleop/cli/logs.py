@@ -17,8 +17,7 @@ from drake_teleop.cli.printing import (
 from drake_teleop.common.writing import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
-from drake_teleop.load.gripper import identified_object
-from drake_teleop.load.identification import Identification
+from drake_teleop.load.identification import Identification, identified_object
 from drake_teleop.logs.contact import contacts_of
 from drake_teleop.logs.detection import (
     DetectedLog,
@@ -61,7 +60,7 @@ def identify_command(
     Args:
         method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
         gripper: identification.json of the gripper alone; then the object's object.json, of the
-            same format, is written too (see `drake_teleop.load.gripper`).
+            same format, is written too (see `drake_teleop.load.identification`).
 
     Returns:
         the summary; its names are explained at the top of `logs.figures`.

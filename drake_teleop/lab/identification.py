@@ -29,7 +29,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.contact.noise_floor import NoiseFloor, finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.online.methods import METHODS
+from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import (

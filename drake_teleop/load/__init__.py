@@ -1,1 +1,5 @@
-"""The load's inertia: regressor, parameters, identification, compensation. No Drake in here."""
+"""Inertial load of a wrist sensor: regressor, parameters, identification and elimination.
+
+Functions that check arrays raise DrakeTeleopError for wrong shapes and for numbers that are not
+finite.
+"""

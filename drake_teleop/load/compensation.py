@@ -1,17 +1,9 @@
-"""Eliminating and scaling the non-contact wrench, Eqs. (12)-(14).
-
-With the measured wrench F, the sensor's offsets F_o and the load phi = phi_gr + phi_obj,
+"""Elimination and scaling of the non-contact wrench in S about So, Eqs. (12)-(14) and (T7).
 
     F_c = F - F_o - V phi                                          (13)
-    F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (Fig. 2)
+    F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
 
-sigma = 0 eliminates the load, 0 < sigma < 1 makes it lighter, 1 keeps it, more makes it heavier:
-the apparent mass is sigma m, in weight as well as in inertia. gamma scales the contact. Offsets
-are subtracted and never scaled. eta of Eq. (14) is the case sigma_gr = 0, sigma_obj = eta,
-gamma = 1.
-
-All in the sensor frame S about its origin So; wrenches [f; tau] [N, N m], motion and phi as in
-`regressor`.
+sigma scales weight and inertia of the load (0 eliminates it), gamma the contact wrench.
 """
 
 from __future__ import annotations
@@ -39,10 +31,9 @@ def scaled_wrench_into(
     gamma,
     out,
 ):
-    """Writes F' into out (6,). With sigma_gripper = sigma_object = 0, gamma = 1 this is Eq. (13).
+    """Write F' of Eq. (T7) into out (6,), with one evaluation of V phi.
 
-    F' = gamma (F - F_o) + V ((sigma_gr - gamma) phi_gr + (sigma_obj - gamma) phi_obj) needs V once,
-    and with sigma = gamma the load drops out exactly, whatever its error.
+    For sigma = gamma the result does not depend on errors of the load.
     """
     a, b = sigma_gripper - gamma, sigma_object - gamma
     phi = (
@@ -90,19 +81,13 @@ def contact_wrench(
     alpha: ArrayLike,
     phi: ArrayLike,
 ) -> Array:
-    """The contact wrench F_c = F - F_o - V phi, Eq. (13).
+    """Return the contact wrench F_c (..., 6) of Eq. (13) [N, N m].
 
     Args:
-        wrench: (..., 6) measured, sign of Eq. (1) [N, N m].
-        offsets: (6,) or (..., 6) of the sensor [N, N m].
-        s, omega, alpha: (..., 3) motion of S, as for `regressor`.
-        phi: (10,) the load about So in S.
-
-    Returns:
-        (..., 6) in S about So [N, N m].
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+        wrench: (..., 6) measured, sign of Eq. (1).
+        offsets: (6,) or (..., 6) of the sensor.
+        s, omega, alpha: (..., 3) as for `regressor`.
+        phi: (10,) about So in S.
     """
     return scaled_wrench(
         wrench,
@@ -131,22 +116,15 @@ def scaled_wrench(
     sigma_object: float,
     gamma: float,
 ) -> Array:
-    """F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj), Fig. 2.
+    """Return the scaled wrench F' (..., 6) of Eq. (T7) [N, N m].
 
     Args:
-        wrench: (..., 6) measured, sign of Eq. (1) [N, N m].
-        offsets: (6,) or (..., 6) of the sensor [N, N m].
-        s, omega, alpha: (..., 3) motion of S, as for `regressor`.
-        phi_gripper, phi_object: (10,) parts of the load about So in S; zeros for no such part.
-        sigma_gripper, sigma_object: share of each part's non-contact wrench that is kept, >= 0.
-        gamma: scale of the contact wrench, >= 0.
-
-    Returns:
-        (..., 6) in S about So [N, N m].
+        wrench, offsets, s, omega, alpha: as for `contact_wrench`.
+        phi_gripper, phi_object: (10,) parts of the load; zeros for a missing part.
+        sigma_gripper, sigma_object, gamma: factors >= 0.
 
     Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite, or for
-            a negative scale.
+        DrakeTeleopError: for a negative factor.
     """
     scales = [
         _scale("sigma_gripper", sigma_gripper),
@@ -162,31 +140,11 @@ def scaled_wrench(
     return out.reshape(*leading, 6)
 
 
-def modified_phi(phi_gripper: ArrayLike, phi_object: ArrayLike, eta: float) -> Array:
-    """What is subtracted to remove the gripper and keep the share eta of the object, Eq. (14).
-
-    Args:
-        phi_gripper, phi_object: (10,) about So in S.
-        eta: share of the object's non-contact wrench that is kept, 0 to 1.
-
-    Returns:
-        (10,) phi_gr + (1 - eta) phi_obj.
-
-    Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or eta outside [0, 1].
-    """
-    gripper, gripped = (
-        checked("phi_gripper", phi_gripper, 10),
-        checked("phi_object", phi_object, 10),
-    )
-    return gripper + (1.0 - scales_from_eta(eta)[1]) * gripped
-
-
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """(sigma_gripper, sigma_object, gamma) = (0, eta, 1), which is what Eq. (14) does.
+    """Return (sigma_gripper, sigma_object, gamma) = (0, eta, 1), equivalent to Eq. (14).
 
     Raises:
-        DrakeTeleopError: if eta is not within [0, 1].
+        DrakeTeleopError: if eta is outside [0, 1].
     """
     if not 0.0 <= number("eta", eta) <= 1.0:
         raise DrakeTeleopError(f"{eta:g} is outside 0 to 1", where="eta")

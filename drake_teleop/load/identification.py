@@ -1,23 +1,15 @@
-"""An identified load: its values, how well each is known, and its file.
+"""Identified load: values, covariance, verdicts, identification.json, and the gripped object.
 
-**What is reported as known.** A load is known to the extent that the motion excited it, and an
-estimator gives numbers for the rest too. Two steps decide what `Identification.identifiable` says:
-
-1. A parameter with a component in a direction that the motion does not determine is undetermined:
-   its variance is infinite (`normal_equations`).
-2. The standard deviations must be honest (`normal_equations` says how), and small enough for the
-   value to mean something. A parameter is identifiable if its standard deviation is at most 5 % of
-   what is natural for a load of this mass m and size L (centre of mass from So, at least 3 cm):
-   m g and m g L for the offsets, m, m L for the first moments, and m L^2 / 3 for the inertia,
-   which is what a rod from So to as far again beyond the centre of mass has about the latter.
-   `Identification.verdicts` adds what the bools cannot say: up to 50 % is "weakly", more "not".
+Parameters in directions without excitation are undetermined: variance inf. A parameter is
+identified if its standard deviation is at most 5 % of `natural_scale`, and "weakly" up to 50 %.
 """
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +19,10 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array, checked, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.writing import write_json
-from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia
+from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
 VERDICTS = ("identified", "weakly", "not", "prior")
-"""What `Identification.verdicts` may say of a parameter."""
+"""Values of `Identification.verdicts`."""
 
 PARAMETERS = (
     *("f_ox", "f_oy", "f_oz", "tau_ox", "tau_oy", "tau_oz"),
@@ -38,44 +30,35 @@ PARAMETERS = (
 )
 """Names of the 16 parameters in the order of Eq. (7): [offsets; phi]."""
 
-METHODS = (
-    *("batch least squares", "recursive least squares"),
-    *("whitened least squares", "robust least squares", "physically consistent least squares"),
-    *("total least squares", "recursive instrumental variables", "recursive total least squares"),
-)
-"""What `Identification.method` says of the estimators that ship."""
-
 WORTH_STATING = 0.05
-"""Standard deviation over natural scale up to which a parameter is identified."""
-# Worth stating: standard deviation over natural scale, smallest size of a load [m], gravity.
-_WEAK, _SMALLEST_SIZE, _GRAVITY = 0.5, 0.03, 9.81
-_LARGEST = 1e9  # of any value, in SI: beyond, its squares' squares are not far from infinity
-_OPTIONAL = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
+"""Largest standard deviation of an identified parameter, relative to its natural scale."""
+# Limit of "weakly" relative to the natural scale, smallest size of a load [m], gravity [m/s^2].
+_WEAK, _MIN_SIZE_M, _GRAVITY = 0.5, 0.03, 9.81
+_MAX_VALUE = 1e9  # of any value in SI units; fourth powers must not overflow
+_OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "verdicts"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification:
-    """An identified load; what identification.json holds.
+    """Identified load, as stored in identification.json.
 
     Attributes:
-        phi: (10,) the load about So in S [kg, kg m, kg m^2].
-        offsets: (6,) of the force-torque sensor [N, N m].
-        covariance: (16, 16) of [offsets; phi], Eq. (7), in SI. The variance of an undetermined
-            parameter is inf and its covariances are 0; in the file inf is null.
-        identifiable: (16,) bools, whether the record determines the parameter well enough for its
-            value to mean something (the rule is in the module's docstring).
-        condition_number: of the regressor [E V] of Eq. (8) with its 16 columns scaled to unit norm
-            (and rows by the noise), over the directions that the record determines.
-        delay_s: how much later the motion was recorded than the wrench [s].
+        phi: (10,) about So in S [kg, kg m, kg m^2].
+        offsets: (6,) of the sensor [N, N m].
+        covariance: (16, 16) of [offsets; phi], Eq. (7) [SI]. An undetermined parameter has
+            variance inf (null in the file) and covariances 0.
+        identifiable: (16,) bools.
+        condition_number: of [E V] of Eq. (8), rows weighted by the noise and columns scaled to
+            unit norm, over the determined directions.
+        delay_s: delay of the motion relative to the wrench [s].
         residual_rms: (6,) of the wrench channels [N, N m].
-        method: in words, as `METHODS`.
+        method: name of the estimator.
         samples: number of samples.
-        weight_removed: whether the robot had removed the load's weight from the wrench, so that
-            only its inertia was left: then only that is to be subtracted. Optional in the file.
-        degrees_of_freedom: (16,) of the variances, for the quantiles of intervals; inf (null in the
-            file) where the noise was given and not estimated. Optional in the file.
-        prior_dominated: (16,) bools, whether the value is mostly a prior's
-            (`uncertainty.prior_dominated`); none for methods without one. Optional in the file.
+        weight_removed: whether the robot had removed the load's weight from the wrench.
+        degrees_of_freedom: (16,) of the variances; inf (null) for specified noise.
+        prior_dominated: (16,) bools, see `uncertainty.prior_dominated`.
+
+    The last three are optional in the file.
     """
 
     phi: Array
@@ -92,48 +75,45 @@ class Identification:
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     def __post_init__(self) -> None:
-        """Raises DrakeTeleopError for a phi or offsets of another shape, or a load never learnt."""
         learnt("phi", checked("phi", self.phi, 10))
         checked("offsets", self.offsets, 6)
 
     @property
     def mass(self) -> float:
-        """[kg]; negative if the wrench has the opposite sign of Eq. (1)."""
+        """Mass [kg]; negative for a wrench of opposite sign."""
         return float(self.phi[0])
 
     @property
     def com(self) -> Array:
-        """(3,) centre of mass p_SoBcm_S [m]."""
+        """Centre of mass p_SoBcm_S (3,) [m]."""
         return mass_com_inertia(self.phi)[1]
 
     @property
     def inertia_com(self) -> Array:
-        """(3, 3) inertia about the centre of mass, axes of S [kg m^2]."""
+        """Inertia (3, 3) about the centre of mass, axes of S [kg m^2]."""
         return mass_com_inertia(self.phi)[2]
 
     @property
     def physically_consistent(self) -> bool:
-        """Whether some body can have these parameters; seldom so if some are not identifiable."""
+        """Whether a body with these parameters exists, Eq. (T1)."""
         return is_physically_consistent(self.phi)
 
     @property
     def standard_deviations(self) -> Array:
-        """(16,) of [offsets; phi], inf for undetermined parameters."""
+        """Standard deviations (16,) of [offsets; phi] [SI]; inf for undetermined parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """(16,) of `VERDICTS`: "identified" is `identifiable`; the others say why it is not.
+        """Verdicts (16,) from `VERDICTS`.
 
-        "prior": the value is mostly the prior's. "weakly": the standard deviation is at most 50 %
-        of what is natural for the load, so that the value tells its order. "not": nothing is known.
+        "prior" marks a value that is mostly the prior's, "weakly" 5 % to 50 % of `natural_scale`.
         """
         share = self.standard_deviations / natural_scale(self.phi)
         rest = np.where(self.prior_dominated, "prior", np.where(share <= _WEAK, "weakly", "not"))
         return tuple(np.where(self.identifiable, "identified", rest).tolist())
 
     def __repr__(self) -> str:
-        """Eight lines; +- is the largest standard deviation."""
         deviations, named = self.standard_deviations, zip(PARAMETERS, self.verdicts, strict=True)
         mass, com, inertia = mass_com_inertia(self.phi)
         inertia = np.where(self.identifiable[10:], inertia[np.triu_indices(3)], np.nan)
@@ -154,10 +134,10 @@ class Identification:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes identification.json.
+        """Write identification.json.
 
         Raises:
-            DrakeTeleopError: if one of its figures is not finite, or the file cannot be written.
+            DrakeTeleopError: if a figure is not finite or the file cannot be written.
         """
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             checked(f"{path}:{name}", getattr(self, name), *shape)
@@ -186,51 +166,50 @@ class Identification:
 
     @classmethod
     def load(cls, path: str | Path) -> Identification:
-        """Reads identification.json.
+        """Read identification.json.
 
         Raises:
-            DrakeTeleopError: naming file and field, if the file is missing, is no JSON, or a field
-                is missing, unknown, of the wrong shape or type, not finite, or at odds with phi,
-                or the load was never learnt.
+            DrakeTeleopError: with file and field, if content is missing, unknown, malformed or
+                contradicts phi.
         """
         expect((str, Path), path, "load")
         document = _read_json(path)
         known = {*cls.__dataclass_fields__, "mass", "com", "inertia_com", "physically_consistent"}
         known |= {"verdicts"}
-        for name in sorted((known ^ document.keys()) - (_OPTIONAL - document.keys())):
-            what = "is missing" if name in known else "is not a field of an identification"
-            raise DrakeTeleopError(what, where=f"{path}:{name}")
+        for name in sorted((known ^ document.keys()) - (_OPTIONAL_FIELDS - document.keys())):
+            problem = "is missing" if name in known else "is not a field of an identification"
+            raise DrakeTeleopError(problem, where=f"{path}:{name}")
 
         def numbers(name: str, *shape: int, largest: float = np.inf) -> Array:
-            if not _holds_numbers(document[name]):
+            if not _only_numbers(document[name]):
                 raise DrakeTeleopError("holds no numbers", where=f"{path}:{name}")
             array = checked(f"{path}:{name}", document[name], *shape)
             if np.abs(array).max() > largest:
-                raise DrakeTeleopError(f"is beyond {largest:g}", where=f"{path}:{name}")
+                raise DrakeTeleopError(f"is above {largest:g} in magnitude", where=f"{path}:{name}")
             return array
 
         if not isinstance(document["method"], str):
-            raise DrakeTeleopError("is no text", where=f"{path}:method")
+            raise DrakeTeleopError("is not a text", where=f"{path}:method")
         optional: dict[str, Any] = {}
         if (name := "weight_removed") in document:
             if not isinstance(document[name], bool):
-                raise DrakeTeleopError("is neither true nor false", where=f"{path}:{name}")
+                raise DrakeTeleopError("is not true or false", where=f"{path}:{name}")
             optional[name] = document[name]
         if (name := "degrees_of_freedom") in document:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
-        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_LARGEST))
-        if phi[0] == 0.0:  # what is natural for a load goes with its mass
+        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
+        if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise DrakeTeleopError("has no mass", where=f"{path}:phi")
         result = cls(
             phi=phi,
-            offsets=numbers("offsets", 6, largest=_LARGEST),
+            offsets=numbers("offsets", 6, largest=_MAX_VALUE),
             covariance=_read_covariance(f"{path}:covariance", document["covariance"]),
             identifiable=_read_flags(f"{path}:identifiable", document["identifiable"]),
             condition_number=float(numbers("condition_number")),
-            delay_s=float(numbers("delay_s", largest=_LARGEST)),
-            residual_rms=numbers("residual_rms", 6, largest=_LARGEST),
+            delay_s=float(numbers("delay_s", largest=_MAX_VALUE)),
+            residual_rms=numbers("residual_rms", 6, largest=_MAX_VALUE),
             method=document["method"],
             samples=int(numbers("samples")),
             **optional,
@@ -262,7 +241,6 @@ class Identification:
 
 
 def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -> str:
-    """Numbers side by side, "?" for NaN, and the largest of their standard deviations."""
     text = ", ".join("?" if np.isnan(value) else f"{value:.4g}" for value in values)
     text = text if len(values) == 1 else f"[{text}]"
     if deviations is None:
@@ -271,12 +249,7 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
 
 
 def com_deviations(phi: Array, covariance: Array) -> Array:
-    """(3,) standard deviations of the centre of mass [m], to first order.
-
-    Args:
-        phi: (10,) the load.
-        covariance: (16, 16) of [offsets; phi].
-    """
+    """Return (3,) standard deviations of the centre of mass [m], to first order."""
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
     part = covariance[6:10, 6:10]
@@ -286,29 +259,24 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    """(16,) whether a parameter is known to 5 % of what is natural for the load (module docstring).
-
-    Args:
-        standard_deviations: (16,) of [offsets; phi] [SI].
-        phi: (10,) the load.
-    """
+    """Return (16,) bools: standard deviation at most 5 % of `natural_scale`."""
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
-    """(16,) what is natural for [offsets; phi] of a load of this mass and size (module docstring).
+    """Return the natural scale (16,) of [offsets; phi] for mass m and size L = max(|c|, 3 cm).
 
-    Args:
-        phi: (10,) the load; its mass is not zero.
+    m g and m g L for offsets, m, m L, and m L^2 / 3 for the inertia: a rod from So to 2 c about its
+    centre. The mass must not be zero.
     """
     m = abs(phi[0])
-    L = max(float(np.linalg.norm(phi[1:4])) / m, _SMALLEST_SIZE)
+    L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
     scale: Array = m * np.repeat([_GRAVITY, _GRAVITY * L, 1.0, L, L * L / 3.0], [3, 3, 1, 3, 6])
     return scale
 
 
 def _read_json(path: str | Path) -> dict[str, Any]:
-    from drake_teleop.common.texts import read_json  # PyYAML takes its time to start
+    from drake_teleop.common.texts import read_json  # the import of PyYAML is slow
 
     if not os.path.exists(path):
         raise DrakeTeleopError(
@@ -316,14 +284,14 @@ def _read_json(path: str | Path) -> dict[str, Any]:
         )
     document = read_json(path)
     if not isinstance(document, dict):
-        raise DrakeTeleopError("holds no JSON object", where=str(path))
+        raise DrakeTeleopError("is not a JSON object", where=str(path))
     return document
 
 
-def _holds_numbers(value: Any) -> bool:
-    """Of JSON: numpy would take "1" and true for 1."""
+def _only_numbers(value: Any) -> bool:
+    """Return whether JSON data contains numbers only; NumPy would also convert "1" and true."""
     if isinstance(value, list):
-        return all(map(_holds_numbers, value))
+        return all(map(_only_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
@@ -335,7 +303,7 @@ def _read_covariance(where: str, value: Any) -> Array:
     if raw.shape != (16, 16):
         raise DrakeTeleopError("is not a (16, 16) table of numbers", where=where)
     unknown = np.array([[i == j and raw[i, j] is None for j in range(16)] for i in range(16)])
-    if not _holds_numbers(raw[~unknown].tolist()):
+    if not _only_numbers(raw[~unknown].tolist()):
         raise DrakeTeleopError("holds no numbers", where=where)
     covariance = checked(where, np.where(unknown, 0.0, raw), 16, 16)
     if (np.diag(covariance) < 0.0).any():
@@ -352,10 +320,80 @@ def _read_flags(where: str, value: Any) -> NDArray[np.bool_]:
 
 
 def _read_degrees(where: str, value: Any) -> Array:
-    if not (isinstance(value, list) and _holds_numbers([v for v in value if v is not None])):
+    if not (isinstance(value, list) and _only_numbers([v for v in value if v is not None])):
         raise DrakeTeleopError("is not a list of 16 numbers or null", where=where)
     degrees = checked(where, [0.0 if v is None else v for v in value], 16)
     unknown = np.array([v is None for v in value])
     if not (degrees[~unknown] > 0.0).all():
         raise DrakeTeleopError("is not positive throughout", where=where)
     return np.where(unknown, np.inf, degrees)
+
+
+SIGNIFICANT = 3.0
+"""Standard deviations below zero at which a mass counts as negative."""
+
+_IS_PHI = np.arange(16) >= 6
+
+
+def identified_object(total: Identification, gripper: Identification) -> Identification:
+    """Return the object's identification: gripper with object minus gripper alone.
+
+    Covariances of phi add. All fields that do not concern phi are those of `total`.
+
+    Raises:
+        DrakeTeleopError: if the object's mass is zero, or negative by more than `SIGNIFICANT`
+            standard deviations.
+    """
+    phi: Array = total.phi - gripper.phi
+    covariance = total.covariance.copy()
+    covariance[6:, 6:] += gripper.covariance[6:, 6:]
+    undetermined = np.isinf(np.diag(covariance))
+    covariance[undetermined, :] = covariance[:, undetermined] = 0.0
+    covariance[undetermined, undetermined] = np.inf
+    deviations = np.sqrt(np.diag(covariance))
+    if phi[0] < -SIGNIFICANT * deviations[6] or phi[0] == 0.0:
+        raise DrakeTeleopError(
+            f"total minus gripper leaves {phi[0]:.4g} kg for the object",
+            where="gripper",
+            remedy="give the gripper alone as gripper, and the record with the object as the load",
+        )
+    identifiable = worth_stating(deviations, phi) & ~undetermined
+    identifiable[6:] &= total.identifiable[6:]
+    return replace(
+        total,
+        phi=phi,
+        covariance=covariance,
+        identifiable=identifiable,
+        degrees_of_freedom=_degrees_of_freedom(total, gripper),
+        prior_dominated=total.prior_dominated | gripper.prior_dominated & _IS_PHI,
+    )
+
+
+def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array:
+    a, b = (np.diag(load.covariance) for load in (total, gripper))
+    b = np.where(_IS_PHI, b, 0.0)
+    finite = np.isfinite(a + b) & (a + b > 0.0)
+    a, b = np.where(finite, a, 1.0), np.where(finite, b, 0.0)
+    with np.errstate(divide="ignore"):
+        sums = (a + b) ** 2 / (a**2 / total.degrees_of_freedom + b**2 / gripper.degrees_of_freedom)
+    return np.where(finite, sums, np.inf)
+
+
+def consistency_margin(load: Identification) -> tuple[float, float]:
+    """Return the smallest eigenvalue of the pseudo-inertia and its standard deviation, Eq. (T9).
+
+    In units of mass and radius of gyration about So; positive for a consistent load. The standard
+    deviation is inf if phi is not fully determined.
+    """
+    J = pseudo_inertia(load.phi)
+    mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))
+    length = np.sqrt(spread / mass) if spread > 0.0 else 1.0
+    scale: Array = np.sqrt(mass) * np.array([length, length, length, 1.0])
+    eigenvalues, vectors = np.linalg.eigh(J / np.outer(scale, scale))
+    v = vectors[:, 0] / scale
+    gradient = np.array([float(v @ pseudo_inertia(unit) @ v) for unit in np.eye(10)])
+    covariance = load.covariance[6:, 6:]
+    if np.isinf(covariance).any():
+        return float(eigenvalues[0]), float("inf")
+    variance = max(0.0, float(gradient @ covariance @ gradient))
+    return float(eigenvalues[0]), math.sqrt(variance)

@@ -1,15 +1,7 @@
-"""The ten inertial parameters phi of a rigid load: other frames, consistency, gripper and object.
+"""Inertial parameters phi of a rigid load: frames and physical consistency.
 
-phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6): mass [kg], first moments about the
-frame's origin [kg m], inertia about the frame's origin [kg m^2] with the products as entries of
-the tensor of Eq. (3). phi is linear in the load: parameters of parts add.
-
-Most of this goes through the pseudo-inertia (Wensing, Kim, Slotine 2018)
-
-    J = [[Sigma, h], [h^T, m]],  Sigma = 1/2 tr(I) E - I = integral of r r^T dm,  h = m c,
-
-which is the second moment of the mass in homogeneous coordinates: it transforms as T J T^T and is
-positive semidefinite exactly if some distribution of positive mass has these parameters.
+phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], about the frame's
+origin. Parameters of parts add. Pseudo-inertia: Wensing, Kim, Slotine 2018.
 """
 
 from __future__ import annotations
@@ -20,65 +12,58 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
 
-# Rounding of phi and of the eigenvalues, so that rods, plates and points count as consistent.
+# Tolerance for rounding, so that rods, plates and points are consistent.
 _ROUNDING = 1e-12
-# Square of a radius of gyration [m^2] below which a body is a point.
-_LEAST_SPREAD = 1e-290
+# Squared radius of gyration [m^2] below which a body is a point.
+_POINT_SPREAD_M2 = 1e-290
 
 
-def _second_moment(about: Array, mass: float) -> Array:
-    """Inertia about the origin of a point mass at `about`."""
+def _point_inertia(about: Array, mass: float) -> Array:
     return mass * (about @ about * np.eye(3) - np.outer(about, about))
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    """phi of a load given as data sheets and CAD programs give it.
+    """Return phi (10,) about So in S.
 
     Args:
         mass: [kg].
         p_SoBcm_S: (3,) centre of mass from So, in S [m].
         I_BBcm_S: (3, 3) inertia about the centre of mass, axes of S [kg m^2].
 
-    Returns:
-        (10,) phi about So in S.
-
     Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or an asymmetric tensor.
+        DrakeTeleopError: for an asymmetric tensor.
     """
     m = float(checked("mass", mass))
     p = checked("p_SoBcm_S", p_SoBcm_S, 3)
     I = checked("I_BBcm_S", I_BBcm_S, 3, 3)  # noqa: E741
     if np.abs(I - I.T).max() > 1e-9 * np.abs(I).max():
         raise DrakeTeleopError("the inertia tensor is not symmetric", where="I_BBcm_S")
-    about_origin = I + _second_moment(p, m)
+    about_origin = I + _point_inertia(p, m)
     return np.concatenate([[m], m * p, about_origin[np.triu_indices(3)]])
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
-    """Mass [kg], centre of mass p_SoBcm_S (3,) [m] and inertia I_BBcm_S (3, 3) [kg m^2].
-
-    The inverse of `phi_from_mass_com_inertia`. A negative mass (a log of the opposite sign) is
-    passed on.
+    """Return mass [kg], p_SoBcm_S (3,) [m] and I_BBcm_S (3, 3) [kg m^2]; the mass may be negative.
 
     Raises:
-        DrakeTeleopError: if phi is not ten finite numbers, or the mass is zero.
+        DrakeTeleopError: if the mass is zero.
     """
     phi = checked("phi", phi, 10)
     m = float(phi[0])
     if m == 0.0:
         raise DrakeTeleopError("a load without mass has no centre of mass", where="phi")
     p = phi[1:4] / m
-    return m, p, inertia_about_origin(phi) - _second_moment(p, m)
+    return m, p, inertia_about_origin(phi) - _point_inertia(p, m)
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
-    """The tensor of Eq. (3): (3, 3), about So in S [kg m^2]."""
+    """Return the inertia tensor (3, 3) of Eq. (3) about So in S [kg m^2]."""
     xx, xy, xz, yy, yz, zz = checked("phi", phi, 10)[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """(4, 4) J = [[Sigma, h], [h^T, m]] [kg m^2, kg m, kg], Sigma = 1/2 tr(I) E - I."""
+    """Return the pseudo-inertia J (4, 4) of Eq. (T1) [kg m^2, kg m, kg]."""
     phi = checked("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
@@ -89,10 +74,10 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """(10,) phi of a pseudo-inertia, the inverse of `pseudo_inertia`: I = tr(Sigma) E - Sigma.
+    """Return phi (10,), the inverse of `pseudo_inertia`.
 
     Raises:
-        DrakeTeleopError: if J is not a finite symmetric (4, 4) matrix.
+        DrakeTeleopError: if J is not symmetric.
     """
     J = checked("J", J, 4, 4)
     if np.abs(J - J.T).max() > 1e-9 * np.abs(J).max():
@@ -103,17 +88,13 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 
 
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
-    """Whether some body can have these parameters: the pseudo-inertia is positive semidefinite.
+    """Return whether a body with these parameters exists, Eq. (T1).
 
-    This implies m >= 0, a positive semidefinite inertia about the centre of mass and the triangle
-    inequalities of its principal moments. Bodies without extent in some direction (points, rods,
-    plates) are consistent, and so is phi = 0, the absent load.
+    Points, rods, plates and phi = 0 are consistent.
 
     Args:
-        phi: (10,) the load.
-        tolerance: how far below zero the smallest eigenvalue of the pseudo-inertia may lie, with
-            mass in units of m and length in units of the load's radius sqrt(tr(Sigma) / m), where
-            its trace is 2. 1e-12 is always allowed for rounding.
+        phi: (10,) load.
+        tolerance: accepted negative eigenvalue of J, in units of m and sqrt(tr(Sigma) / m).
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -121,26 +102,23 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
     mass, spread = J[3, 3], np.trace(J[:3, :3])
     if mass <= 0.0 or spread < 0.0:
         return False
-    # Next to the smallest numbers there are, quotients are no longer precise: that is a point.
-    length = np.sqrt(spread / mass) if spread > _LEAST_SPREAD * mass else 1.0
+    # Quotients of denormal numbers are inaccurate: treat such a body as a point.
+    length = np.sqrt(spread / mass) if spread > _POINT_SPREAD_M2 * mass else 1.0
     unit = np.array([length, length, length, 1.0])
     eigenvalues = np.linalg.eigvalsh(J / np.outer(unit, unit) / mass)
     return bool(eigenvalues[0] >= -(tolerance + _ROUNDING))
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """The same load seen from another frame and point.
+    """Return phi (10,) of the same load about Ao in A, Eq. (T2).
 
     Args:
         phi_B: (10,) about Bo in B.
         R_AB: (3, 3) rotation, v_A = R_AB v_B.
         p_AoBo_A: (3,) position of Bo from Ao, in A [m].
 
-    Returns:
-        (10,) phi about Ao in A.
-
     Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or if R_AB is no rotation.
+        DrakeTeleopError: if R_AB is not a rotation.
     """
     R = checked("R_AB", R_AB, 3, 3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
@@ -150,27 +128,3 @@ def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Arr
     T[:3, 3] = checked("p_AoBo_A", p_AoBo_A, 3)
     J = T @ pseudo_inertia(phi_B) @ T.T
     return phi_from_pseudo_inertia(0.5 * (J + J.T))
-
-
-def split_object(phi_total: ArrayLike, phi_gripper: ArrayLike) -> Array:
-    """The gripped object alone: phi_obj = phi_total - phi_gr (section V).
-
-    Args:
-        phi_total: (10,) gripper with the object, about So in S.
-        phi_gripper: (10,) gripper alone, about the same So in the same S.
-
-    Returns:
-        (10,) phi of the object about So in S.
-
-    Raises:
-        DrakeTeleopError: if the difference is not physically consistent.
-    """
-    phi = checked("phi_total", phi_total, 10) - checked("phi_gripper", phi_gripper, 10)
-    if not is_physically_consistent(phi):
-        raise DrakeTeleopError(
-            f"total minus gripper is not physically consistent (mass {phi[0]:.4g} kg)",
-            where="phi_object",
-            remedy="identify both about the same sensor frame, with the object in the gripper "
-            "for the total only",
-        )
-    return phi

@@ -1,17 +1,12 @@
-"""The non-contact wrench of a load: the matrix V of Eq. (5) and the Newton-Euler Eqs. (1)-(2).
+"""Non-contact wrench of a load: matrix V of Eq. (5) and Newton-Euler Eqs. (1)-(2).
 
-Everything is expressed in the sensor frame S, about its origin So. The wrench is what the sensor
-exerts on the load: at rest f = -m g. The motion enters as
+All vectors are in the sensor frame S about its origin So. The sensor exerts the wrench on the load;
+at rest f = -m g. Functions named `..._into` are compiled and do not check their input.
 
-- s: specific force a - g of So [m/s^2] (a real accelerometer's reading, moved to So),
-- omega: angular velocity [rad/s],
-- alpha: angular acceleration [rad/s^2],
+A sample is one row of numbers for sensor, estimators and logs (logs use the first 15, SI at So):
 
-and the load as phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] [kg, kg m, kg m^2] with the
-inertia about So and the products as entries of the tensor of Eq. (3).
-
-The ``..._into`` kernels are compiled, allocate nothing and check nothing; the functions without
-that suffix check their input and run the same kernels over any number of samples.
+    [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
+     saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
 """
 
 from __future__ import annotations
@@ -23,10 +18,24 @@ from drake_teleop.common.arrays import Array, checked, checked_rows
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, times
 
+WRENCH = slice(0, 6)
+SPECIFIC_FORCE = slice(6, 9)
+ANGULAR_VELOCITY = slice(9, 12)
+ANGULAR_ACCELERATION = slice(12, 15)
+MOTION = slice(6, 15)  #: specific force, angular velocity and angular acceleration of S
+WRENCH_AND_MOTION = slice(0, 15)
+SATURATED = 15  #: above 0.5 the wrench is not valid
+#: At this value of SATURATED and above, the reading was lost or impossible: the sample is an old
+#: one. The excess counts the samples with remaining effects.
+LOST = 2.0
+BEFORE_JOINTS = 16
+JOINT_POSITION = slice(BEFORE_JOINTS, None)
+TIME = -1  #: [s], only in the output of the wrist sensor
+
 
 @njit(cache=True)
 def regressor_into(s, omega, alpha, V):
-    """Writes V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
+    """Write V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
     sx, sy, sz = s[0], s[1], s[2]
     wx, wy, wz = omega[0], omega[1], omega[2]
     ax, ay, az = alpha[0], alpha[1], alpha[2]
@@ -49,7 +58,7 @@ def regressor_into(s, omega, alpha, V):
 
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Writes V phi, Eqs. (1)-(2), into out (6,) without building V. phi may be a tuple."""
+    """Write V phi, Eqs. (1)-(2), into out (6,) without V. phi may be a tuple."""
     s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
     m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
     force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
@@ -72,19 +81,12 @@ def _non_contact_wrenches(s, omega, alpha, phi, out):
 
 
 def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
-    """V of Eq. (5), with [f; tau] = V phi.
+    """Return V (..., 6, 10) of Eq. (5), with [f; tau] = V phi.
 
     Args:
         s: (..., 3) specific force a - g of So in S [m/s^2].
         omega: (..., 3) angular velocity of S in S [rad/s].
         alpha: (..., 3) angular acceleration of S in S [rad/s^2].
-
-    Returns:
-        (..., 6, 10). For many samples this is large: `non_contact_wrench` and
-        `normal_equations.NormalEquations` do without it.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
     """
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     V = np.empty((motion[0].shape[0], 6, 10))
@@ -93,20 +95,29 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
 
 
 def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: ArrayLike) -> Array:
-    """The wrench [f; tau] that moves the load, Eqs. (1)-(2) and (12).
+    """Return the wrench V phi (..., 6) of Eqs. (1)-(2) and (12) [N, N m].
 
-    Args:
-        s, omega, alpha: (..., 3) as for `regressor`.
-        phi: (10,) the load about So in S.
-
-    Returns:
-        (..., 6) wrench of the sensor on the load about So in S [N, N m].
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
+    Arguments as for `regressor`, and phi (10,) about So in S.
     """
     phi = checked("phi", phi, 10)
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     out = np.empty((motion[0].shape[0], 6))
     _non_contact_wrenches(*motion, phi, out)
     return out.reshape(*leading, 6)
+
+
+def sample_parts(num_joints: int) -> dict[str, int]:
+    """Return the parts of a wrist sensor's sample: signal name -> size."""
+    return {
+        "measured_wrench_S": 6,
+        "specific_force_S": 3,
+        "angular_velocity_S": 3,
+        "angular_acceleration_S": 3,
+        "saturated": 1,
+        "joint_position": num_joints,
+    }
+
+
+def sample_size(num_joints: int) -> int:
+    """Return the length of a wrist sensor's sample without time."""
+    return BEFORE_JOINTS + num_joints

@@ -1,9 +1,4 @@
-"""How well a load has to be known: "mass 0.5 %, com 0.5 mm, inertia 5 %", and how well it is.
-
-The mass in percent of itself, the centre of mass along each axis in metres, and the six entries of
-the inertia about the centre of mass in percent of the mean of its principal moments: what a robot
-is told. They follow from [offsets; phi] by first order, and their covariance with them.
-"""
+"""Required accuracy of a load, such as "mass 0.5 %, com 0.5 mm, inertia 5 %", and its check."""
 
 from __future__ import annotations
 
@@ -17,28 +12,28 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITIES = ("mass", "com", "inertia")
-"""What may be asked for."""
+"""Quantities of a tolerance."""
 ENTRIES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 }
-"""The numbers that each is made of."""
+"""Numbers of each quantity."""
 UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
-"""In which the numbers of each are shown."""
+"""Units for display."""
 
-_UNITS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
-_ONE = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
-_LEAST, _MOST = 1e-9, 10.0
+_FACTORS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
+_ENTRY_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
+_MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
-    """How well each is to be known; None where nothing is asked.
+    """Required standard deviations; None where no accuracy is required.
 
     Attributes:
-        mass: share of itself.
+        mass: relative to the mass.
         com: along each axis [m].
-        inertia: of each entry about the centre of mass, share of the mean principal moment.
+        inertia: of each entry about the centre of mass, relative to the mean principal moment.
     """
 
     mass: float | None = None
@@ -46,17 +41,17 @@ class Tolerance(NamedTuple):
     inertia: float | None = None
 
     @property
-    def asked(self) -> tuple[str, ...]:
-        """The `QUANTITIES` that are asked for."""
+    def required(self) -> tuple[str, ...]:
+        """Required `QUANTITIES`."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """(k,) the numbers that are asked for, in the order of `errors_of`."""
-        return tuple(entry for name in self.asked for entry in ENTRIES[name])
+        """Names (k,) of the required numbers, in the order of `errors_of`."""
+        return tuple(entry for name in self.required for entry in ENTRIES[name])
 
     def __str__(self) -> str:
-        """As `read_tolerance` reads it."""
+        """Return the text that `read_tolerance` reads."""
         return ", ".join(
             f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
             for name, value in zip(QUANTITIES, self, strict=True)
@@ -65,38 +60,33 @@ class Tolerance(NamedTuple):
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """The tolerance in words like "mass 0.5 %, com 0.5 mm, inertia 5 %".
+    """Return the tolerance of a text of this form.
 
     Raises:
-        DrakeTeleopError: if it is no such list.
+        DrakeTeleopError: for another form or a value outside 1e-9 to 10.
     """
     found: dict[str, float] = {}
     for part in text.split(","):
-        match = _ONE.fullmatch(part)
+        match = _ENTRY_PATTERN.fullmatch(part)
         name, unit = (match[1], match[3]) if match else ("", "")
         try:
-            value = float(match[2]) * _UNITS[unit] if match else 0.0
+            value = float(match[2]) * _FACTORS[unit] if match else 0.0
         except ValueError:
             value = 0.0
         if name not in QUANTITIES or (unit == "%") == (name == "com") or name in found:
             raise DrakeTeleopError(
-                f"{part.strip()!r} is no tolerance",
+                f"{part.strip()!r} is not a tolerance",
                 where=text,
                 remedy="write, say, mass 0.5 %, com 0.5 mm, inertia 5 %",
             )
-        if not _LEAST <= value <= _MOST:
-            raise DrakeTeleopError(f"{part.strip()!r} is out of reach", where=text)
+        if not _MIN_VALUE <= value <= _MAX_VALUE:
+            raise DrakeTeleopError(f"{part.strip()!r} is outside 1e-9 to 10", where=text)
         found[name] = value
     return Tolerance(**found)
 
 
 def errors_of(tolerance: Tolerance, phi: Array) -> Array:
-    """(k, 16) what a small error of [offsets; phi] is in the asked numbers, over their tolerances.
-
-    Args:
-        tolerance: with k numbers.
-        phi: (10,) about which it is small; its mass is not zero.
-    """
+    """Return the derivative (k, 16) of required numbers over tolerances by [offsets; phi]."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -109,40 +99,39 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
         both = np.outer(E[k], c) + np.outer(c, E[k])
         rows[4:, 1 + k] = -(2.0 * c[k] * E - both)[upper]
     rows[4:, 4:] = np.eye(6)
-    # Where the inertia is hardly known yet the estimate may be anything, but not smaller than this.
+    # Lower bound, because a poorly determined inertia can have any estimate.
     scale = max(float(np.trace(inertia)) / 3.0, 1e-4 * abs(m) * (float(c @ c) + 1e-4))
-    out, at = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
-    for name in tolerance.asked:
-        start, stop, size = at[name]
+    out, rows_of = [], {"mass": (0, 1, 1.0), "com": (1, 4, 1.0), "inertia": (4, 10, scale)}
+    for name in tolerance.required:
+        start, stop, size = rows_of[name]
         out.append(rows[start:stop] / (size * getattr(tolerance, name)))
     return np.hstack([np.zeros((sum(map(len, out)), 6)), np.concatenate(out)])
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """(k,) standard deviations of the asked numbers over their tolerances; inf: undetermined.
-
-    Args:
-        errors: (k, 16) from `errors_of`.
-        covariance: (16, 16) of [offsets; phi], as of an `Identification`.
-    """
+    """Return standard deviations (k,) over tolerances from `errors_of`; inf if undetermined."""
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
-    lacking = (errors[:, unknown] != 0.0).any(axis=1)
-    return np.where(lacking, np.inf, np.sqrt(np.maximum(variances, 0.0)))
+    is_undetermined = (errors[:, unknown] != 0.0).any(axis=1)
+    return np.where(is_undetermined, np.inf, np.sqrt(np.maximum(variances, 0.0)))
 
 
 def values_of(tolerance: Tolerance, phi: Array) -> Array:
-    """(k,) the asked numbers in the units of `UNITS`."""
+    """Return the required numbers (k,) in the units of `UNITS`."""
     m, c, inertia = mass_com_inertia(phi)
-    all_ = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
-    return np.concatenate([all_[name] for name in tolerance.asked])
+    values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
+    return np.concatenate([values[name] for name in tolerance.required])
 
 
 def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
-    """(k,) the tolerances in the units of `UNITS`."""
+    """Return the tolerances (k,) in the units of `UNITS`."""
     m, _, inertia = mass_com_inertia(phi)
-    sizes = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
+    size = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     return np.array(
-        [sizes[name] * getattr(tolerance, name) for name in tolerance.asked for _ in ENTRIES[name]]
+        [
+            size[name] * getattr(tolerance, name)
+            for name in tolerance.required
+            for _ in ENTRIES[name]
+        ]
     )

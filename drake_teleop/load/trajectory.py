@@ -1,4 +1,4 @@
-"""Excitation trajectories as Fourier series, Eqs. (9)-(10). Who designs them: room `excitation`."""
+"""Excitation trajectories as Fourier series, Eqs. (9)-(10)."""
 
 from __future__ import annotations
 
@@ -14,20 +14,17 @@ from drake_teleop.common.writing import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 
-_FIELDS, _OF_JOINT = {"frequency", "joints"}, {"q0", "rho", "delta"}
-_LARGEST = 1e6  # of any number in a file: rad, and Hz
+_FIELDS, _JOINT_FIELDS = {"frequency", "joints"}, {"q0", "rho", "delta"}
+_MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]
 
 
 @dataclass(frozen=True)
 class FourierTrajectory:
-    """A periodic joint trajectory, Eqs. (9)-(10).
+    """Periodic joint trajectory, Eqs. (9)-(10).
 
-    q_i(t) = q0_i + sum_k rho_ik sin(2 pi k f t) + delta_ik cos(2 pi k f t), k = 1..N.
-
-    Args:
+    Attributes:
         q0: (n,) constant part [rad].
-        rho: (n, N) sine coefficients [rad].
-        delta: (n, N) cosine coefficients [rad].
+        rho, delta: (n, N) sine and cosine coefficients [rad].
         frequency: base frequency f [Hz].
     """
 
@@ -40,15 +37,11 @@ class FourierTrajectory:
     def at_rest(
         cls, q0: ArrayLike, sine: ArrayLike, cosine: ArrayLike, frequency: float
     ) -> FourierTrajectory:
-        """A trajectory whose velocity and acceleration vanish at both ends of the period.
-
-        The paper's form starts with velocity 2 pi f sum(k rho) and acceleration
-        -(2 pi f)^2 sum(k^2 delta). Both are eliminated: the free coefficients are coordinates in
-        the subspace where they are zero, and the k-th harmonic is scaled by 1/k.
+        """Return a trajectory that is at rest at both ends of the period, Eq. (T17).
 
         Args:
-            q0: (n,) constant part [rad]. The trajectory starts at q0 + sum(delta).
-            sine, cosine: (n, N - 1) free coefficients [rad].
+            q0: (n,) constant part [rad]; the trajectory starts at q0 + sum(delta).
+            sine, cosine: (n, N - 1) free coefficients [rad]; harmonic k is scaled by 1/k.
             frequency: base frequency [Hz].
         """
         sine, cosine = np.asarray(sine, float), np.asarray(cosine, float)
@@ -61,7 +54,7 @@ class FourierTrajectory:
         return 1.0 / self.frequency
 
     def evaluate(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """Position, velocity, acceleration at times `t` (...) [s], each (..., n) in rad and s."""
+        """Return position, velocity and acceleration (..., n) at times t (...) [s, rad]."""
         rate = 2 * np.pi * self.frequency * np.arange(1, self.rho.shape[1] + 1)
         phase = np.multiply.outer(np.asarray(t, float), rate)
         sine, cosine = np.sin(phase), np.cos(phase)
@@ -72,11 +65,11 @@ class FourierTrajectory:
         return q, qd, qdd
 
     def scaled(self, factor: float) -> FourierTrajectory:
-        """The same motion with `factor` times the amplitude about q0."""
+        """Return the motion with `factor` times the amplitude about q0."""
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        """Writes the coefficients as YAML: `frequency`, and by joint `q0`, `rho`, `delta`."""
+        """Write the coefficients as YAML."""
         from drake_teleop.common.texts import yaml_text
 
         joints = {
@@ -88,17 +81,17 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Reads what `save` wrote.
+        """Read a file of `save`.
 
         Raises:
-            DrakeTeleopError: naming file and field, if that cannot be a trajectory.
+            DrakeTeleopError: with file and field, if the content is not a trajectory.
         """
         from drake_teleop.common.texts import read_yaml
 
         data = read_yaml(path)
         try:
             joints = list(data["joints"].values())
-            for fields, known in [(data, _FIELDS), *((joint, _OF_JOINT) for joint in joints)]:
+            for fields, known in [(data, _FIELDS), *((joint, _JOINT_FIELDS) for joint in joints)]:
                 if unknown := sorted(fields.keys() - known):
                     raise DrakeTeleopError(
                         f"there is no field '{unknown[0]}'",
@@ -123,13 +116,12 @@ class FourierTrajectory:
                 "is not a trajectory: q0 is a number, rho and delta have one for each harmonic",
                 where=str(path),
             )
-        if np.abs(numbers).max() > _LARGEST:
-            raise DrakeTeleopError(f"there are numbers beyond {_LARGEST:g}", where=str(path))
+        if np.abs(numbers).max() > _MAX_NUMBER:
+            raise DrakeTeleopError(f"contains numbers above {_MAX_NUMBER:g}", where=str(path))
         return cls(q0, rho, delta, frequency)
 
 
 def _rest_bases(harmonics: int) -> tuple[Array, Array]:
-    """(N - 1, N) each: from free coefficients to rho and to delta, with rest at the ends."""
     k = np.arange(1.0, harmonics + 1)
     bases = [np.linalg.qr(row[:, np.newaxis], mode="complete")[0][:, 1:] for row in (k**0, k)]
     return (bases[0] / k[:, np.newaxis]).T, (bases[1] / k[:, np.newaxis]).T

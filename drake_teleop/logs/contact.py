@@ -34,11 +34,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.load.contact.detection import ContactDetector
+from drake_teleop.load.contact.detection import RARE, ContactDetector, statistics, wrench_axis
 from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, statistic_index
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
-from drake_teleop.load.contact.statistics import RARE, statistics
-from drake_teleop.load.contact.wrench_axis import wrench_axis
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 

@@ -9,7 +9,7 @@ free                   the log of free motion that floor and threshold are of; n
                        of the log itself in which nothing stands out, see
                        `drake_teleop.logs.contact`
 free_s                 how much free motion that was
-statistic, threshold   see `drake_teleop.load.contact.statistics`
+statistic, threshold   see `drake_teleop.load.contact.detection`
 noise                  [f; tau], standard deviation at rest
 per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
 above_threshold        share of the samples whose statistic reaches the threshold

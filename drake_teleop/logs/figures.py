@@ -47,7 +47,7 @@ gripper                its file, if --gripper was given; otherwise this and the 
 object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
                        deviations, identifiable, not_identifiable and physically_consistent as
                        above; consistency_margin and consistency_margin_std, see
-                       `drake_teleop.load.gripper.consistency_margin`
+                       `drake_teleop.load.identification.consistency_margin`
 ====================== ==========================================================================
 
 ========================= =======================================================================
@@ -91,8 +91,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.load.batch.uncertainty import intervals
-from drake_teleop.load.gripper import SIGNIFICANT, consistency_margin
-from drake_teleop.load.identification import PARAMETERS, Identification, com_deviations
+from drake_teleop.load.identification import (
+    PARAMETERS,
+    SIGNIFICANT,
+    Identification,
+    com_deviations,
+    consistency_margin,
+)
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.cause import Stretch
 from drake_teleop.logs.contact import contacts_of, noise_floor

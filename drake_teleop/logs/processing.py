@@ -16,8 +16,7 @@ from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identi
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
 from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_index
-from drake_teleop.load.gripper import identified_object
-from drake_teleop.load.identification import PARAMETERS, Identification
+from drake_teleop.load.identification import PARAMETERS, Identification, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log

@@ -15,10 +15,9 @@ import numpy as np
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.detection import ContactDetector, flag_update
+from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
-from drake_teleop.load.contact.statistics import RARE
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import low_pass_coefficients

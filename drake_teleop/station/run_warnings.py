@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.fault import MEANINGS, Fault
 from drake_teleop.common.style import contact_spans
-from drake_teleop.load.sample import LOST
+from drake_teleop.load.regressor import LOST
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import power_scale, told_of_the_arm
 from drake_teleop.station.master.dynamics import HapticDevice

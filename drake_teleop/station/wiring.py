@@ -9,7 +9,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import LogVectorOutput, Multiplexer
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.sample import sample_parts
+from drake_teleop.load.regressor import sample_parts
 from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
 
 #: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes

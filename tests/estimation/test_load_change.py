@@ -9,7 +9,15 @@ from scipy.signal import sosfilt
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.batch.moments import Noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.change import (
+    CHANGED,
+    IDENTIFIED,
+    KNOWN,
+    change_memory,
+    change_parameters,
+    identified_load,
+    watch_load,
+)
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig, butterworth_sections
 
@@ -51,20 +59,25 @@ def tool():
     return identify_batch(*parts(samples(99)), method="total", noise=noise).identification
 
 
+def watch(tool, rows, period):
+    """Return the states (N,) and the identified load."""
+    parameters = change_parameters(SENSOR.wrench_std(), SENSOR.motion_std(), period)
+    memory = change_memory(np.concatenate([tool.offsets, tool.phi]), tool.covariance)
+    return watch_load(memory, parameters, *parts(rows)), identified_load(memory, tool)
+
+
 def test_no_alarm_in_free_motion(tool):
     for seed in range(3):
-        monitor = LoadChangeMonitor(tool, SENSOR.wrench_std(), SENSOR.motion_std(), 1 / RATE)
-        assert monitor.watch(*parts(samples(seed))).max() == STATES.index("known")
+        assert watch(tool, samples(seed), 1 / RATE)[0].max() == KNOWN
 
 
 @pytest.mark.parametrize("keep", [1, 8])
 def test_a_grasp_at_8_and_at_1_khz(tool, keep):
     """The stated noise is that before the filter, at either rate."""
     for seed in range(3):
-        monitor = LoadChangeMonitor(tool, SENSOR.wrench_std(), SENSOR.motion_std(), keep / RATE)
-        states = monitor.watch(*parts(samples(seed, grasp=True)[::keep]))
-        assert states[: int(EVENT * RATE / keep)].max() == STATES.index("known")
-        after = np.argmax(states >= STATES.index("changed")) * keep / RATE - EVENT
+        states, load = watch(tool, samples(seed, grasp=True)[::keep], keep / RATE)
+        assert states[: int(EVENT * RATE / keep)].max() == KNOWN
+        after = np.argmax(states >= CHANGED) * keep / RATE - EVENT
         assert 0.0 < after < 0.5
-        assert monitor.state == "identified"
-        assert monitor.load.mass - tool.mass == pytest.approx(0.8, rel=0.01)
+        assert states[-1] == IDENTIFIED
+        assert load.mass - tool.mass == pytest.approx(0.8, rel=0.01)

@@ -11,7 +11,6 @@ from load_cases import OFFSETS, TOOL, loads, motions, rich_motion, vectors
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.compensation import (
     contact_wrench,
-    modified_phi,
     scaled_wrench,
     scaled_wrench_into,
     scales_from_eta,
@@ -50,7 +49,7 @@ def test_equal_scales_make_the_load_irrelevant(F, motion, wrong_phi, other_phi, 
 
 @given(vectors(6, 100.0), motions(), loads(), loads(), st.floats(0.0, 1.0))
 def test_eta_is_equation_14(F, motion, gripper, thing, eta):
-    by_eq_14 = contact_wrench(F, OFFSETS, *motion, modified_phi(gripper, thing, eta))
+    by_eq_14 = contact_wrench(F, OFFSETS, *motion, gripper + (1.0 - eta) * thing)
     by_scales = scaled_wrench(F, OFFSETS, *motion, gripper, thing, **named(*scales_from_eta(eta)))
     np.testing.assert_allclose(by_scales, by_eq_14, rtol=1e-10, atol=1e-8)
     F_c = contact_wrench(F, OFFSETS, *motion, gripper + thing)
@@ -99,8 +98,6 @@ def test_scales_are_not_negative(name, value):
 def test_eta_is_a_share(eta):
     with pytest.raises(DrakeTeleopError, match=r"^eta: .* is outside 0 to 1"):
         scales_from_eta(eta)
-    with pytest.raises(DrakeTeleopError, match=r"^eta: "):
-        modified_phi(TOOL, TOOL, eta)
 
 
 def test_bad_input_is_named():

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 FILE = Path(__file__).parents[2] / "benchmarks" / "errors_in_variables.py"
+sys.path.insert(0, str(FILE.parent))
 
 
 @pytest.fixture(scope="module")

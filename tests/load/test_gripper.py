@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.gripper import consistency_margin, identified_object
-from drake_teleop.load.identification import Identification
+from drake_teleop.load.identification import Identification, consistency_margin, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify
 from drake_teleop.load.regressor import non_contact_wrench

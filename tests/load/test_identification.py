@@ -281,7 +281,7 @@ def hole(document):
         (put("mass", 99.0), "json:mass: does not follow from phi"),
         (put("com", [0.0, 0.0]), "json:com: has shape"),
         (put("physically_consistent", False), "json:physically_consistent: does not follow"),
-        (put("method", ["guess"]), "json:method: is no text"),
+        (put("method", ["guess"]), "json:method: is not a text"),
         (put("samples", "many"), "json:samples: holds no numbers"),
     ],
 )
@@ -325,7 +325,7 @@ def test_what_is_not_identified_is_not_printed_as_a_number():
 def test_no_file(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"absent\.json: cannot be read"):
         Identification.load(tmp_path / "absent.json")
-    for text, message in [("{", "is not JSON"), ("[1]", "holds no JSON object")]:
+    for text, message in [("{", "is not JSON"), ("[1]", "is not a JSON object")]:
         (tmp_path / "bad.json").write_text(text)
         with pytest.raises(DrakeTeleopError, match=rf"bad\.json: {message}"):
             Identification.load(tmp_path / "bad.json")
@@ -349,7 +349,7 @@ def test_bad_input_is_named():
         identify(F, *motion, noise=[1, 1, 1, 0, 1, 1])
     with pytest.raises(DrakeTeleopError, match=r"^2 samples cannot determine a load"):
         identify(F[:2], *(x[:2] for x in motion))
-    with pytest.raises(DrakeTeleopError, match="no mass can be told"):
+    with pytest.raises(DrakeTeleopError, match="the mass cannot be identified"):
         identify(np.zeros((10, 6)), *motion)
 
 

@@ -16,7 +16,6 @@ from drake_teleop.load.inertia import (
     phi_from_mass_com_inertia,
     phi_from_pseudo_inertia,
     pseudo_inertia,
-    split_object,
     transform_phi,
 )
 
@@ -104,14 +103,6 @@ def test_tolerance_admits_what_lies_just_outside():
     for mass in (1e-3, 1.0, 1e3):
         assert is_physically_consistent(mass * phi, tolerance=2.6e-7)
         assert not is_physically_consistent(mass * phi, tolerance=2.4e-7)
-
-
-def test_the_object_is_what_the_gripper_is_not():
-    thing = phi_from_mass_com_inertia(0.5, [0.0, 0.02, 0.15], np.diag([1e-3, 1e-3, 5e-4]))
-    np.testing.assert_allclose(split_object(TOOL + thing, TOOL), thing, atol=1e-15)
-    np.testing.assert_array_equal(split_object(TOOL, TOOL), np.zeros(10))
-    with pytest.raises(DrakeTeleopError, match=r"^phi_object: .*mass -0\.5 kg.*identify both"):
-        split_object(TOOL, TOOL + thing)
 
 
 @pytest.mark.parametrize(

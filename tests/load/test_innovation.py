@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from load_cases import TOOL
 
-from drake_teleop.load.online.innovation import whitening
+from drake_teleop.load.online.change import whitening
 from drake_teleop.load.regressor import non_contact_wrench
 
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from load_cases import OFFSETS, TOOL, rich_motion
 
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from instrumental import RecursiveInstrumentalVariables
+
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
-from drake_teleop.load.online.instrumental import RecursiveInstrumentalVariables
 from drake_teleop.load.online.recursive import PRIOR_STD, RecursiveLeastSquares
 from drake_teleop.load.regressor import non_contact_wrench, regressor
 
@@ -16,7 +22,6 @@ NOISE = np.repeat([0.25, 0.012], 3)
 MOTION = np.repeat([0.06, 0.002, 1.5], 3)
 TRUTH = np.concatenate([OFFSETS, TOOL])
 INERTIAS = [10, 13, 15]
-REST = np.zeros(3)
 
 
 def record(seed, samples=1500):
@@ -143,7 +148,7 @@ def test_sample_by_sample_on_a_log_and_kept_elsewhere_are_the_same(tmp_path):
     state = np.zeros(16)
     memory = elsewhere.initial_memory(state)
     for sample in zip(F, *motion, commanded, strict=True):
-        single.update(*sample)
+        single.learn(*(np.reshape(part, (1, -1)) for part in sample))
         elsewhere.update_into(state, memory, np.concatenate(sample))
     np.testing.assert_array_equal(theta(single), theta(log))
     np.testing.assert_array_equal(state, theta(log))
@@ -159,12 +164,10 @@ def test_bad_input_is_named_and_leaves_the_estimate():
     F, motion, commanded = record(6, samples=50)
     estimator = learnt(F, motion, commanded)
     before = theta(estimator)
-    with pytest.raises(DrakeTeleopError, match="needs instruments"):
-        estimator.update(F[0], REST, REST, REST)
-    with pytest.raises(DrakeTeleopError, match=r"instruments have shapes"):
-        estimator.update(F[0], REST, REST, REST, np.zeros(3))
-    with pytest.raises(DrakeTeleopError, match=r"^sample: is not finite"):
-        estimator.update(F[0], REST, REST, REST, np.full(9, np.inf))
+    with pytest.raises(DrakeTeleopError, match=r"^instruments: has shape"):
+        estimator.learn(F, *motion, np.zeros((50, 3)))
+    with pytest.raises(DrakeTeleopError, match=r"^instruments: is not finite"):
+        estimator.learn(F, *motion, np.full((50, 9), np.inf))
     np.testing.assert_array_equal(theta(estimator), before)
-    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
         RecursiveInstrumentalVariables(NOISE).identification()

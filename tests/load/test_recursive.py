@@ -198,11 +198,9 @@ def test_bad_input_is_named_and_leaves_the_estimate():
         RecursiveLeastSquares(NOISE, forgetting=1.1)
     with pytest.raises(DrakeTeleopError, match=r"^bound: -1\.0 is not positive"):
         RecursiveLeastSquares(NOISE, bound=-1.0)
-    with pytest.raises(DrakeTeleopError, match="takes no instruments"):
-        estimator.learn(F, *motion, instruments=np.zeros((5, 9)))
     with pytest.raises(DrakeTeleopError, match=r"^noise_std: is not positive"):
         RecursiveLeastSquares(-NOISE)
     with pytest.raises(DrakeTeleopError, match=r"^prior_std: has shape \(10,\)"):
         RecursiveLeastSquares(NOISE, prior_std=np.ones(10))
-    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
         RecursiveLeastSquares(NOISE).identification()

@@ -236,9 +236,5 @@ def test_bad_input_is_named():
         RecursiveTotalLeastSquares(NOISE, NOISE)
     with pytest.raises(DrakeTeleopError, match=r"^bound: 0\.0 is not positive"):
         RecursiveTotalLeastSquares(NOISE, MOTION, bound=0.0)
-    with pytest.raises(DrakeTeleopError, match="takes no instruments"):
-        RecursiveTotalLeastSquares(NOISE, MOTION).update(
-            OFFSETS, REST, REST, REST, instruments=np.zeros(9)
-        )
-    with pytest.raises(DrakeTeleopError, match="no sample has been learnt from"):
+    with pytest.raises(DrakeTeleopError, match="there was no update yet"):
         RecursiveTotalLeastSquares(NOISE, MOTION).identification()

@@ -169,7 +169,7 @@ def test_a_wrench_of_rounding_tells_no_mass():
     motion = np.sin(np.outer(np.arange(100.0), 1.0 + np.arange(9)))
     wrench = 1e-150 * np.cos(np.outer(np.arange(100.0), 1.0 + np.arange(6)))
     line = message(lambda: identify_batch(wrench, *np.split(motion, 3, axis=1)))
-    assert "no mass can be told" in line
+    assert "the mass cannot be identified" in line
 
 
 def test_channels_far_below_what_is_known_of_the_load():

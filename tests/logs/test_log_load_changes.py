@@ -13,7 +13,13 @@ from test_log_commands import GRAVITY, describe_poses, describe_record
 
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import STATES, LoadChangeMonitor
+from drake_teleop.load.online.change import (
+    CHANGED,
+    KNOWN,
+    change_memory,
+    change_parameters,
+    watch_load,
+)
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.causes.instants import instants
@@ -80,20 +86,20 @@ def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None
     noise = 4.0 * np.array([0.035, 0.021, 0.075, 0.0012, 0.0019, 0.0003])
     motion_std, drift = np.repeat([0.1, 0.0, 0.0], 3), np.repeat([0.5, 0.02], 3)
 
-    def states(wrench: np.ndarray) -> np.ndarray:
-        monitor = LoadChangeMonitor(
-            known, noise, motion_std, log.dt, offset_drift=drift, model_error=0.02
-        )
-        return monitor.watch(wrench, *log.motion)
+    theta = np.concatenate([known.offsets, known.phi])
 
-    changed = STATES.index("changed")
+    def states(wrench: np.ndarray) -> np.ndarray:
+        parameters = change_parameters(noise, motion_std, log.dt, model_error=0.02)
+        memory = change_memory(theta, known.covariance, drift)
+        return watch_load(memory, parameters, wrench, *log.motion)
+
     free = states(log.wrench)
-    assert free.max() < changed and free[-1] == STATES.index("known")
-    assert (free == STATES.index("known")).mean() > (1 - 1e-9 if record == "1-baseline" else 0.95)
+    assert free.max() < CHANGED and free[-1] == KNOWN
+    assert (free == KNOWN).mean() > (1 - 1e-9 if record == "1-baseline" else 0.95)
     added = phi_from_mass_com_inertia(0.25, [0.0, 0.0, 0.08], 1e-5 * np.eye(3))
     after = log.t - log.t[0] - 2.5
     grasped = states(log.wrench + (after > 0)[:, None] * non_contact_wrench(*log.motion, added))
-    assert 0.0 < after[np.argmax(grasped == changed)] < 0.5
+    assert 0.0 < after[np.argmax(grasped == CHANGED)] < 0.5
 
 
 def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:

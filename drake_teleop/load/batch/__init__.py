@@ -1,1 +1,1 @@
-"""Estimation from a whole record."""
+"""Estimators of the load from a whole record."""

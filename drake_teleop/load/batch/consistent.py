@@ -1,19 +1,12 @@
-"""The load that some body can have and that fits best: a semidefinite program.
+"""Physically consistent load with the best fit, as a semidefinite program, Eqs. (T1) and (T5).
 
-Least squares minimises theta^T G theta - 2 b^T theta; here the pseudo-inertia J(phi) must be
-positive semidefinite besides (Wensing, Kim, Slotine, RA-L 2018), which is linear in phi. Offsets
-are eliminated first, and phi is divided by (m0, m0 L, m0 L^2), L the load's radius about So: in SI
-units the inertia of a light tool drowns in the solver's tolerance. If least squares is consistent
-already, it is the solution, to the last bit, and nothing else is done.
+A consistent least squares solution is returned unchanged (Wensing, Kim, Slotine, RA-L 2018).
+Priors phi_0, weighted per sample:
 
-A prior phi_0 pulls what the record does not say, with the weight of so many samples:
+- entropic: tr(J_0^-1 J) - log det J (Lee, Wensing, Park, T-RO 2020);
+- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2), a quadratic cost (Lee, Park, RA-L 2018).
 
-- entropic: tr(J_0^-1 J) - log det J, the log-det divergence (Lee, Wensing, Park, T-RO 2020);
-- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2), the constant pull-back of the affine-invariant metric
-  (Lee, Park, RA-L 2018), which is a quadratic cost.
-
-An ellipsoid (r - c)^T A (r - c) <= 1 that contains the load's mass makes tr(J E) >= 0, with
-E = [[-A, A c], [c^T A, 1 - c^T A c]] (Wensing, Kim, Slotine 2018).
+An ellipsoid that contains the mass adds tr(J E) >= 0, E = [[-A, A c], [c^T A, 1 - c^T A c]].
 """
 
 from __future__ import annotations
@@ -33,23 +26,22 @@ from drake_teleop.load.inertia import (
     pseudo_inertia,
 )
 
-_UNITS = [pseudo_inertia(unit) for unit in np.eye(10)]
-_CONSTRAINT = [np.zeros((4, 4)), *_UNITS]
-_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_UNITS, (10, 16)).T)  # (10, 16)
-_SMALLEST_LENGTH = 1e-3  # of the unit of length [m]
-# Smallest eigenvalue over the largest that is information, and what the others are taken for.
-_RANK, _RIDGE = 1e-12, 1e-12
+_BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
+_CONSTRAINT = [np.zeros((4, 4)), *_BASIS]
+_FROM_PSEUDO_INERTIA = np.linalg.pinv(np.reshape(_BASIS, (10, 16)).T)  # (10, 16)
+_MIN_LENGTH_M = 1e-3  # lower bound of the length unit L [m]
+# Eigenvalues relative to the largest: limit of information, and replacement of smaller ones.
+_MIN_EIGENVALUE, _RIDGE_EIGENVALUE = 1e-12, 1e-12
 _PRIORS = ("entropic", "geodesic")
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What the load was thought to be before the record.
+    """Prior of the load; `kind` is "entropic" or "geodesic".
 
     Attributes:
         phi: (10,) about So in S, of a body with extent in all directions.
-        weight: in residual variance per sample: small against 1 if the record shall decide.
-        kind: "entropic" or "geodesic" (module docstring).
+        weight: residual variance per sample.
     """
 
     phi: ArrayLike
@@ -62,23 +54,17 @@ class Prior:
         if not 0.0 < self.weight < np.inf:
             raise DrakeTeleopError(f"{self.weight} is not positive", where="prior.weight")
         if np.linalg.eigvalsh(pseudo_inertia(self.phi))[0] <= 0.0:
-            raise DrakeTeleopError(
-                "has no extent in some direction, or is no body", where="prior.phi"
-            )
+            raise DrakeTeleopError("is not a body with extent in all directions", where="prior.phi")
 
     def information(self, samples: int) -> Array:
-        """(10, 10) inverse covariance of phi that it stands for: the Hessian of either kind at phi.
-
-        Args:
-            samples: of the record, in units of which it has its weight.
-        """
-        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _UNITS)
+        """Return the inverse covariance (10, 10) of the prior for a number of samples."""
+        parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _BASIS)
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """Contains the mass of the load: (r - center)^T matrix (r - center) <= 1.
+    """Ellipsoid that contains the mass: (r - center)^T matrix (r - center) <= 1.
 
     Attributes:
         center: (3,) from So in S [m].
@@ -89,16 +75,16 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """(10,) coefficients of phi in tr(J E) >= 0.
+        """Return the coefficients (10,) of phi in tr(J E) >= 0.
 
         Raises:
-            DrakeTeleopError: for other shapes, or a matrix that is not positive definite.
+            DrakeTeleopError: if the matrix is not positive definite.
         """
         A, c = checked("ellipsoid.matrix", self.matrix, 3, 3), checked("center", self.center, 3)
         if np.abs(A - A.T).max() > 1e-9 * np.abs(A).max() or np.linalg.eigvalsh(A)[0] <= 0.0:
             raise DrakeTeleopError("is not positive definite", where="ellipsoid.matrix")
         E = np.block([[-A, (A @ c)[:, None]], [A @ c, 1.0 - c @ A @ c]])
-        return np.array([np.sum(unit * E) for unit in _UNITS])
+        return np.array([np.sum(unit * E) for unit in _BASIS])
 
 
 def consistent_least_squares(
@@ -108,14 +94,11 @@ def consistent_least_squares(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
 ) -> Array:
-    """(16,) [offsets; phi] of the best physically consistent load.
+    """Return [offsets; phi] (16,) of the physically consistent load with the best fit.
 
     Args:
-        gram, right: (16, 16), (16,) normal equations, rows weighted by the noise; divided by the
-            number of samples if there is a prior.
+        gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
         theta: (16,) their solution.
-        prior: of the load.
-        ellipsoid: that contains it.
 
     Raises:
         DrakeTeleopError: if the solver finds no solution.
@@ -124,43 +107,43 @@ def consistent_least_squares(
     inside = row is None or row @ theta[6:] >= 0.0
     if prior is None and inside and is_physically_consistent(theta[6:]):
         return theta
-    unit = _units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
+    unit = _parameter_units(theta[6:] if prior is None else checked("prior.phi", prior.phi, 10))
     cross = gram[:6, 6:]
-    offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))  # less phi's share
+    offsets = np.linalg.solve(gram[:6, :6], np.column_stack([right[:6], cross]))
     reduced = (gram[6:, 6:] - cross.T @ offsets[:, 1:]) * np.outer(unit, unit)
-    whole = float((np.diag(gram)[6:] * unit**2).max())
-    if prior is None and np.abs(reduced).max() <= _RANK * whole:
-        return theta  # no load differs from offsets in this record
+    largest_diagonal = float((np.diag(gram)[6:] * unit**2).max())
+    if prior is None and np.abs(reduced).max() <= _MIN_EIGENVALUE * largest_diagonal:
+        return theta  # the record cannot separate load and offsets
     linear = (right[6:] - cross.T @ offsets[:, 0]) * unit
     phi = unit * _solve(0.5 * (reduced + reduced.T), linear, unit, prior, row)
     return np.concatenate([offsets[:, 0] - offsets[:, 1:] @ phi, phi])
 
 
-def _units(phi: Array) -> Array:
-    """(10,) (m0, m0 L, m0 L^2) of a load that need not be consistent."""
+def _parameter_units(phi: Array) -> Array:
+    """Return units (10,) (m0, m0 L, m0 L^2) that scale the program, L the radius about So."""
     m = abs(phi[0])
     if m == 0.0:
-        raise DrakeTeleopError("no mass can be told from this wrench", where="wrench")
+        raise DrakeTeleopError("the mass cannot be identified from this wrench", where="wrench")
     spread = max(0.0, 0.5 * (phi[4] + phi[7] + phi[9]) / m)
-    L = max(_SMALLEST_LENGTH, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
+    L = max(_MIN_LENGTH_M, float(np.linalg.norm(phi[1:4])) / m, np.sqrt(spread))
     return m * np.repeat([1.0, L, L * L], [1, 3, 6])
 
 
 def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
-    """(10,) phi / unit that minimises phi^T H phi / 2 - b^T phi + prior, J(phi) >= 0."""
+    """Return phi / unit that minimises phi^T H phi / 2 - b^T phi + prior with J(phi) >= 0."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
-        scaled = [J0_inverse @ part for part in _UNITS]
+        scaled = [J0_inverse @ part for part in _BASIS]
         pull = prior.weight * np.array([np.trace(part) for part in scaled])
         if prior.kind == "geodesic":
             H = H + prior.weight * np.einsum("aij,bji->ab", scaled, scaled)
         b = b + (-pull if entropic else pull)
     if not entropic and row is None:
-        prepared = _distance_program(get_ident())
+        problem = _distance_program(get_ident())
     else:
-        prepared = _new_program(distance=not entropic)
-    program, x, cone, solver = prepared
+        problem = _make_program(distance=not entropic)
+    program, x, cone, solver = problem
     if row is not None:
         normalised = row * unit / np.abs(row * unit).max()
         program.AddLinearConstraint(normalised[None, :], [0.0], [np.inf], x)
@@ -170,7 +153,7 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
         program.AddQuadraticCost(scale * H, -scale * b, x, is_convex=True)
         _add_log_det(program, x, prior.weight * scale)
     else:
-        cone.UpdateCoefficients(*_distance(H, b))
+        cone.UpdateCoefficients(*_distance_cone(H, b))
     result = solver.Solve(program)
     if not result.is_success():
         raise DrakeTeleopError(
@@ -178,15 +161,14 @@ def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | No
             where="consistent",
             remedy="check the sign of the wrench, and that the load moves",
         )
-    # The solver's tolerance leaves eigenvalues of -1e-9 or so.
-    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _UNITS, 1))
+    # The solver's tolerance leaves eigenvalues of about -1e-9.
+    values, vectors = np.linalg.eigh(np.tensordot(result.GetSolution(x), _BASIS, 1))
     J = (vectors * np.maximum(values, 0.0)) @ vectors.T
     return np.asarray(_FROM_PSEUDO_INERTIA @ J.ravel(), np.float64)
 
 
-def _new_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
-    """(program, phi / unit, cone of the distance or None, solver) with J(phi) >= 0."""
-    # Drake is imported here: all else of the load core does without, and starts ten times faster.
+def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
+    # Imported here because the rest of the package starts ten times faster without Drake.
     from pydrake.solvers import ClarabelSolver, MathematicalProgram
 
     program, cone = MathematicalProgram(), None
@@ -202,32 +184,26 @@ def _new_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 
 @cache
 def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
-    """Building the program takes as long as solving it: each thread has one, whose data change."""
-    return _new_program(distance=True)
+    """Return the reusable program of a thread; building it takes as long as solving it."""
+    return _make_program(distance=True)
 
 
-def _distance(H: Array, b: Array) -> tuple[Array, Array]:
-    """Cone t >= |R x - d|, R^T R = H, R^T d = b: where x^T H x / 2 - b^T x is smallest.
+def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
+    """Return the cone t >= |R x - d| with R^T R = H, R^T d = b: (11, 11) and (11,) for [x; t].
 
-    The distance and not its square: the solver stops at 1e-8 of either, and the square root of
-    that would be the error of a load at the edge of consistency. What the record does not determine
-    is kept small.
-
-    Returns:
-        (11, 11) and (11,), the coefficients of [x; t] and the constants.
+    With the squared distance, the solver's tolerance of 1e-8 would become an error of 1e-4.
     """
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]
     values = values / scale
-    root = np.sqrt(np.maximum(values, _RIDGE))
+    root = np.sqrt(np.maximum(values, _RIDGE_EIGENVALUE))
     cone, constants = np.zeros((11, 11)), np.zeros(11)
     cone[0, 10], cone[1:, :10] = 1.0, root[:, None] * vectors.T
-    constants[1:] = -np.where(values > _RANK, vectors.T @ b / root, 0.0) / scale
+    constants[1:] = -np.where(values > _MIN_EIGENVALUE, vectors.T @ b / root, 0.0) / scale
     return cone, constants
 
 
 def _add_log_det(program: Any, x: Any, weight: float) -> None:
-    """Adds -weight log det J(x) to the cost; Drake normalises it no further."""
     m, hx, hy, hz, xx, xy, xz, yy, yz, zz = x
     half = 0.5 * (xx + yy + zz)
     J = np.array(

@@ -1,19 +1,8 @@
-"""How sure a batch estimator's solution is.
+"""Covariance of the batch estimators (docs/theory.md, "Details of the estimators").
 
-The covariance is that of `normal_equations.NormalEquations` with the same weights of the rows, so
-coloured noise is accounted for; where noise of the motion couples the channels, with the
-correlation that it predicts. Offsets that wander are no stationary noise, and a record is too short
-to show how much they do: if the noise says so (`Noise.walk`, which Allan deviations of a record at
-rest give), the effects of all steps of the walk on the solution are added up. The offsets that the
-covariance is about are then those at the start of the record. A walk that goes as far as the noise
-within a record counts twice, since it is in the residuals too: that is cautious. Errors in
-variables enlarge the covariance: with G theta_LS = b and (G - lambda C) theta = b it is
-K Cov(theta_LS) K^T, K = (G - lambda C)^-1 G (`transfer`). That of `consistent` is of the same fit
-without the constraint, which is cautious. A prior adds its information to that of the record, and
-parameters that it says most about are named.
-
-Errors of the sensor's gains, if some are stated, are no noise: a record of any length has the same
-ones. What each of the 36 does to the solution is added up (`gain_effects`).
+It starts from that of `NormalEquations` and adds noise of the motion, random walks of the offsets,
+errors in variables, the prior and errors of the sensor's 36 gains. `consistent` uses the covariance
+without its constraint.
 """
 
 from __future__ import annotations
@@ -28,47 +17,41 @@ from drake_teleop.load.batch.moments import (
     inverse_root,
     normal_equations,
 )
-from drake_teleop.load.batch.record import CHUNK, Fit, Record
-from drake_teleop.load.batch.total_least_squares import NormalForm
+from drake_teleop.load.batch.total_least_squares import CHUNK, Fit, NormalForm, Record
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 
 ARM = 0.06
-"""Length that compares an error of a force's gain with one of a torque's [m]."""
+"""Length that relates gain errors of forces to those of torques [m]."""
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Covariance (16, 16) of data and prior together, and which parameters are mostly the prior's.
+    """Return the covariance (16, 16) of data and prior, and (16,) bools: prior-dominated.
 
-    With the information D of the data and P of the prior, (10, 10) of phi, the estimate is
-    (D + P)^-1 (D theta_data + P theta_prior): the diagonal of (D + P)^-1 D is the data's share. For
-    a single parameter it is 1 - (standard deviation over the prior's)^2.
+    With information D of the data and P of the prior (10, 10), the data's share is the diagonal of
+    (D + P)^-1 D.
     """
-    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
-    used = known | (np.arange(16) >= 6)
-    # In units in which the entries are of one size.
-    scale = np.sqrt(np.where(known, np.diag(covariance), 1.0))
+    determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
+    used = determined | (np.arange(16) >= 6)
+    # Scaled so that all entries have similar size.
+    scale = np.sqrt(np.where(determined, np.diag(covariance), 1.0))
     scale[6:] = np.diag(information) ** -0.5
     data, total = np.zeros((2, 16, 16))
-    both, part = np.ix_(known, known), np.ix_(used, used)
-    data[both] = np.linalg.inv(covariance[both] / np.outer(scale, scale)[both])
+    block, used_block = np.ix_(determined, determined), np.ix_(used, used)
+    data[block] = np.linalg.inv(covariance[block] / np.outer(scale, scale)[block])
     total[6:, 6:] = information * np.outer(scale, scale)[6:, 6:]
     total += data
     posterior = np.where(np.diag(~used & np.isinf(np.diag(covariance))), np.inf, 0.0)
-    inverse = np.linalg.inv(total[part])
-    posterior[part] = inverse * np.outer(scale, scale)[part]
+    inverse = np.linalg.inv(total[used_block])
+    posterior[used_block] = inverse * np.outer(scale, scale)[used_block]
     prior_share = np.zeros(16)
-    prior_share[used] = 1.0 - np.diag(inverse @ data[part])
+    prior_share[used] = 1.0 - np.diag(inverse @ data[used_block])
     return posterior, prior_dominated(np.sqrt(prior_share.clip(0.0)), np.ones(16))
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """(16, 16) of least squares with weights W that couple the channels, if they do.
-
-    Noise of the motion is in several channels of the wrench at once, which `plain`, of
-    `NormalEquations`, does not know. Their correlation is the predicted one, that of W^-1.
-    """
+    """Return the covariance (16, 16) for weights W between channels, correlated as W^-1."""
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -84,30 +67,24 @@ def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Arra
 
 
 def _inverse_gram(fit: Fit) -> Array:
-    """(16, 16) pseudo-inverse of the sum of [E V]^T W [E V] over the samples."""
     Z = fit.moments.mean
     root = inverse_root(normal_equations(Z, fit.form.weights)[0], excited_columns(Z))
     return np.asarray(root @ root.T / fit.moments.samples)
 
 
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
-    """(16, 16) covariance of least squares from offsets that wander, about those at the start.
-
-    A step of the walk changes the wrench of all samples after it, and the solution by G^+ times
-    their share of the right-hand side. The steps are independent; `steps` (6, 6) is their
-    covariance, those of the motion's channels as changes of V phi.
-    """
+    """Return the covariance (16, 16) of random walks of the offsets, steps (6, 6) per sample."""
     covariance = np.zeros((16, 16))
     if not steps.any():
         return covariance
     backwards, used = record.every(-1), kept[::-1]
     after = np.zeros((6, 16))
     for start in range(0, len(used), CHUNK):
-        part = slice(start, start + CHUNK)
-        rows = np.zeros((len(used[part]), 6, 16))
+        used_block = slice(start, start + CHUNK)
+        rows = np.zeros((len(used[used_block]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
-        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
-        rows = fit.form.weights @ (rows * used[part, None, None])
+        rows[:, :, 6:] = regressor(*(table[used_block] for table in backwards.arrays[1:]))
+        rows = fit.form.weights @ (rows * used[used_block, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows
@@ -117,23 +94,21 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """(n, 36) what an error of 1 in each of the sensor's gains does to least squares.
-
-    A gain from force to torque counts as 1 at `ARM` [m], one from torque to force at 1 / `ARM`.
+    """Return the effect (n, 36) of a unit error of each sensor gain, scaled by `ARM`.
 
     Args:
         products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
         W: (bands, 6, 6) weights between the channels.
-        inverse: (n, n) of the Gram matrix of the same moments.
+        inverse: (n, n) inverse Gram matrix.
     """
-    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # of gain d, k
+    right = np.einsum("bcd,bcjk->jdk", W, products, optimize=True)  # per gain (d, k)
     length = np.repeat([1.0, ARM], 3)
     effect = np.einsum("ij,jdk->idk", inverse, right) * (length[:, None] / length)
     return np.asarray(effect.reshape(len(inverse), 36))
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """(16, 16) of the form's solution by errors of the gains of standard deviation 1."""
+    """Return the covariance (16, 16) due to gain errors with standard deviation 1."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)
@@ -143,10 +118,10 @@ def gain_covariance(fit: Fit, offsets: bool) -> Array:
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """(16, 16) of the form's solution, from that of least squares (module docstring)."""
+    """Return the covariance (16, 16) of the form's solution from that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
-    if not offsets:  # what is left when the offsets are known
+    if not offsets:  # covariance for known offsets
         inner = np.linalg.pinv(covariance[:6, :6], hermitian=True)
         covariance = covariance - covariance[:, :6] @ inner @ covariance[:6]
         covariance[:6], covariance[:, :6] = 0.0, 0.0

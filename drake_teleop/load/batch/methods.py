@@ -1,35 +1,14 @@
-"""Batch estimators by name, for the load and the sensor's offsets from a record.
+"""Batch estimators by name for the load and the sensor's offsets.
 
-| name | what it does | when |
-|---|---|---|
-| `ordinary` | least squares, N and N m alike, Eqs. (7)-(8) | to compare with |
-| `whitened` | rows divided by each channel's noise, given or estimated | the plain weighted fit |
-| `total` | `whitened` with errors in variables (`total_least_squares`) | motion's noise is given |
-| `robust` | `total` without knocks and short contacts | |
-| `consistent` | `robust`, and a body can have these parameters (`consistent`) | default |
+| name | method |
+|---|---|
+| `ordinary` | least squares, equal weights, Eqs. (7)-(8) |
+| `whitened` | rows divided by each channel's noise, specified or estimated |
+| `total` | `whitened` with errors in variables |
+| `robust` | `total` without impacts and short contacts |
+| `consistent` | `robust` with physical consistency; default |
 
-A negative mass is no body's and stays as it is.
-
-The first three see the record only as a (19, 19) matrix of second moments (`moments`), in one
-pass. The noise of the wrench, if not given, comes from the residual of a first fit, without what
-the noise of the motion explains of it, and once more from the residual of the second.
-
-`robust` is iteratively reweighted least squares with Huber's weights (Huber, Robust Statistics,
-1981, chapter 7), which a few bad samples cannot lead far astray, then least squares on the samples
-within 4.5 robust standard deviations (1.4826 x median of the absolute residual) in all channels,
-repeated until they stay the same. Of normal noise it rejects one sample in 25000. In a record that
-rests most of the time all errors of the motion (delay, scale, mounting) look like disturbances, and
-the samples that say most would be rejected. Therefore nothing is, and `BatchResult.note` says so,
-where the rest of the samples would double some standard deviation: knocks and contacts raise it by
-15 %, motion taken for a disturbance by 30 % to a hundredfold. Nor is anything of less than 12
-samples.
-
-Averages over poses at rest leave no noise but errors of calibration and orientation, which turn
-with the pose and belong to no channel. With `shared_noise` the three forces have one estimated
-noise and the three torques one; weights of their own would make mass and centre of mass worse by
-10 to 30 % (simulated gain errors of 0.3 % and tilts of 4 mrad).
-
-`covariance` says how sure each of them is.
+Details: docs/theory.md, "Details of the estimators".
 """
 
 from __future__ import annotations
@@ -59,23 +38,29 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
-from drake_teleop.load.batch.record import CHUNK, Fit, Options, Record
-from drake_teleop.load.batch.total_least_squares import NormalForm, total_least_squares
+from drake_teleop.load.batch.total_least_squares import (
+    CHUNK,
+    Fit,
+    NormalForm,
+    Options,
+    Record,
+    total_least_squares,
+)
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 
-# Least noise of a channel, relative to the wrench: what rounding leaves of a perfect record.
-_ROUNDING = 1e-7
-# A wrench's variance is at least this share of the residual's, whatever the motion's explains.
-_LEAST_SHARE = 0.01
-# Huber's limit and the rejection's, in robust standard deviations; fits at most; and how many
-# samples the median looks at.
-_HUBER, _REJECT, _FITS, _MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
+# Smallest noise of a channel, relative to the wrench: rounding in a noise-free record.
+_MIN_RELATIVE_NOISE = 1e-7
+# Smallest share of the residual's variance that is wrench noise, not noise of the motion.
+_NOISE_SHARE = 0.01
+# Limits of Huber's weights and of the rejection in robust standard deviations, largest number of
+# fits, and largest number of samples for the median.
+_HUBER_LIMIT, _REJECTION_LIMIT, _MAX_FITS, _MAX_MEDIAN_SAMPLES = 3.0, 4.5, 30, 20000
 _NORMAL_MAD = 1.4826
-# Samples of which a median says something, samples from which to start, and how much a standard
-# deviation may grow by what is rejected.
-_FEWEST_TO_REJECT, _SOME, _MOST_LOSS = 12, 50_000, 2.0
-_NOTHING_REJECTED = (
+# Fewest samples for a rejection, number of samples for the first fit, and largest growth of a
+# standard deviation by rejected samples.
+_MIN_SAMPLES_TO_REJECT, _MAX_START_SAMPLES, _MAX_STD_GROWTH = 12, 50_000, 2.0
+_NOTE_NOTHING_REJECTED = (
     "the residual is large where the load moves and small where it rests, so that disturbances"
     " cannot be told from errors of the motion (delay, scale, mounting): no sample was rejected"
 )
@@ -83,15 +68,14 @@ _NOTHING_REJECTED = (
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """An identification by one of `METHODS`, and what it rests upon.
+    """Result of `identify_batch`.
 
     Attributes:
-        identification: the load.
-        noise: (6,) standard deviations of the wrench channels that gave the weights [N, N m].
-        rejected: (N,) bools, samples that the fit did without.
-        note: what a user has to know of the fit; mostly empty.
-        equations: of the samples that were used, with these weights: what
-            `uncertainty.base_parameters` asks for.
+        identification: load and offsets.
+        noise: (6,) standard deviations behind the weights [N, N m].
+        rejected: (N,) bools.
+        note: warning for the user, mostly empty.
+        equations: of the used samples, for `uncertainty.base_parameters`.
     """
 
     identification: Identification
@@ -107,18 +91,18 @@ def _ordinary(record: Record, options: Options) -> Fit:
 
 
 def _whitened(record: Record, options: Options) -> Fit:
-    return _weighted(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
+    return _fit_moments(record.moments, replace(options, noise=Noise(options.noise.wrench)), record)
 
 
 def _total(record: Record, options: Options) -> Fit:
-    return _weighted(record.moments, options, record)
+    return _fit_moments(record.moments, options, record)
 
 
 def _consistent(record: Record, options: Options) -> Fit:
     fit = _robust(record, options)
     gram, right, theta = fit.form[:3]
     if theta[6] < 0.0:
-        # An inverted sign, or no load: the nearest possible body, nothing at all, would hide it.
+        # The nearest consistent load is zero; it would hide an inverted sign or a missing load.
         return fit
     theta = consistent_least_squares(gram, right, theta, options.prior, options.ellipsoid)
     return replace(fit, form=fit.form._replace(theta=theta))
@@ -127,33 +111,32 @@ def _consistent(record: Record, options: Options) -> Fit:
 def _robust(record: Record, options: Options) -> Fit:
     whole = _total(record, options)
     n = len(record.s)
-    if n < _FEWEST_TO_REJECT:
+    if n < _MIN_SAMPLES_TO_REJECT:
         return whole
-    # The start need not be better than what some of the samples say.
-    form = _huber(record.every(max(1, n // _SOME)), options)
+    # A subset of the samples is sufficient as a starting point.
+    form = _huber(record.every(max(1, n // _MAX_START_SAMPLES)), options)
     rejected = np.zeros(n, bool)
-    for _ in range(_FITS):
-        last = rejected
-        rejected = _distances(record, form.theta, options.shared_noise) > _REJECT
+    for _ in range(_MAX_FITS):
+        previous = rejected
+        rejected = _relative_residuals(record, form.theta, options.shared_noise) > _REJECTION_LIMIT
         moments = Moments()
         moments.add(*record.arrays, weights=~rejected)
-        if _loss(whole, moments) > _MOST_LOSS:
-            return replace(whole, note=_NOTHING_REJECTED)
-        fit = _weighted(moments, options, record)
+        if _std_growth(whole, moments) > _MAX_STD_GROWTH:
+            return replace(whole, note=_NOTE_NOTHING_REJECTED)
+        fit = _fit_moments(moments, options, record)
         form = fit.form
-        if (rejected == last).all():
+        if (rejected == previous).all():
             break
     return replace(fit, rejected=rejected)
 
 
 def _huber(record: Record, options: Options) -> NormalForm:
-    """Iteratively reweighted, until the weights stay the same."""
     moments, weights = record.moments, np.ones(len(record.s))
-    for _ in range(_FITS):
+    for _ in range(_MAX_FITS):
         before = weights
-        form = _weighted(moments, options, record).form
-        distances = _distances(record, form.theta, options.shared_noise)
-        weights = np.minimum(1.0, _HUBER / np.maximum(distances, _HUBER))
+        form = _fit_moments(moments, options, record).form
+        distances = _relative_residuals(record, form.theta, options.shared_noise)
+        weights = np.minimum(1.0, _HUBER_LIMIT / np.maximum(distances, _HUBER_LIMIT))
         if np.abs(weights - before).max() < 0.01:
             break
         moments = Moments()
@@ -161,9 +144,9 @@ def _huber(record: Record, options: Options) -> NormalForm:
     return form
 
 
-def _loss(whole: Fit, kept: Moments) -> float:
-    """By how much fewer samples enlarge the standard deviation that grows most, noise alike."""
-    if kept.samples < _FEWEST_TO_REJECT:
+def _std_growth(whole: Fit, kept: Moments) -> float:
+    """Return the largest ratio of standard deviations, fewer samples over all samples."""
+    if kept.samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
     used = excited_columns(whole.moments.mean)
     variances = []
@@ -174,7 +157,7 @@ def _loss(whole: Fit, kept: Moments) -> float:
 
 
 class Method(NamedTuple):
-    """An estimator, and what `Identification.method` calls it."""
+    """Name of an estimator in `Identification.method`, and its function."""
 
     name: str
     fit: Callable[[Record, Options], Fit]
@@ -187,13 +170,13 @@ METHODS = {
     "total": Method("total least squares", _total),
     "consistent": Method("physically consistent least squares", _consistent),
 }
-"""The estimators by name, all with one signature: a line here enters one."""
+"""Estimators by name; add a line for a new one."""
 
 DEFAULT_METHOD = "consistent"
 
 
 def check_method(method: str) -> None:
-    """Raises DrakeTeleopError unless it is one of `METHODS`."""
+    """Raise DrakeTeleopError unless the method is one of `METHODS`."""
     if not isinstance(method, str) or method not in METHODS:
         raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
 
@@ -214,29 +197,21 @@ def identify_batch(
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
-    """Load and sensor offsets of a free motion by any of `METHODS`.
+    """Return load and sensor offsets of a free motion by one of `METHODS`.
 
     Args:
-        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        s, omega, alpha: (N, 3) specific force a - g [m/s^2], angular velocity [rad/s] and angular
-            acceleration [rad/s^2] of S in S, in the order of time.
-        method: one of `METHODS`.
-        noise: of wrench and motion; default: that of the wrench is estimated, the motion is exact
-            and offsets do not wander.
-        offsets: whether to estimate the sensor's; otherwise they were subtracted before.
-        shared_noise: whether the three forces have one estimated noise, and the three torques one,
-            as is right for averages over poses at rest (module docstring).
-        resolution: step of the numbers of forces and torques [N, N m], for averages over poses.
-        prior, ellipsoid: what is known of the load, for "consistent".
-        delay_s: the delay that was taken out of the motion, for the record [s].
-        gain_std: standard deviation of each of the sensor's 36 gains, such as 0.01, of one between
-            force and torque as at `drake_teleop.load.batch.covariance.ARM`; it enters the
-            covariance.
+        wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
+        noise: of wrench and motion; default: estimated wrench noise, exact motion, fixed offsets.
+        offsets: False if they were subtracted before.
+        shared_noise: one estimated noise for the forces and one for the torques, as for averages
+            over poses at rest.
+        resolution: quantisation step of forces and torques [N, N m], for averages over poses.
+        prior, ellipsoid: only for "consistent".
+        gain_std: standard deviation of the sensor's 36 gains, scaled by `covariance.ARM` between
+            force and torque; increases the covariance.
 
     Raises:
-        DrakeTeleopError: for an unknown method, arrays of another shape, numbers that are not
-            finite, a negative `gain_std`, fewer than 3 samples, or a wrench that is zero
-            throughout.
+        DrakeTeleopError: for unsuitable options, fewer than 3 samples, or a zero wrench.
     """
     check_method(method)
     expect((Noise, type(None)), noise, "noise")
@@ -281,14 +256,14 @@ def identify_batch(
     return BatchResult(identification, fit.wrench_noise, fit.rejected, fit.note, equations)
 
 
-def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
-    """Errors in variables with the noise that is given, or with the residual's."""
+def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
+    """Return total least squares with the specified noise, or that of the residual."""
     noise, Z = options.noise, moments.mean
     if noise.wrench is not None:
         std = np.asarray(noise.wrench, np.float64)
     else:
         std = np.ones(6)
-        floor = _ROUNDING * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
+        floor = _MIN_RELATIVE_NOISE * np.sqrt(np.diag(Z)[1:7].reshape(2, 3).sum(axis=1)).repeat(3)
         floor = np.where(floor > 0.0, floor, 1.0)
         for known in (Noise(), noise):
             theta = total_least_squares(moments, known, std, offsets=options.offsets).theta
@@ -299,20 +274,20 @@ def _weighted(moments: Moments, options: Options, record: Record) -> Fit:
                 squares, explained = (
                     x.reshape(2, 3).mean(axis=1).repeat(3) for x in (squares, explained)
                 )
-            std = np.sqrt(np.maximum(squares - explained, _LEAST_SHARE * squares).clip(floor**2))
+            std = np.sqrt(np.maximum(squares - explained, _NOISE_SHARE * squares).clip(floor**2))
     form = total_least_squares(moments, noise, std, offsets=options.offsets)
     return Fit(form, std, moments, np.zeros(len(record.s), bool))
 
 
-def _distances(record: Record, theta: Array, shared: bool) -> Array:
-    """(N,) largest residual of a sample's channels over the channel's robust deviation."""
+def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
+    """Return (N,) largest residual of a sample over the channel's robust deviation."""
     n = len(record.s)
-    some = np.abs(record.residual(theta, slice(0, n, max(1, n // _MEDIAN_SAMPLES))))
-    median = np.median(some, axis=0)
+    magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
+    median = np.median(magnitudes, axis=0)
     if shared:
-        median = np.median(some.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
+        median = np.median(magnitudes.reshape(-1, 2, 3), axis=(0, 2)).repeat(3)
     rms = np.sqrt(np.mean(record.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    scale = np.maximum(_NORMAL_MAD * median, _ROUNDING * rms)
+    scale = np.maximum(_NORMAL_MAD * median, _MIN_RELATIVE_NOISE * rms)
     scale = np.where(scale > 0.0, scale, 1.0)
     out = np.empty(n)
     for start in range(0, n, CHUNK):

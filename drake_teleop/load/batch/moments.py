@@ -1,17 +1,11 @@
-"""Second moments of a record, from which every batch estimator but the robust one follows.
+"""Second moments of a record, a (19, 19) matrix for any length, Eq. (T4).
 
-The row of channel c of the regressor, a_c = [e_c, V_c] (16), is linear in
+Row c of [E V] is T_c z with constant T_c and
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 
-with constant coefficients: a_c = T_c z. The mean Z of z z^T is therefore all that least squares
-with any weights between the channels, errors in variables and the residual's covariance need: a
-(19, 19) matrix whatever the length of the record.
-
-Noise of z has a mean covariance Q: constant for the wrench, s and alpha, and for the products of
-angular velocity to first order, d(w_i w_j) = w_i d w_j + w_j d w_i, by the mean of w w^T, which is
-in Z. The mean of w_i^2 grows by the variance of w_i; the covariances have none of that second
-order (of 0.002 rad/s it is 4e-6 rad^2/s^2).
+The mean of z z^T determines least squares with any weights between channels, errors in variables
+and the residual's covariance. Noise of omega counts to first order.
 """
 
 from __future__ import annotations
@@ -28,22 +22,21 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import regressor
 
 _CHUNK = 2**15
-# Singular directions of the scaled Gram, and columns without excitation [m/s^2, rad/s^2]; as in
-# `identification`.
-_RANK, _NO_EXCITATION = 1e-12, 1e-9
-# Where the products of angular velocity stand in z: (3, 3).
+# Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
+# `normal_equations`.
+_MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
+# Indices of the products w_i w_j in z.
 _PRODUCTS = np.array([[13, 16, 17], [16, 14, 18], [17, 18, 15]])
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations of what was measured; white, independent between the channels.
+    """Standard deviations of white measurement noise, independent between channels.
 
     Attributes:
         wrench: (6,) of [f; tau] [N, N m]; None to estimate them from the residual.
-        s, omega, alpha: (3,), or a number for all axes, of the motion [m/s^2, rad/s, rad/s^2].
-        walk: (12,), or 0, of the steps from one sample to the next by which the offsets of
-            [wrench, s, alpha] wander: random walks.
+        s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
+        walk: (12,), or 0, steps per sample of the random walks of [wrench, s, alpha].
     """
 
     wrench: ArrayLike | None = None
@@ -69,19 +62,19 @@ class Noise:
 
 
 class Moments:
-    """Sums of z z^T over a record, in memory that does not grow with it."""
+    """Sums of z z^T over a record; memory does not depend on its length."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((19, 19))
 
     @property
     def samples(self) -> float:
-        """The number of samples, or the sum of their weights."""
+        """Number of samples, or the sum of their weights."""
         return float(self._sums[0, 0])
 
     @property
     def mean(self) -> Array:
-        """(19, 19) mean of z z^T.
+        """Mean of z z^T (19, 19).
 
         Raises:
             DrakeTeleopError: for fewer than 3 samples.
@@ -101,16 +94,7 @@ class Moments:
         alpha: ArrayLike,
         weights: ArrayLike | None = None,
     ) -> None:
-        """Adds samples, in any order.
-
-        Args:
-            wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-            s, omega, alpha: (N, 3) motion of S in S, as for `regressor`.
-            weights: (N,) of the samples; None counts each as 1.
-
-        Raises:
-            DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
-        """
+        """Add samples (N, 6) and (N, 3) as for `identify`, in any order, with weights (N,) or 1."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else checked("weights", weights, n)
@@ -121,12 +105,12 @@ class Moments:
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
-        """(19, 19) mean covariance Q of the noise of z (module docstring); wrench: (6,) std."""
+        """Return the mean covariance Q (19, 19) of the noise of z; wrench: (6,) std."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
         products = self.mean[0, _PRODUCTS]
-        jacobian = np.zeros((3, 3, 19))  # of z by w_k, coefficient of w_i
+        jacobian = np.zeros((3, 3, 19))  # derivative of z by w_k, coefficient of w_i
         for i in range(3):
             for j in range(3):
                 jacobian[j, i, _PRODUCTS[i, j]] += 1.0 + (i == j)
@@ -136,7 +120,7 @@ class Moments:
 
     @staticmethod
     def walk_covariance(noise: Noise) -> Array:
-        """(19, 19) covariance of the steps of z's random walks."""
+        """Return the covariance (19, 19) of the steps of the random walks of z."""
         Q = np.zeros((19, 19))
         Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
         return Q
@@ -144,25 +128,23 @@ class Moments:
 
 @cache
 def coefficients() -> Array:
-    """T (6, 16, 19), with [E V] = T z; read off the regressor itself."""
-    T, unit, none = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
+    """Return T (6, 16, 19) with [E V] = T z, computed from the regressor."""
+    T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
-    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, none, none), 0, -1)
-    T[:, 6:, 10:13] = np.moveaxis(regressor(none, none, unit), 0, -1)
-    T[:, 6:, 13:16] = np.moveaxis(regressor(none, unit, none), 0, -1)
+    T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)
+    T[:, 6:, 10:13] = np.moveaxis(regressor(zero, zero, unit), 0, -1)
+    T[:, 6:, 13:16] = np.moveaxis(regressor(zero, unit, zero), 0, -1)
     for k, (i, j) in enumerate([(0, 1), (0, 2), (1, 2)]):
-        both = regressor(none, unit[i] + unit[j], none)
-        T[:, 6:, 16 + k] = both - regressor(none, unit[[i, j]], none).sum(axis=0)
+        both = regressor(zero, unit[i] + unit[j], zero)
+        T[:, 6:, 16 + k] = both - regressor(zero, unit[[i, j]], zero).sum(axis=0)
     T.flags.writeable = False
     return T
 
 
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
-    """Gram (16, 16) = sum W_cd T_c Z T_d^T, and right-hand side (16,), of mean moments.
+    """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
 
-    Args:
-        Z: (19, 19) mean moments of z, or a covariance of its noise.
-        W: (6, 6) weights between the channels, the inverse of the residual's covariance.
+    Z is a mean of z z^T or a noise covariance, W the weights between the channels.
     """
     T = coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
@@ -173,7 +155,7 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """(6, 6) mean of r r^T, r = F - [E V] theta; of a noise covariance, what it does to r."""
+    """Return the mean (6, 6) of r r^T, r = F - [E V] theta, from moments or noise covariance Z."""
     L = -np.einsum("cjk,j->ck", coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
@@ -181,24 +163,24 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
-    """(16,) bools, whether a column of [E V] is other than rounding."""
-    return np.diag(normal_equations(Z, np.eye(6))[0]) > _NO_EXCITATION**2
+    """Return (16,) bools: columns of [E V] above rounding."""
+    return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """(n, rank) R with R^T gram R = 1: R R^T right is the minimum norm solution, columns scaled.
+    """Return R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution.
 
-    It is 0 in columns that are not used and along singular directions.
+    Columns are scaled. R is 0 in unused columns and along singular directions.
     """
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _RANK * eigenvalues[-1]
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(eigenvalues[kept]), np.float64)
 
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, weights, sums):
-    """Adds the weighted sum of z z^T to sums (19, 19), upper half."""
+    """Add the weighted sum of z z^T to sums (19, 19), upper half."""
     z = np.empty(19)
     for i in range(wrench.shape[0]):
         z[0] = 1.0

@@ -1,32 +1,17 @@
-"""Errors in variables: the motion is measured with noise too, so V is not what it should be.
+"""Mixed least squares and total least squares: noise in the measured motion too, Eq. (T4).
 
-Noise of s, alpha and omega enters many entries of V at once, in force and torque rows together,
-and least squares takes the excess of V^T V for excitation: it makes inertias too small. With the
-mean covariance Q of the noise of z (`moments`) the residual r = F - [E V] theta has the covariance
-R(theta) = L(theta) Q L(theta)^T, L the coefficients of r in z. Offsets and structural zeros have no
-noise in Q and so stay exact.
+The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)), the factor of the specified
+variances (Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3 and 8).
+W = R(theta)^-1 is updated until convergence (Kukush, Van Huffel, Metrika 59, 2004).
 
-`total_least_squares` is mixed LS-TLS (Van Huffel, Vandewalle, The Total Least Squares Problem,
-1991, chapters 3 and 8) for a given weight W between the channels: it minimises the ratio
-
-    lambda = tr(W S(theta)) / tr(W R(theta)),   S the mean of r r^T,
-
-a generalised eigenvalue problem of (17, 17) matrices, whose solution is that of the compensated
-normal equations (G - lambda C) theta = b: C is the Gram of the noise alone. lambda is the factor by
-which the variances were stated too small; only their ratios matter. W = R(theta)^-1 is then taken
-from the solution and the step repeated, which is the element-wise weighted TLS estimator for noise
-whose covariance is the same in every sample (Kukush, Van Huffel, Metrika 59, 2004); omega's noise
-has another in every sample, of which this uses the mean. Without noise in the motion C = 0, and it
-is weighted least squares.
-
-Where the motion is no more than its noise, as the angular acceleration in static poses, there is
-nothing to learn, and dividing by the difference of G and lambda C would sell noise for inertias.
-Directions v in which v^T G v exceeds lambda v^T C v by less than the fraction 5 sqrt(2 / N), five
-standard deviations of a sum of squares of N samples of noise, are therefore left out.
+A direction v is left out if v^T G v exceeds lambda v^T C v by less than 5 sqrt(2 / N) of it: the
+motion is not distinguishable from its noise.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +20,7 @@ from scipy.optimize import brentq
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.batch.consistent import Ellipsoid, Prior
 from drake_teleop.load.batch.moments import (
     Moments,
     Noise,
@@ -43,25 +29,25 @@ from drake_teleop.load.batch.moments import (
     normal_equations,
     residual_covariance,
 )
+from drake_teleop.load.regressor import non_contact_wrench
 
-# At most so many weights, until theta changes by less; how near to a pole a root may be; and
-# standard deviations of noise that a signal must exceed.
-_ITERATIONS, _CONVERGED, _ROUNDING, _SIGNIFICANT = 10, 1e-8, 1e-12, 5.0
-_NOTHING = 1e-60  # N^2, N^2 m^2: mean squares whose inverse is beyond all use
+# Largest number of weight updates, relative change of theta at convergence, smallest relative
+# distance of a root from a pole, and standard deviations of noise that a signal must exceed.
+_MAX_ITERATIONS, _THETA_TOLERANCE, _POLE_DISTANCE, _NOISE_DEVIATIONS = 10, 1e-8, 1e-12, 5.0
+_MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
-    """gram theta = right of an estimator, divided by the number of samples, with its solution.
+    """Equations gram theta = right, divided by the number of samples, and their solution.
 
     Attributes:
-        gram: (16, 16), compensated for the noise in it.
+        gram: (16, 16), compensated for noise.
         right: (16,).
         theta: (16,) [offsets; phi] [SI].
-        weights: (6, 6) W between the channels, the inverse of the residual's covariance.
-        scale: lambda, residual variance over what the noise predicts.
-        transfer: (16, 16) from the solution of plain least squares with these weights to theta.
-        undetermined: (16,) bools, parameters whose variance in plain least squares comes for the
-            most part from directions that were left out.
+        weights: (6, 6) W between channels.
+        scale: lambda.
+        transfer: (16, 16) from plain least squares to theta.
+        undetermined: (16,) bools, parameters with most of their variance in left-out directions.
     """
 
     gram: Array
@@ -80,60 +66,56 @@ def total_least_squares(
     *,
     offsets: bool = True,
 ) -> NormalForm:
-    """Offsets and load where wrench and motion are noisy.
+    """Return offsets and load for noise of the wrench (6,) [N, N m] and of the motion.
 
-    Args:
-        moments: of the record.
-        noise: of the motion.
-        wrench_noise: (6,) standard deviations of the wrench channels [N, N m].
-        offsets: whether to estimate them; otherwise they are 0, subtracted already.
+    `offsets` False fixes them at 0.
 
     Raises:
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
     """
     Z, Q = moments.mean, moments.noise_covariance(noise, wrench_noise)
-    if np.diag(Z)[1:7].max() <= _NOTHING:
+    if np.diag(Z)[1:7].max() <= _MIN_MEAN_SQUARE:
         raise DrakeTeleopError(
-            "no mass can be told from this wrench",
+            "the mass cannot be identified from this wrench",
             where="wrench",
-            remedy="is the sensor connected, and does its orientation change?",
+            remedy="check that the sensor is connected and that its orientation changes",
         )
     W: Array = np.diag(wrench_noise**-2.0)
-    excess = _SIGNIFICANT * np.sqrt(2.0 / moments.samples)
-    before, least = np.zeros(16), excess / (1.0 + excess)
-    for _ in range(_ITERATIONS):
-        form = _step(Z, Q, W, offsets, least)
-        change = np.linalg.norm(form.theta - before)
-        if not noise.motion.any() or change <= _CONVERGED * np.linalg.norm(before):
+    excess = _NOISE_DEVIATIONS * np.sqrt(2.0 / moments.samples)
+    previous, min_gain = np.zeros(16), excess / (1.0 + excess)
+    for _ in range(_MAX_ITERATIONS):
+        form = _solve(Z, Q, W, offsets, min_gain)
+        change = np.linalg.norm(form.theta - previous)
+        if not noise.motion.any() or change <= _THETA_TOLERANCE * np.linalg.norm(previous):
             break
         W = np.asarray(np.linalg.inv(residual_covariance(Q, form.theta)), np.float64)
-        before = form.theta
+        previous = form.theta
     return form
 
 
-def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalForm:
-    """Mixed TLS with the weight W, without directions of which less than `least` is signal."""
+def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> NormalForm:
+    """Return mixed TLS for W, without directions with a signal share below `min_gain`."""
     gram, right = normal_equations(Z, W)
-    if not offsets:  # uncorrelated with all else, their estimate is 0
+    if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
         right[:6] = 0.0
     compensation, _ = normal_equations(Q, W)
     root = inverse_root(gram, excited_columns(Z))
-    # In these coordinates G is the identity: nu is the share of noise in each direction.
+    # In these coordinates G is the identity; nu is the noise share of each direction.
     nu, vectors = np.linalg.eigh(root.T @ compensation @ root)
     basis = root @ vectors
-    scale = _ratio(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
+    scale = _min_root(basis.T @ right, nu, float(np.sum(W * Z[1:7, 1:7])), np.sum(W * Q[1:7, 1:7]))
     gain = 1.0 - scale * nu
-    kept = gain > (least if nu[-1] > 0.0 else 0.0)
+    kept = gain > (min_gain if nu[-1] > 0.0 else 0.0)
     inverse = (basis[:, kept] / gain[kept]) @ basis[:, kept].T
     theta = inverse @ right
     if not offsets:
         theta[:6] = 0.0
-    along = gram @ basis[:, kept]
+    gram_basis = gram @ basis[:, kept]
     variance = np.sum(basis**2, axis=1)
     return NormalForm(
-        gram=(along * gain[kept]) @ along.T,
-        right=along @ (basis[:, kept].T @ right),
+        gram=(gram_basis * gain[kept]) @ gram_basis.T,
+        right=gram_basis @ (basis[:, kept].T @ right),
         theta=theta,
         weights=W,
         scale=scale,
@@ -142,10 +124,9 @@ def _step(Z: Array, Q: Array, W: Array, offsets: bool, least: float) -> NormalFo
     )
 
 
-def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """The smallest lambda with [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise] singular.
-
-    It is the one root below 1 / max nu of the secular equation.
+def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
+    """Return the smallest lambda that makes [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise]
+    singular: the only root below 1 / max(nu) of the secular equation.
     """
 
     def excess(ratio: float) -> float:
@@ -153,7 +134,64 @@ def _ratio(right: Array, nu: Array, squares: float, noise: float) -> float:
 
     highest = squares / noise
     if highest * nu[-1] >= 1.0:
-        highest = (1.0 - _ROUNDING) / nu[-1]
+        highest = (1.0 - _POLE_DISTANCE) / nu[-1]
     if excess(0.0) <= 0.0:  # no residual
         return 0.0
     return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))
+
+
+CHUNK = 2**15
+"""Samples per pass over a long record."""
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """Options of an estimator, as for `identify_batch`."""
+
+    noise: Noise
+    offsets: bool = True
+    shared_noise: bool = False
+    prior: Prior | None = None
+    ellipsoid: Ellipsoid | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Checked record: wrench (N, 6), s, omega and alpha (N, 3)."""
+
+    wrench: Array
+    s: Array
+    omega: Array
+    alpha: Array
+
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array]:
+        """Wrench (N, 6), s, omega and alpha (N, 3)."""
+        return self.wrench, self.s, self.omega, self.alpha
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Second moments of the record."""
+        moments = Moments()
+        moments.add(*self.arrays)
+        return moments
+
+    def every(self, step: int) -> Record:
+        """Return every `step`-th sample."""
+        return Record(*(table[::step] for table in self.arrays))
+
+    def residual(self, theta: Array, part: slice) -> Array:
+        """Return F - [E V] theta (n, 6) of a part of the samples."""
+        F, s, omega, alpha = (table[part] for table in self.arrays)
+        return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Normal form, wrench noise (6,), moments, rejected samples (N,) and a note for the user."""
+
+    form: NormalForm
+    wrench_noise: Array
+    moments: Moments
+    rejected: NDArray[np.bool_]
+    note: str = ""

@@ -1,8 +1,4 @@
-"""What an identification knows: intervals, determined combinations, priors, predicted wrenches.
-
-Standard deviations and degrees of freedom come with the `Identification`; how they are made honest
-in coloured noise is said in the docstring of `identification`.
-"""
+"""Intervals, determined combinations, prior shares and predicted wrenches of an identification."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.special import stdtrit
 
-from drake_teleop.common.arrays import Array, checked_rows
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import (
     PARAMETERS,
@@ -22,38 +18,31 @@ from drake_teleop.load.identification import (
     natural_scale,
 )
 from drake_teleop.load.normal_equations import NormalEquations
-from drake_teleop.load.regressor import regressor
 
-_MANY_DEGREES = 1e6  # beyond, Student's t is the normal distribution to six digits
+_NORMAL_DEGREES = 1e6  # Student's t is then normal to six digits
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 """Names of the wrench channels."""
 
 _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
-# Directions of the scaled Gram below which nothing is determined (as in `identification`), and
-# coefficients of combinations that count as zero: rounding.
-_RANK, _NO_COEFFICIENT = 1e-12, 1e-6
-# Terms of a combination that are worth a number, or a mention, as shares of the largest.
-_WORTH_A_NUMBER, _WORTH_A_MENTION = 0.1, 0.01
-_CHUNK = 2**13  # rows of V at a time: 4 MB
+# Smallest relative eigenvalue of a determined direction (as in `normal_equations`), and largest
+# coefficient that is rounding.
+_MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
+# Terms of a combination, relative to the largest, that appear with a number, or as "...".
+_NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
+_CHUNK = 2**13  # samples per pass, 4 MB of V
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
-    """(16,) lower and (16,) upper ends of the intervals of [offsets; phi] [SI].
+    """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
 
-    Student's t with the degrees of freedom of each variance: variances that were estimated from few
-    independent stretches of noise scatter themselves, and 1.96 standard deviations would hold
-    less often than stated. Undetermined parameters have (-inf, inf).
-
-    Args:
-        load: the identification.
-        level: share of the records in which an interval is to hold the truth.
+    Student's t with the degrees of freedom of each variance; (-inf, inf) if undetermined.
 
     Raises:
-        DrakeTeleopError: if the level is not within (0, 1).
+        DrakeTeleopError: if the level is outside (0, 1).
     """
     if not 0.0 < level < 1.0:
         raise DrakeTeleopError(f"{level} is not within (0, 1)", where="level")
-    degrees = np.minimum(load.degrees_of_freedom, _MANY_DEGREES)
+    degrees = np.minimum(load.degrees_of_freedom, _NORMAL_DEGREES)
     half = stdtrit(degrees, 0.5 + 0.5 * level) * load.standard_deviations
     theta = np.concatenate([load.offsets, load.phi])
     return theta - half, theta + half
@@ -62,28 +51,15 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Which parameters are still mostly the prior's, for `Identification.prior_dominated`.
-
-    An estimate with a Gaussian prior is the mean of data and prior weighted by their information;
-    the prior's weight is the square of (posterior / prior standard deviation). From a share of 0.5
-    on, the prior has a quarter of the weight or more, and the data alone would be less certain than
-    0.58 of the prior.
-
-    Args:
-        standard_deviations: (n,) of the estimate.
-        prior_std: (n,) of the prior; inf for none.
-        share: of the prior's standard deviation from which on it dominates.
-
-    Returns:
-        (n,) bools.
+    """Return (n,) bools: standard deviation at least `share` of the prior's, inf for no prior.
 
     Raises:
-        DrakeTeleopError: if the shapes differ or a standard deviation of the prior is not positive.
+        DrakeTeleopError: if shapes differ or a prior standard deviation is not positive.
     """
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
-            f"takes positive numbers, one for each of {deviations.shape} parameters",
+            f"needs positive numbers of shape {deviations.shape}",
             where="prior_std",
         )
     return np.asarray(deviations >= share * prior)
@@ -91,17 +67,13 @@ def prior_dominated(
 
 @dataclass(frozen=True, eq=False)
 class Combination:
-    """A linear combination of [offsets; phi] that a record determines.
+    """Linear combination of [offsets; phi] that a record determines.
 
     Attributes:
-        coefficients: (16,) of [offsets; phi]; the combination has the unit of its leading
-            parameter, whose coefficient is 1.
-        leading: index of that parameter in `PARAMETERS`.
-        value: the estimate, in the unit of the leading parameter.
-        standard_deviation: likewise.
-        share: standard deviation over what is natural for the load (`natural_scale`).
-        words: the sum, such as "I_zz + 0.2 m c_x"; terms below a tenth of the largest, by what is
-            natural for the load, are "...", and those below a hundredth are left out.
+        coefficients: (16,); 1 for the leading parameter, which gives the unit.
+        leading: its index in `PARAMETERS`.
+        share: standard deviation over the natural scale.
+        words: the sum as text; "..." stands for terms below a tenth of the largest.
     """
 
     coefficients: Array
@@ -112,25 +84,21 @@ class Combination:
     words: str
 
     def __str__(self) -> str:
-        """For instance "I_zz + 0.2 m c_x = 0.31 +- 0.01 kg m^2"."""
+        """Return text such as "I_zz + 0.2 m c_x = 0.31 +- 0.01 kg m^2"."""
         numbers = f"{self.value:.4g} +- {self.standard_deviation:.2g} {_UNITS[self.leading]}"
         return f"{self.words} = {numbers}"
 
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Which combinations of load and offsets a record determines (base parameters).
+    """Base parameters: combinations of load and offsets that a record determines.
 
     Attributes:
-        combinations: as many as the rank of [E V]; each is one parameter plus multiples of those
-            that cannot be told from it. Gautier, Khalil, IEEE Trans. Robotics and Automation 6(3),
-            1990, whose numerical form is a QR decomposition with pivoting (Gautier, ICRA 1990).
-        without_influence: names of the parameters that had no part in the wrench at all.
-        directions: of the parameters that are determined but not identified, the independent
-            combinations from the best to the worst known, in units natural for the load. One that
-            has a share of at most 5 % is identified although its parts are not.
-        slow_noise: names of the wrench channels whose noise remembers longer than the record can
-            tell (drift): the standard deviations are then lower bounds.
+        combinations: as many as the rank of [E V] (Gautier, Khalil, IEEE Trans. Robotics and
+            Automation 6(3), 1990; QR with pivoting: Gautier, ICRA 1990).
+        without_influence: names of parameters without influence on the wrench.
+        directions: principal combinations of determined but not identified parameters.
+        slow_noise: names of wrench channels with drift.
     """
 
     combinations: tuple[Combination, ...]
@@ -140,11 +108,11 @@ class BaseParameters:
 
     @property
     def rank(self) -> int:
-        """The number of independent combinations that the record determines, 16 at most."""
+        """Number of independent combinations that the record determines, at most 16."""
         return len(self.combinations)
 
     def lines(self) -> list[str]:
-        """What the record determines beyond single parameters, in words; one line for each."""
+        """Return the summary as lines of text."""
         lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)
@@ -154,8 +122,8 @@ class BaseParameters:
         ]
         for c in self.directions:
             if np.count_nonzero(c.coefficients) == 1 or c.share > WORTH_STATING:
-                much = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
-                lines.append(f"weak: {c} ({much} what is natural for the load)")
+                percentage = f"{100.0 * c.share:.0f} % of" if c.share < 1.0 else "more than"
+                lines.append(f"weak: {c} ({percentage} the natural scale of the load)")
             else:
                 lines.append(f"identified although its parts are not: {c}")
         if self.slow_noise:
@@ -165,14 +133,7 @@ class BaseParameters:
 
 
 def base_parameters(equations: NormalEquations) -> BaseParameters:
-    """What a record determines, exactly and within its noise.
-
-    Args:
-        equations: the sums over the record.
-
-    Raises:
-        DrakeTeleopError: as `NormalEquations.solve`.
-    """
+    """Return the base parameters of a record; raises as `NormalEquations.solve`."""
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scale(load.phi)
@@ -182,20 +143,20 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         c = coefficients / coefficients[leading]
         deviation = float(np.sqrt(max(0.0, c @ covariance @ c)))
         size = float(np.linalg.norm(c * natural))
-        words = _sum_in_words(c, leading, np.abs(c) * natural)
+        words = _combination_text(c, leading, np.abs(c) * natural)
         return Combination(c, leading, float(c @ theta), deviation, deviation / size, words)
 
-    # Exactly: the dependent columns of [E V] as combinations of independent ones. Of equals, the
-    # load's columns are taken for independent, so that the words begin with its parameters.
+    # Dependent columns of [E V] as combinations of independent ones. The scale prefers columns of
+    # the load as independent, so that the text begins with its parameters.
     gram, _ = equations.normal_equations()
     norm = np.sqrt(np.where(unexcited, 1.0, np.diag(gram)))
     scale = np.where(unexcited, 0.0, np.repeat([1.0, 2.0], [6, 10]) / norm)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
-    kept = eigenvalues > _RANK * eigenvalues[-1]
+    kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]
     rank = int(kept.sum())
     R, order = qr(np.sqrt(eigenvalues[kept])[:, None] * vectors[:, kept].T, mode="r", pivoting=True)
     dependence = solve_triangular(R[:, :rank], R[:, rank:])
-    dependence[np.abs(dependence) < _NO_COEFFICIENT] = 0.0
+    dependence[np.abs(dependence) < _MIN_COEFFICIENT] = 0.0
     combinations = []
     for row, i in enumerate(order[:rank]):
         c = np.zeros(16)
@@ -207,7 +168,7 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
         combinations.append(combination(c, int(i)))
     combinations.sort(key=lambda c: c.leading)
 
-    # Within the noise: principal directions of what is determined but not identified.
+    # Principal directions of determined but not identified parameters.
     weak = np.flatnonzero(~load.identifiable & np.isfinite(load.standard_deviations))
     scaled = covariance[np.ix_(weak, weak)] / np.outer(natural[weak], natural[weak])
     directions = []
@@ -220,47 +181,13 @@ def base_parameters(equations: NormalEquations) -> BaseParameters:
     return BaseParameters(tuple(combinations), names, tuple(directions), slow)
 
 
-def _sum_in_words(coefficients: Array, leading: int, weights: Array) -> str:
+def _combination_text(coefficients: Array, leading: int, weights: Array) -> str:
     weights = weights / weights.max()
     text = PARAMETERS[leading]
-    for i in np.flatnonzero(weights >= _WORTH_A_NUMBER):
+    for i in np.flatnonzero(weights >= _NUMBER_SHARE):
         if i != leading:
             c = coefficients[i]
             size = "" if abs(abs(c) - 1.0) < 5e-4 else f"{abs(c):.3g} "
             text += f" {'-' if c < 0.0 else '+'} {size}{PARAMETERS[i]}"
-    small = (weights < _WORTH_A_NUMBER) & (weights >= _WORTH_A_MENTION)
+    small = (weights < _NUMBER_SHARE) & (weights >= _ELLIPSIS_SHARE)
     return text + " + ..." if small.any() else text
-
-
-def wrench_standard_deviations(
-    load: Identification, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike
-) -> Array:
-    """How well an identified load predicts the wrench V phi of a motion.
-
-    The variance of row v of V is v C v^T with the covariance C of phi, products between parameters
-    included: a motion like that of the record is predicted better than the parameters are known.
-    Errors of the motion and the model are not in it, nor are the offsets.
-
-    Args:
-        load: the identification.
-        s, omega, alpha: (..., 3) motion, as for `regressor`.
-
-    Returns:
-        (..., 6) standard deviations of [f; tau] [N, N m]; inf where an undetermined parameter has a
-        part in the wrench.
-
-    Raises:
-        DrakeTeleopError: for arrays of another shape or with numbers that are not finite.
-    """
-    leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
-    covariance = load.covariance[6:, 6:]
-    unknown = np.isinf(np.diag(covariance))
-    finite = np.where(np.isinf(covariance), 0.0, covariance)
-    samples = motion[0].shape[0]
-    deviations = np.empty((samples, 6))
-    for start in range(0, samples, _CHUNK):
-        V = regressor(*(table[start : start + _CHUNK] for table in motion))
-        variances = np.einsum("nci,nci->nc", V @ finite, V)
-        variances[(V[:, :, unknown] != 0.0).any(axis=2)] = np.inf
-        deviations[start : start + _CHUNK] = np.sqrt(np.maximum(variances, 0.0))
-    return deviations.reshape(*leading, 6)

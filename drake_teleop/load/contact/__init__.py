@@ -1,1 +1,1 @@
-"""Contact in what is left after elimination."""
+"""Contact detection in the eliminated wrench."""

@@ -1,9 +1,14 @@
-"""Noticing contact in the eliminated wrench, sample by sample, without calling fast motion contact.
+"""Contact detection in the eliminated wrench, sample by sample.
 
-Contact begins when the chosen one of the `statistics` reaches its threshold. It ends when for a
-while the level has stayed below a share of the level's own threshold, and the sum over that while
-is as low; then the sums start anew, because after a long contact they would take as long to come
-down.
+Statistics, of z and e as in `noise_floor`:
+
+    level    |z|; its square is chi-squared with six degrees of freedom
+    cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
+             30, 1988)
+    glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
+             generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
+
+Contact begins at a threshold and ends after `hold` samples below `leave`; then the sums restart.
 """
 
 from __future__ import annotations
@@ -16,28 +21,137 @@ from numpy.typing import ArrayLike, NDArray
 from drake_teleop.common.arrays import Array, checked, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.memory import (
-    COUNT,
-    FIRST_STATISTIC,
-    FLAG,
-    QUIET_FOR,
-    RING,
-    SIZE,
-    SUM,
-    TOTAL,
+from drake_teleop.load.contact.noise_floor import (
+    HELD_A,
+    HELD_ALPHA,
+    LENGTHS,
     WINDOW,
+    NoiseFloor,
+    checked_motion,
+    hold_peaks,
+    parameter_variance,
+    statistic_index,
 )
-from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, statistic_index
-from drake_teleop.load.contact.statistics import LEAVE, SLACK, detection_update
+
+# Indices into the memory: sample count; held |a|^2 and |alpha|^2 (in `noise_floor`); flag; samples
+# below `leave`; statistics (3); previous z (6); mean of F_c (6); cumulative sum S (6); sum of all
+# e (6); ring of its last WINDOW values.
+COUNT, FLAG, QUIET_FOR, FIRST_STATISTIC = 0, 3, 4, 5
+Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
+SIZE = RING + 6 * WINDOW
+"""Length of the memory of `detection_update`."""
+SLACK = 1.0
+"""Slack of the cumulative sum [standard deviations]. In white noise, half of the smallest shift to
+detect is best; this value tolerates lasting errors of the load."""
+RARE = 6.2
+"""Level that normal noise reaches once in a million samples."""
+LEAVE = 0.7 * RARE
+"""Level below which contact may end."""
+
+
+@njit(cache=True)
+def detection_update(
+    memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
+):
+    """Update by one sample and write the `STATISTICS` to memory[5:8]; compiled, without checks.
+
+    Args:
+        memory: (SIZE,), zeros before the first sample.
+        contact: (6,) F_c of Eq. (13).
+        s, omega, alpha, acceleration: (3,) as for `NoiseFloor.sigma`.
+        parameters: `NoiseFloor.parameters`.
+        slack, following, quiet: as for `ContactDetector`, quiet for leave.
+    """
+    variances, P, growth, root, rho, widths, fade = parameters
+    V, scaled = np.empty((6, 10)), np.empty(6)
+    hold_peaks(memory, acceleration, alpha, fade)
+    parameter_variance(s, omega, alpha, P, V, scaled)
+    for c in range(6):
+        moving = growth[c, 0] * memory[HELD_A] + growth[c, 1] * memory[HELD_ALPHA]
+        variance = variances[c] + max(scaled[c], 0.0) + moving
+        scaled[c] = (contact[c] - memory[MEAN + c]) / math.sqrt(variance)
+    count = int(memory[COUNT])
+    level, length = 0.0, 0.0
+    for i in range(6):
+        z = 0.0
+        for j in range(i + 1):
+            z += root[i, j] * scaled[j]
+        # The first sample has no predecessor.
+        e = z if count == 0 else (z - rho[i] * memory[Z + i]) / math.sqrt(1.0 - rho[i] * rho[i])
+        memory[Z + i] = z
+        level += z * z
+        memory[SUM + i] += e
+        length += memory[SUM + i] * memory[SUM + i]
+        memory[TOTAL + i] += e
+    level, length = math.sqrt(level), math.sqrt(length)
+    if level < quiet:
+        for c in range(6):
+            memory[MEAN + c] += following * (contact[c] - memory[MEAN + c])
+    shrink = max(0.0, 1.0 - slack / length) if length > 0.0 else 0.0
+    for i in range(6):
+        memory[SUM + i] *= shrink
+    # The sum before the first sample is zero, as is the initial ring.
+    here = RING + 6 * (count % WINDOW)
+    best, n = 0.0, 1
+    for m in range(LENGTHS):
+        if n > count + 1:
+            break
+        before = RING + 6 * ((count + WINDOW - n) % WINDOW)
+        total = 0.0
+        for i in range(6):
+            difference = memory[TOTAL + i] - memory[before + i]
+            total += difference * difference
+        best = max(best, total / (n * widths[m] * widths[m]))
+        n *= 2
+    for i in range(6):
+        memory[here + i] = memory[TOTAL + i]
+    memory[COUNT] += 1.0
+    memory[FIRST_STATISTIC] = level
+    memory[FIRST_STATISTIC + 1] = length * shrink
+    memory[FIRST_STATISTIC + 2] = math.sqrt(best)
+
+
+@njit(cache=True)
+def _statistics(rows, parameters, slack, following, quiet, out):
+    contact, s, omega, alpha, acceleration = rows
+    memory = np.zeros(SIZE)
+    for k in range(contact.shape[0]):
+        sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
+        detection_update(memory, *sample, parameters, slack, following, quiet)
+        out[k] = memory[FIRST_STATISTIC : FIRST_STATISTIC + 3]
+
+
+def statistics(
+    floor: NoiseFloor,
+    contact: ArrayLike,
+    s: ArrayLike,
+    omega: ArrayLike,
+    alpha: ArrayLike,
+    acceleration: ArrayLike,
+    *,
+    slack: float = SLACK,
+    following: float = 0.0,
+) -> Array:
+    """Return the `STATISTICS` (N, 3) of each sample of a log, without hysteresis.
+
+    Args:
+        contact: (N, 6) F_c of Eq. (13) [N, N m].
+        s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
+    """
+    rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
+    out = np.empty((len(rows[0]), 3))
+    sums = float(positive("slack", slack)), float(following), LEAVE
+    _statistics(tuple(rows), floor.parameters, *sums, out)
+    return out
 
 
 @njit(cache=True)
 def _last_sum(memory, hold, widths):
-    """The likelihood ratio of the longest window within `hold` samples, without a maximum."""
+    """Return the likelihood ratio of the longest window within `hold` samples."""
     m = 0
     while 2 << m <= min(hold, WINDOW // 2):
         m += 1
-    # The sample before that window; what no sample has filled is zero.
+    # Sum before that window; zero if there was no sample yet.
     before = RING + 6 * ((int(memory[COUNT]) + WINDOW - 1 - (1 << m)) % WINDOW)
     total = 0.0
     for i in range(6):
@@ -48,15 +162,14 @@ def _last_sum(memory, hold, widths):
 
 @njit(cache=True)
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Whether there is contact, after `detection_update`; compiled, checks nothing.
+    """Return whether there is contact, after `detection_update`; compiled, without checks.
 
     Args:
-        memory: the same, updated.
+        memory: of `detection_update`, updated.
         statistic: index into `STATISTICS`.
-        enter: threshold of that statistic.
-        leave: level below which contact may end, and sum of the longest window within `hold`.
-        hold: samples below it, after which it has ended.
-        widths: of the sums.
+        enter: its threshold.
+        leave, hold: level, and samples below it, before contact ends.
+        widths: of `NoiseFloor`.
     """
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
@@ -64,7 +177,7 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
     else:
         memory[QUIET_FOR] = memory[QUIET_FOR] + 1.0 if memory[FIRST_STATISTIC] < leave else 0.0
         if memory[QUIET_FOR] > hold and _last_sum(memory, hold, widths) < leave:
-            # The sums start anew, the noise goes on.
+            # Reset the sums, because they would decrease too slowly after a long contact. Keep z.
             memory[FLAG] = 0.0
             memory[SUM:] = 0.0
             memory[COUNT] = 1.0
@@ -72,24 +185,11 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 
 @njit(cache=True)
-def flag_update(
-    memory,
-    contact,
-    s,
-    omega,
-    alpha,
-    acceleration,
-    parameters,
-    slack,
-    following,
-    statistic,
-    enter,
-    leave,
-    hold,
-):
-    """One sample, in place; whether there is contact. `ContactDetector.settings` are the last."""
+def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
+    """Update by one sample with `ContactDetector.settings`; return whether there is contact."""
+    slack, following, statistic, enter, leave, hold = decision
     detection_update(
-        memory, contact, s, omega, alpha, acceleration, *parameters, slack, following, leave
+        memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
     )
     return hysteresis_update(memory, statistic, enter, leave, hold, parameters[5])
 
@@ -98,29 +198,25 @@ def flag_update(
 def _flags(memory, rows, settings, out):
     contact, s, omega, alpha, acceleration = rows
     for k in range(contact.shape[0]):
-        out[k] = flag_update(
-            memory, contact[k], s[k], omega[k], alpha[k], acceleration[k], *settings
-        )
+        sample = contact[k], s[k], omega[k], alpha[k], acceleration[k]
+        out[k] = flag_update(memory, *sample, *settings)
 
 
 class ContactDetector:
-    """Says at each sample whether something is touched (module docstring).
+    """Contact detector for a stream of samples.
 
-    What it knows is a `memory` (an array), which can be kept outside, as in the state of a Drake
-    system: `initial_memory`, `flag_update(memory, ..., *settings)`.
+    `flag_update(memory, ..., *settings)` works on external memory, such as a Drake state.
 
     Args:
-        floor: of the free motion.
-        threshold: of the chosen statistic; see `free_threshold`.
+        threshold: of the statistic, such as `NoiseFloor.threshold`.
         statistic: one of `STATISTICS`.
-        leave: level below which contact may end.
-        hold: samples of quiet after which it has ended.
-        slack: of the cumulative sum.
-        following: share by which the mean of F_c, which is taken away, follows each sample while
-            the level is below `leave`: period over time constant, or 0 for no mean.
+        leave, hold: level, and samples below it, before contact ends.
+        slack: of the cumulative sum [standard deviations].
+        following: period over time constant of the subtracted mean of F_c, updated while the level
+            is below `leave`; 0 for no mean.
 
     Raises:
-        DrakeTeleopError: for another statistic or values that are not positive.
+        DrakeTeleopError: for an unknown statistic or values outside their range.
     """
 
     def __init__(
@@ -135,18 +231,18 @@ class ContactDetector:
         following: float = 0.0,
     ) -> None:
         column = statistic_index(statistic)
-        enter, low = float(positive("threshold", threshold)), float(positive("leave", leave))
+        enter, exit_level = float(positive("threshold", threshold)), float(positive("leave", leave))
         if not 0.0 <= following < 1.0:
             raise DrakeTeleopError(f"{following} is not within [0, 1)", where="following")
         sums = float(positive("slack", slack)), float(following)
-        decision = column, enter, low, int(hold)
-        #: The last arguments of `flag_update`, the kernel of this class.
-        self.settings = (floor.parameters, *sums, *decision)
+        decision = column, enter, exit_level, int(hold)
+        #: Last arguments of `flag_update`.
+        self.settings = (floor.parameters, (*sums, *decision))
         self._memory = self.initial_memory()
 
     @staticmethod
     def initial_memory() -> Array:
-        """The memory before the first sample, (n,)."""
+        """Return the memory (n,) before the first sample."""
         return np.zeros(SIZE)
 
     def update(
@@ -157,11 +253,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> bool:
-        """Takes one sample, (6,) and (3,) each as for `statistics`; whether there is contact.
-
-        Raises:
-            DrakeTeleopError: for other shapes or numbers that are not finite.
-        """
+        """Update by one sample as for `statistics`; return whether there is contact."""
         parts = {"s": s, "omega": omega, "alpha": alpha, "acceleration": acceleration}
         motion = [checked(name, value, 3) for name, value in parts.items()]
         wrench = checked("contact", contact, 6)
@@ -175,10 +267,23 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> NDArray[np.bool_]:
-        """`update` with each of N samples of a log, in a compiled loop; (N,) flags."""
+        """Return the flags (N,) of N samples of a log, updating as `update` does."""
         rows = checked_motion(
             contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration
         )
         out = np.empty(len(rows[0]), np.bool_)
         _flags(self._memory, tuple(rows), self.settings, out)
         return out
+
+
+def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return direction (..., 3), nearest point (..., 3) [m] and pitch (...) [m] of a wrench's axis.
+
+    Poinsot's central axis of (..., 6) in S; the point is nearest to So. NaN where f = 0.
+    """
+    w = checked("wrench", wrench, 6, leading=True)
+    f, tau = w[..., :3], w[..., 3:]
+    square = np.sum(f * f, axis=-1)
+    square = np.where(square > 0.0, square, np.nan)
+    direction = f / np.sqrt(square)[..., None]
+    return direction, np.cross(f, tau) / square[..., None], np.sum(f * tau, axis=-1) / square

@@ -1,20 +1,11 @@
-"""How large the eliminated wrench is in free motion.
-
-In free motion the contact wrench r = F - F_o - V phi of Eq. (13) is not zero. The standard
-deviation of channel c is taken as
+"""Noise floor: standard deviation of the eliminated wrench r = F - F_o - V phi in free motion.
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-with n the noise at rest, P the covariance of the estimated [offsets; phi], and |a|, |alpha| the
-accelerations of S without gravity. What grows with them is what gains, alignment in time and
-space, bandwidth and elasticity leave of the inertial wrench; n, k and l are fitted to free motion
-(`noise_floor_fit`). The residual of a delay or a low-pass is largest when the acceleration
-changes, not when it is large; so their squares are held at their peaks, from where they fade.
-
-**Whitening.** r_c / sigma_c is decorrelated by the Cholesky factor of its correlation in free
-motion: z, whose six components have unit variance. A low-pass leaves z correlated in time; sums of
-z (`statistics`) take its innovations e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2), rho the lag-one
-correlation of each component. For a sensor with white noise rho = 0 and e = z.
+n is the noise at rest, P the covariance of [offsets; phi], a and alpha the accelerations of S
+without gravity, whose squares are held at their peaks and fade. k and l cover gains, alignment,
+bandwidth and elasticity. z is r / sigma, decorrelated, with innovations
+e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
 """
 
 from __future__ import annotations
@@ -28,22 +19,28 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.arrays import Array, checked, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.memory import HELD_A, HELD_ALPHA, LENGTHS
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into
 
+WINDOW = 128
+"""Longest sum of the likelihood ratio [samples], a power of two."""
+LENGTHS = WINDOW.bit_length()
+"""Number of sums: over 1, 2, 4 ... WINDOW samples."""
+
+HELD_A, HELD_ALPHA = 1, 2  # indices of held squares in the memory of a detector
+
 STATISTICS = ("level", "cusum", "glr")
-"""Columns of `statistics`, and what `ContactDetector` may decide by."""
+"""Columns of `statistics`, and choices of `ContactDetector`."""
 MARGIN = 1.25
-"""Of a threshold over the largest value of free motion, which is reached about once in as long a
-record of more of it. Normal noise reaches a quarter more hundreds of times less often."""
+"""Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
+less often than that value, which is reached about once in a record of the same length."""
 
 
 def statistic_index(statistic: str) -> int:
-    """The column of a statistic in `statistics`.
+    """Return the column of a statistic.
 
     Raises:
-        DrakeTeleopError: for a name that is not one of `STATISTICS`.
+        DrakeTeleopError: unless it is one of `STATISTICS`.
     """
     if statistic not in STATISTICS:
         raise DrakeTeleopError(
@@ -56,17 +53,17 @@ def statistic_index(statistic: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class NoiseFloor:
-    """How large the eliminated wrench is in free motion (module docstring).
+    """Noise floor of the eliminated wrench.
 
     Attributes:
-        noise: (6,) standard deviation n at rest [N, N m].
-        covariance: (16, 16) P of [offsets; phi]; finite, see `finite_covariance`.
+        noise: (6,) n [N, N m].
+        covariance: (16, 16) P, finite, see `finite_covariance`.
         per_acceleration: (6, 2) k [N, N m per m/s^2] and l [per rad/s^2].
-        correlation: (6, 6) of the wrench over its floor, in free motion.
-        rho: (6,) lag-one correlation of the decorrelated components, of the log's rate.
+        correlation: (6, 6) of r / sigma.
+        rho: (6,) lag-one correlation of z.
         widths: (8,) w_n of sums of 1, 2, 4 ... `WINDOW` innovations; 1 for white ones.
-        fade: factor by which held squares of the acceleration fade each sample, 0 for no hold.
-        reached: (3,) the largest of each of the `STATISTICS` in the motion that this was fitted to.
+        fade: factor per sample on held squares of the acceleration, 0 for no hold.
+        reached: (3,) largest value of each statistic in the fitted motion.
     """
 
     noise: Array
@@ -96,18 +93,16 @@ class NoiseFloor:
             raise DrakeTeleopError("is not positive definite", where="correlation")
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
-        """What the statistic reached in free motion, times a margin.
-
-        It is worth as much as that motion, which should be as fast as what is judged by it.
+        """Return the largest value of the statistic in the fitted free motion, times a margin.
 
         Raises:
-            DrakeTeleopError: for another statistic, or if this was not fitted to a motion.
+            DrakeTeleopError: for an unknown statistic, or without a fitted motion.
         """
         return margin * float(positive("reached", self.reached, 3)[statistic_index(statistic)])
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
-        """For the kernels: variances, P, squares of k and l, whitening, rho, widths, fade."""
+        """Kernel arguments: variances, P, squares of k and l, whitening, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
@@ -115,11 +110,11 @@ class NoiseFloor:
     def sigma(
         self, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, acceleration: ArrayLike
     ) -> Array:
-        """(N, 6) standard deviation of each channel along a free motion, N samples in order.
+        """Return sigma (N, 6) along a free motion of N consecutive samples.
 
         Args:
-            s, omega, alpha: (N, 3) motion of S, as for `regressor`.
-            acceleration: (N, 3) a of So, without gravity, in any axes [m/s^2].
+            s, omega, alpha: (N, 3) as for `regressor`.
+            acceleration: (N, 3) a of So without gravity, in any axes [m/s^2].
         """
         rows = checked_motion(s=s, omega=omega, alpha=alpha, acceleration=acceleration)
         out = np.empty((len(rows[0]), 6))
@@ -134,14 +129,14 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
-    """Updates the largest squares of acceleration and alpha so far, which fade at each sample."""
+    """Update the fading peaks of the squared accelerations."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
 
 @njit(cache=True)
 def parameter_variance(s, omega, alpha, P, V, out):
-    """Writes the diagonal of J P J^T into out (6,); V (6, 10) is working space."""
+    """Write the diagonal of J P J^T into out (6,); V (6, 10) is scratch."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -157,7 +152,7 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 @njit(cache=True)
 def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Writes the (N, 6) deviations of a record's contact wrench: noise, load, motion."""
+    """Write the standard deviations (N, 6) of a record's contact wrench into out."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
         hold_peaks(memory, acceleration[k], alpha[k], fade)
@@ -168,31 +163,21 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
 
 
 def checked_motion(**arrays: ArrayLike) -> list[Array]:
-    """The arrays by name as (N, 3), `contact` as (N, 6), of one length and finite."""
+    """Return the named arrays as (N, 3) tables of equal length, `contact` as (N, 6)."""
     sizes = {name: (value, 6 if name == "contact" else 3) for name, value in arrays.items()}
     return checked_rows(**sizes)[1]
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """The covariance of an identification, with what the record left open made finite.
+    """Return a covariance (16, 16) with `natural_scale` instead of larger deviations.
 
-    Undetermined parameters (infinite variance, or more than is natural) are replaced by what is
-    natural for a load of this mass and size (`identification.natural_scale`): the elimination uses
-    values of that order for them.
-
-    Args:
-        phi: (10,) the load that is eliminated.
-        covariance: (16, 16) of [offsets; phi], as of `Identification`.
-        tared: the offsets are not of the identification but of the very record.
-
-    Returns:
-        (16, 16).
+    `tared` means offsets from the same record: their variance is 0.
     """
     P, natural = covariance.copy(), natural_scale(phi)
-    # Offsets that are not determined have been tared, or the elimination is worth nothing.
-    unknown = ~(np.diag(P) <= natural**2)
-    P[unknown, :] = P[:, unknown] = 0.0
-    P[unknown, unknown] = natural[unknown] ** 2
+    # Undetermined offsets must have been tared; otherwise the elimination is useless.
+    undetermined = ~(np.diag(P) <= natural**2)
+    P[undetermined, :] = P[:, undetermined] = 0.0
+    P[undetermined, undetermined] = natural[undetermined] ** 2
     if tared:
         P[:6, :] = P[:, :6] = 0.0
     return P

@@ -1,4 +1,4 @@
-"""Fitting the noise floor to a record of free motion."""
+"""Fit of the noise floor to a record of free motion."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.contact.memory import LENGTHS
-from drake_teleop.load.contact.noise_floor import NoiseFloor, checked_motion, write_sigmas
-from drake_teleop.load.contact.statistics import statistics
+from drake_teleop.load.contact.detection import statistics
+from drake_teleop.load.contact.noise_floor import LENGTHS, NoiseFloor, checked_motion, write_sigmas
 
-# A noise floor below this counts as this [N, N m]: as in `logs.contact`.
+# Lower limit of a noise floor [N, N m], as in `logs.contact`.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
-_FITS, _SETTLED = 20, 1e-4
-_HIGHEST_RHO, _NARROWEST, _RARE = 0.999, 0.1, 1e-3
+_MAX_FITS, _FIT_TOLERANCE = 20, 1e-4
+_MAX_RHO, _MIN_WIDTH, _RARE_SHARE = 0.999, 0.1, 1e-3
 
 
 def fit_noise_floor(
@@ -29,72 +28,71 @@ def fit_noise_floor(
     *,
     fade: float = 0.0,
 ) -> NoiseFloor:
-    """The noise floor of a record of free motion, the faster the better.
+    """Return the noise floor of a record of free motion, the faster the better.
 
-    The squares of each channel are explained by 1, |a|^2 and |alpha|^2 with coefficients >= 0, on
-    top of what the parameters' covariance explains; samples weigh by their own floor (as for normal
-    noise, whose squares vary in proportion), so the fit is repeated until that settles.
+    Squares of each channel are explained by 1, |a|^2, |alpha|^2 and P. Weights are iterated:
+    squares of normal noise scatter in proportion to their mean.
 
     Args:
-        contact: (N, 6) F_c where nothing is touched, N samples in order [N, N m].
+        contact: (N, 6) F_c without contact [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
         covariance: (16, 16) as of `finite_covariance`.
         fade: of `NoiseFloor`.
 
     Raises:
-        DrakeTeleopError: for other shapes, numbers that are not finite, or fewer than 100 samples.
+        DrakeTeleopError: for fewer than 100 samples.
     """
     from scipy.optimize import nnls
 
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     if len(rows[0]) < 100:
         raise DrakeTeleopError(
-            f"{len(rows[0])} samples say too little about noise",
+            f"{len(rows[0])} samples are too few for a noise floor",
             where="contact",
             remedy="give 100 samples of free motion or more",
         )
     P = checked("covariance", covariance, 16, 16)
-    known, one = np.empty_like(rows[0]), np.zeros((6, 2))
-    write_sigmas(*rows[1:], np.zeros(6), P, one, fade, known)
+    parameter_std, no_growth = np.empty_like(rows[0]), np.zeros((6, 2))
+    write_sigmas(*rows[1:], np.zeros(6), P, no_growth, fade, parameter_std)
     held = np.empty((2, *rows[0].shape))
     for unit, out in zip(np.eye(2), held, strict=True):
         growth = np.tile(unit, (6, 1))
         write_sigmas(*rows[1:], np.zeros(6), np.zeros((16, 16)), growth, fade, out)
-    found = np.zeros((6, 3))
+    fitted = np.zeros((6, 3))
     for c in range(6):
-        square, given = rows[0][:, c] ** 2, known[:, c] ** 2
+        square, explained = rows[0][:, c] ** 2, parameter_std[:, c] ** 2
         terms = np.stack([np.ones(len(square)), *held[:, :, c] ** 2], axis=1)
         variance = np.full(len(square), max(float(square.mean()), _RESOLUTION[c] ** 2))
-        for _ in range(_FITS):
-            before = found[c].copy()
-            weighted = np.column_stack([terms, square - given]) / variance[:, None]
-            R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem, of four rows
-            found[c] = nnls(R[:, :3], R[:, 3])[0]
-            found[c, 0] = max(found[c, 0], _RESOLUTION[c] ** 2)
-            variance = terms @ found[c] + given
-            if np.allclose(found[c], before, rtol=_SETTLED, atol=0.0):
+        for _ in range(_MAX_FITS):
+            previous = fitted[c].copy()
+            weighted = np.column_stack([terms, square - explained]) / variance[:, None]
+            R = np.asarray(np.linalg.qr(weighted, mode="r"))  # the same problem with four rows
+            fitted[c] = nnls(R[:, :3], R[:, 3])[0]
+            fitted[c, 0] = max(fitted[c, 0], _RESOLUTION[c] ** 2)
+            variance = terms @ fitted[c] + explained
+            if np.allclose(fitted[c], previous, rtol=_FIT_TOLERANCE, atol=0.0):
                 break
     floor = NoiseFloor(
-        np.sqrt(found[:, 0]), P, np.sqrt(found[:, 1:]), np.eye(6), np.zeros(6), fade=fade
+        np.sqrt(fitted[:, 0]), P, np.sqrt(fitted[:, 1:]), np.eye(6), np.zeros(6), fade=fade
     )
     scaled = rows[0] / floor.sigma(*rows[1:])
     deviations = np.sqrt(np.mean(scaled**2, axis=0))
-    least = np.maximum(deviations, 1e-6)
-    power = scaled.T @ scaled / len(scaled) / np.outer(least, least)
-    # A channel without noise of its own is still one of six.
+    scales = np.maximum(deviations, 1e-6)
+    power = scaled.T @ scaled / len(scaled) / np.outer(scales, scales)
+    # Keeps the correlation positive definite if a channel has no independent noise.
     correlation = 0.999 * power + 0.001 * np.eye(6)
     np.fill_diagonal(correlation, 1.0)
     z = scaled @ np.linalg.inv(np.linalg.cholesky(correlation)).T
     energy = np.maximum(np.sum(z**2, axis=0), 1e-12)
-    rho = np.clip(np.sum(z[1:] * z[:-1], axis=0) / energy, 0.0, _HIGHEST_RHO)
+    rho = np.clip(np.sum(z[1:] * z[:-1], axis=0) / energy, 0.0, _MAX_RHO)
     e = (z[1:] - rho * z[:-1]) / np.sqrt(1.0 - rho**2)
     sums = np.cumsum(np.vstack([np.zeros(6), e]), axis=0)
     lengths = [min(2**m, len(e)) for m in range(LENGTHS)]
     squares = [np.sum((sums[n:] - sums[:-n]) ** 2, axis=1) / n for n in lengths]
     power = np.array([square.mean() for square in squares]) / 6.0
-    rare = np.array([np.quantile(square, 1.0 - _RARE) for square in squares])
-    # Among the few long sums of a short record rare ones may be small by chance, the power is not.
+    rare = np.array([np.quantile(square, 1.0 - _RARE_SHARE) for square in squares])
+    # A short record has few long sums: their quantile can be small by chance, their power is not.
     rare /= max(rare[0], 1e-12)
-    widths = np.sqrt(np.maximum(np.maximum(power, rare), _NARROWEST**2))
+    widths = np.sqrt(np.maximum(np.maximum(power, rare), _MIN_WIDTH**2))
     floor = replace(floor, correlation=correlation, rho=rho, widths=widths)
     return replace(floor, reached=statistics(floor, *rows).max(axis=0))

@@ -1,1 +1,1 @@
-"""Estimation sample by sample, and what tells that the load has changed."""
+"""Recursive estimators of the load, and detection of a changed load."""

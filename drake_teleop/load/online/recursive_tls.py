@@ -1,74 +1,257 @@
-"""Recursive total least squares for the load and the offsets: noise in the measured motion too.
+"""Recursive total least squares for load and offsets: noise in the measured motion too, Eq. (T18).
 
-Least squares takes the matrix V of Eq. (5) for exact. Measured accelerations are noisy, V with
-them, and the estimate is biased towards zero, the inertias most. Total least squares minimises
+Minimises lambda, the weighted squared residuals over their expected value (Kubus, Kroeger, Wahl,
+IROS 2008), by one step of the inverse iteration per sample. As in `batch.moments`, row c of [E V]
+is T_c z, here with
 
-    lambda = (sum of r^T W r, r = F - [E V] theta) / (what noise of the stated levels makes of it)
-           = (c - 2 g^T theta + theta^T G theta) / (n + theta^T N theta)
+    z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 
-(Kubus, Kroeger, Wahl: On-line estimation of inertial parameters using a recursive total
-least-squares approach, IROS 2008; Van Huffel, Vandewalle: The Total Least Squares Problem, SIAM
-1991). G, g, c are the sums of least squares, N the expected share of the noise in G. Every column
-has its own noise, and so do their correlations; exact columns (the offsets, the structural zeros of
-V) have none. Only the ratios of the noise levels matter: lambda is their common scale, about 1 if
-they are right, less behind a filter that takes noise off all channels alike. W (6, 6) is the
-inverse covariance of the six rows' errors for the present theta, see `recursive_moments`.
-
-At the minimum (G - lambda N) theta = g. Each sample does one step G theta' = g + lambda N theta
-of the inverse iteration, starting from the last estimate. As G >= N in the mean, for given W lambda
-never grows by it (it minimises a quadratic that touches the sum from above), so that a few samples
-suffice: from then on it is the batch's `total_least_squares` of the samples so far.
-
-**Poor excitation.** Where G holds nothing but noise, G - lambda N vanishes and total least squares
-knows no bound. Parameters are compensated only as far as the information of every combination of
-them exceeds that of the noise by more than the noise of the sums themselves (4 times
-sqrt(2 / samples), of the noise's information); a combination that does not has the prior's
-variance. Forgetting brings back the information of the prior, about the present estimate.
+Parameters are compensated only where the information exceeds that of the noise by 4
+sqrt(2 / samples) of it. Compiled functions allocate no memory and check no input.
 """
 
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.online.recursive import PRIOR_STD, SETTLED
-from drake_teleop.load.online.recursive_moments import (
-    MomentEstimator,
-    add_product,
-    eliminate,
-    forget,
-    invert,
-    noise_products,
-    observe,
-    residual_products,
-    scratch,
-    solve,
-    terms,
-    weighted_gram,
-    weighted_right,
+from drake_teleop.load.batch.moments import coefficients
+from drake_teleop.load.online.recursive import (
+    PRIOR_STD,
+    SETTLED,
+    RecursiveEstimator,
+    RecursiveLeastSquares,
 )
-from drake_teleop.load.sample import MOTION, WRENCH
+from drake_teleop.load.regressor import MOTION, WRENCH
 
-# Excess of information over noise, in units of sqrt(2 / samples), that compensation has to leave.
-_EXCESS = 4.0
-# The least pivot relative to its diagonal element: below it is rounding.
-_PIVOT = 1e-13
-# Samples from which on the residuals tell the scale of the noise.
-_FEWEST = 20
+# Relative increase of diagonal elements against rounding.
+RIDGE = 1e-13
+# Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
+_WRENCH, _PRODUCTS = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
+_ORDER = [0, *range(7, 19), *range(1, 7)]
+
+
+@cache
+def terms() -> tuple[NDArray[np.uintp], Array]:
+    """Return the nonzero terms of T: (n, 3) [channel, element of z, parameter], and n factors."""
+    T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
+    index = np.argwhere(T)
+    # Unsigned, so that the compiled loops do not check for negative indices.
+    return np.ascontiguousarray(index, dtype=np.uintp), T[tuple(index.T)]
 
 
 @njit(cache=True)
-def compensable(G, N, strength, K, taper):
-    """Marks in taper (16,) the parameters whose noise can be taken out of G: 1, else 0.
+def scratch():
+    """Return working arrays (E, g, L, LZ, inverse, S, W)."""
+    return (
+        np.empty((13, 6, 16)),
+        np.empty(16),
+        np.empty((6, 19)),
+        np.empty((6, 19)),
+        np.empty((6, 12)),
+        np.empty((6, 6)),
+        np.empty((6, 6)),
+    )
 
-    They are such that G - strength N over them stays positive definite: its Cholesky factor is
-    built in K (16, 16), and a parameter at which it would break down is left out. If that does not
-    help, none is taken. All are tried at once first, by elimination, which is faster.
+
+@njit(cache=True)
+def write_z(wrench, motion, z):
+    """Write z of a wrench (6,) and a motion (9,) [s, omega, alpha]."""
+    s, omega, alpha = motion[:3], motion[3:6], motion[6:]
+    z[0] = 1.0
+    for i in range(3):
+        z[1 + i] = s[i]
+        z[4 + i] = alpha[i]
+        for j in range(i + 1):
+            z[_PRODUCTS[i, j]] = omega[i] * omega[j]
+    for c in range(6):
+        z[_WRENCH + c] = wrench[c]
+
+
+@njit(cache=True)
+def add_outer_product(y, z, total):
+    """Add y z^T to total (19, 19)."""
+    for i in range(19):
+        for j in range(19):
+            total[i, j] += y[i] * z[j]
+
+
+@njit(cache=True)
+def forget(memory, theta, information, forgetting):
+    """Multiply the sums by `forgetting` and centre the prior at the present estimate."""
+    last = memory.shape[0] - 1
+    for i in range(last):
+        for j in range(19):
+            memory[i, j] *= forgetting
+    for j in range(16):
+        memory[last, j] = information[j] * theta[j]
+
+
+@njit(cache=True)
+def residual_products(Z, theta, index, factors, L, LZ, S):
+    """Write L with r = F - [E V] theta = L z, L Z, and S = L Z L^T, the sum of r r^T.
+
+    Args:
+        Z: (19, 19) sum of z z^T, or a covariance of its noise.
+        index, factors: from `terms`.
+        L, LZ: (6, 19), S: (6, 6), written.
+    """
+    L[:] = 0.0
+    LZ[:] = 0.0
+    for c in range(6):
+        L[c, _WRENCH + c] = 1.0
+    for t in range(len(factors)):
+        L[index[t, 0], index[t, 1]] -= factors[t] * theta[index[t, 2]]
+    for c in range(6):
+        for i in range(19):
+            a = L[c, i]
+            if a != 0.0:
+                for j in range(19):
+                    LZ[c, j] += a * Z[i, j]
+    for c in range(6):
+        for d in range(c + 1):
+            total = 0.0
+            for j in range(19):
+                total += LZ[c, j] * L[d, j]
+            S[c, d] = S[d, c] = total
+
+
+@njit(cache=True)
+def noise_products(Z, noise_std, motion_std, Q):
+    """Write the expected noise in the sum Z of z z^T into Q (19, 19), omega to first order."""
+    Q[:] = 0.0
+    for c in range(6):
+        Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
+    for k in range(3):
+        Q[1 + k, 1 + k] = Z[0, 0] * motion_std[k] ** 2
+        Q[4 + k, 4 + k] = Z[0, 0] * motion_std[6 + k] ** 2
+        # The derivative of w_i w_k by w_k is w_i, or 2 w_i for i = k.
+        for i in range(3):
+            for j in range(3):
+                both = (1.0 + (i == k)) * (1.0 + (j == k)) * Z[0, _PRODUCTS[i, j]]
+                Q[_PRODUCTS[i, k], _PRODUCTS[j, k]] += motion_std[3 + k] ** 2 * both
+
+
+@njit(cache=True)
+def weighted_gram(Z, W, index, factors, E, G, first):
+    """Write the sum of X^T W Y into columns `first`... of G, X and Y being [E V] of y and z.
+
+    Args:
+        Z: (19, 19) sum of y z^T.
+        index, factors: from `terms`.
+        E: (13, 6, 16) scratch.
+    """
+    E[:] = 0.0
+    for t in range(len(factors)):
+        c, b, k, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
+        for a in range(13):
+            E[a, c, k] += factor * Z[a, b]
+    G[:, first : first + 16] = 0.0
+    for t in range(len(factors)):
+        c, a, j, factor = index[t, 0], index[t, 1], index[t, 2], factors[t]
+        w0, w1, w2 = factor * W[c, 0], factor * W[c, 1], factor * W[c, 2]
+        w3, w4, w5 = factor * W[c, 3], factor * W[c, 4], factor * W[c, 5]
+        for k in range(16):
+            G[j, first + k] += (
+                (w0 * E[a, 0, k] + w1 * E[a, 1, k])
+                + (w2 * E[a, 2, k] + w3 * E[a, 3, k])
+                + (w4 * E[a, 4, k] + w5 * E[a, 5, k])
+            )
+
+
+@njit(cache=True)
+def weighted_right(LZ, W, index, factors, g):
+    """Write the sum of X^T W r into g (16,), from LZ (6, 19), the sum of r z^T."""
+    g[:] = 0.0
+    for t in range(len(factors)):
+        c, a = index[t, 0], index[t, 1]
+        total = 0.0
+        for d in range(6):
+            total += W[c, d] * LZ[d, a]
+        g[index[t, 2]] += factors[t] * total
+
+
+@njit(cache=True)
+def eliminate(A):
+    """Turn [A B] into [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
+    n, m = A.shape
+    for k in range(n):
+        inverse = 1.0 / A[k, k]
+        for i in range(k + 1, n):
+            factor = A[k, i] * inverse
+            # Whole rows, although the first part is eliminated: equal loops are vectorised better.
+            for j in range(m):
+                A[i, j] -= factor * A[k, j]
+
+
+@njit(cache=True)
+def solve(A):
+    """Turn [A B], A symmetric and positive definite, into [-, A^-1 B] in place."""
+    n, m = A.shape
+    for i in range(n):
+        A[i, i] *= 1.0 + RIDGE
+    eliminate(A)
+    for i in range(n - 1, -1, -1):
+        for j in range(n, m):
+            x = A[i, j] / A[i, i]
+            A[i, j] = x
+            for k in range(i):
+                A[k, j] -= A[k, i] * x
+
+
+@njit(cache=True)
+def invert(S, A, W):
+    """Write S^-1 into W, both (6, 6); A (6, 12) is scratch."""
+    for c in range(6):
+        for d in range(6):
+            A[c, d] = S[c, d]
+            A[c, 6 + d] = 0.0
+        A[c, 6 + c] = 1.0
+    solve(A)
+    for c in range(6):
+        for d in range(6):
+            W[c, d] = A[c, 6 + d]
+
+
+class MomentEstimator(RecursiveEstimator):
+    """Recursive estimator whose memory is sums of z z^T and the prior's part of the equations."""
+
+    def initial_memory(self, theta: Array) -> Array:
+        """Return the memory (20, 19): sum of z z^T, and the prior's information times theta."""
+        memory = np.zeros((20, 19))
+        memory[-1, :16] = theta / self._prior
+        return memory
+
+    def _residual_rms(self) -> Array:
+        L, LZ, S = np.empty((6, 19)), np.empty((6, 19)), np.empty((6, 6))
+        residual_products(self._memory[:19], self._theta, *terms(), L, LZ, S)
+        return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
+
+    def _within_prior(self, covariance: Array) -> Array:
+        """Return the covariance with variances limited to the prior's, same correlations."""
+        shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
+        return np.asarray(covariance * np.outer(shrink, shrink))
+
+
+# Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
+_EXCESS = 4.0
+# Smallest pivot relative to its diagonal element that is not rounding.
+_MIN_PIVOT = 1e-13
+# Fewest samples for the noise scale from residuals.
+_MIN_SCALE_SAMPLES = 20
+
+
+@njit(cache=True)
+def select_compensated(G, N, strength, K, taper):
+    """Set taper (16,) to 1 for parameters with compensated noise, otherwise to 0.
+
+    G - strength N over them is positive definite; K (16, 16) is scratch.
     """
     taper[:] = 1.0
     for i in range(16):
@@ -77,7 +260,7 @@ def compensable(G, N, strength, K, taper):
     eliminate(K)
     definite = True
     for i in range(16):
-        definite &= K[i, i] > _PIVOT * G[i, i]
+        definite &= K[i, i] > _MIN_PIVOT * G[i, i]
     if definite:
         return
     for i in range(16):
@@ -91,9 +274,9 @@ def compensable(G, N, strength, K, taper):
             total = G[i, i] - strength * taper[i] * N[i, i]
             for k in range(i):
                 total -= K[i, k] * K[i, k]
-            if total > _PIVOT * G[i, i]:
+            if total > _MIN_PIVOT * G[i, i]:
                 break
-        if not total > _PIVOT * G[i, i]:
+        if not total > _MIN_PIVOT * G[i, i]:
             taper[:] = 0.0
             return
         K[i, i] = math.sqrt(total)
@@ -101,13 +284,11 @@ def compensable(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Writes G and g into G (16, >= 17), N into N (16, 16); returns lambda for theta.
+    """Write G and g into G (16, >= 17) and N into N (16, 16); return lambda for theta.
 
     Args:
         Z: (19, 19) sum of z z^T.
-        theta: (16,) estimate, for the weights.
-        noise_std: (6,) of the wrench [N, N m].
-        motion_std: (9,) of [s, omega, alpha].
+        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
         index, factors: from `terms`, space: from `scratch`, Q: (19, 19) scratch.
     """
     E, g, L, LZ, inverse, S, W = space
@@ -134,15 +315,13 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
 def rtls_update(
     theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
 ):
-    """One sample after the other, in place; compiled, checks nothing.
+    """Update the estimate by each sample; compiled, without checks.
 
     Args:
         theta: (16,) [offsets; phi], updated.
-        memory: (20, 19) sum of z z^T, and prior theta_0; updated.
-        samples: (N, at least 15) [wrench, s, omega, alpha].
-        forgetting: factor per sample on the weight of the past.
-        information: (16,) of the prior.
-        noise_std, motion_std, index, factors: as for `rtls_normal_equations`.
+        memory: (20, 19) sum of z z^T, and the prior's part; updated.
+        samples: (N, at least 15), see `regressor`.
+        forgetting, information: factor per sample, and (16,) of the prior.
     """
     space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
@@ -150,15 +329,15 @@ def rtls_update(
     for n in range(len(samples)):
         if forgetting < 1.0:
             forget(memory, theta, information, forgetting)
-        observe(samples[n, WRENCH], samples[n, MOTION], z)
-        add_product(z, z, Z)
+        write_z(samples[n, WRENCH], samples[n, MOTION], z)
+        add_outer_product(z, z, Z)
         scale = rtls_normal_equations(Z, theta, *options, space, Q, G, N)
         for i in range(16):
             G[i, i] += information[i]
             G[i, 16] += memory[19, i]
-        kept = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
-        if kept > 0.0:
-            compensable(G, N, scale / kept, K, taper)
+        gain = 1.0 - _EXCESS * math.sqrt(2.0 / Z[0, 0])
+        if gain > 0.0:
+            select_compensated(G, N, scale / gain, K, taper)
             for i in range(6, 16):
                 for j in range(6, 16):
                     G[i, 16] += scale * taper[i] * taper[j] * N[i, j] * theta[j]
@@ -168,19 +347,11 @@ def rtls_update(
 
 
 class RecursiveTotalLeastSquares(MomentEstimator):
-    """Recursive total least squares: for noise in the measured motion, see the module.
-
-    The update takes the same number of operations for every sample.
+    """Recursive total least squares with constant cost per sample.
 
     Args:
-        noise_std: (6,) standard deviations of the wrench channels [N, N m].
+        noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
         motion_std: (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2]; zeros give least squares.
-        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) standard deviations of [offsets; phi] to begin with.
-        bound: of `settled`.
-
-    Raises:
-        DrakeTeleopError: for other shapes or values.
     """
 
     method = "recursive total least squares"
@@ -203,43 +374,53 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """One for noise of (6,) wrench and (9,) motion, as `__init__` takes them."""
+        """Return an estimator for noise of (6,) wrench and (9,) motion."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
     def noise_scale(self) -> float:
-        """lambda: the factor on the stated variances of all noise that the residuals show."""
+        """Ratio lambda of observed to specified noise variances."""
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """(16, 16) lambda H^-1 G H^-1, H = G - lambda N; the prior's where H holds no more."""
+        """Return lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
+
+        Directions without sufficient information get the prior's variance.
+        """
         samples, information = memory[0, 0], np.diag(1.0 / self._prior)
         G, N, scale = self._normal_equations(theta, memory)
-        root = np.linalg.inv(_root(G + information))
+        root = np.linalg.inv(_cholesky(G + information))
         shares, vectors = np.linalg.eigh(scale * root @ N @ root.T)
         directions = root.T @ vectors
         excess = 1.0 - shares
-        excited = (shares < _PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
+        excited = (shares < _MIN_PIVOT) | (excess > _EXCESS * math.sqrt(2.0 / max(samples, 1.0)))
         inverse = (directions[:, excited] / excess[excited]) @ directions[:, excited].T
-        half = inverse @ _root(scale * G + information)
+        factor = inverse @ _cholesky(scale * G + information)
         unknown = directions[:, ~excited]
         unknown = unknown / np.sqrt(np.sum(unknown**2 / self._prior[:, None], axis=0))
-        return self._within_prior(half @ half.T + unknown @ unknown.T)
+        return self._within_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
-        """G and N (16, 16), without the prior, and lambda, 1 while there are too few samples."""
+        """Return G and N (16, 16) without prior, and lambda (1 for few samples)."""
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
         options = (self._noise_std, self._motion_std, *terms(), scratch(), Q)
         scale = rtls_normal_equations(memory[:19], theta, *options, G, N)
-        return G[:, :16], N, scale if memory[0, 0] > _FEWEST else 1.0
+        return G[:, :16], N, scale if memory[0, 0] > _MIN_SCALE_SAMPLES else 1.0
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:
         options = (self._noise_std, self._motion_std, self._forgetting, 1.0 / self._prior)
         rtls_update(theta, memory, samples, *options, *terms())
 
 
-def _root(A: Array) -> Array:
-    """The Cholesky factor of A, its diagonal raised by what is rounding."""
-    return np.asarray(np.linalg.cholesky(A + _PIVOT * np.diag(np.diag(A))))
+def _cholesky(A: Array) -> Array:
+    """Return the Cholesky factor of A with its diagonal raised by rounding."""
+    return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
+
+
+METHODS: dict[str, type[RecursiveEstimator]] = {
+    "rls": RecursiveLeastSquares,
+    "rtls": RecursiveTotalLeastSquares,
+}
+"""Recursive estimators by name; add a line for a new one."""

@@ -1,32 +1,14 @@
-"""A known load while it is watched: what the elimination is given of it, sample by sample.
+"""Load for the elimination while a known load is monitored, sample by sample.
 
-The load was learnt and is frozen. `change.change_update` tells whether it is still there; this
-module draws the conclusions::
+    settled     the known load explains the wrench and is used
+    disturbed   contact, or the moment of a grasp; the known load is used
+    changed     another load: the fallback (gripper or nothing) is used until the known load
+                explains the wrench again or the new one is identified
 
-    settled     the known load explains the wrench. It is handed out as it is
-    disturbed   something is touched, or it is the moment of a grasp. The known load is handed out:
-                a contact has to be felt
-    changed     another load than the known one has been there for a while (`change.HOLD`), and
-                has shown that it is none but a load (below): a request to identify again, by a
-                motion that excites mass and first moments. The load handed out fades to what is
-                known otherwise (the gripper alone, or nothing). The hand then feels of the unknown
-                load what the sensor feels, sigma = gamma in Fig. 2: nothing that is not there, as
-                eliminating a load that was put down would make it, and contacts too. It stays like
-                this until either the old load explains the wrench again or the new one is
-                identified, whatever is touched meanwhile; then "settled"
-
-Whatever happens, what is handed out goes over with the time constant `FADE`: the force takes no
-step, and is never outside what the two loads give.
-
-**A constant push** and another weight are the same, at rest and for as long as they do not change.
-What looks like another load is therefore taken for a contact until the force that it exerts has
-changed by `VARIES`, and the new load has explained that for `EXPLAINED` seconds: until the tool is
-turned or accelerated. Its centre of mass has to be within `REACH`; a friction that changes with the
-motion needs one that is metres away.
-
-**Offsets** drift with temperature. While S rests and the load is the known one, the known offsets
-follow the residual with the time constant `FOLLOW`, as long as it is below `LARGEST`; what is
-larger is a contact. A push of up to `LARGEST` at rest is therefore forgotten within seconds.
+Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight: a
+new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
+seconds, with a centre of mass within `MAX_COM_DISTANCE_M`. At rest, offsets follow residuals below
+`MAX_OFFSET_RESIDUAL`.
 """
 
 from __future__ import annotations
@@ -46,43 +28,43 @@ from drake_teleop.load.online.change import (
     new_load,
     new_load_age,
 )
-from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.load.regressor import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    SPECIFIC_FORCE,
+    WRENCH,
+    non_contact_wrench_into,
+)
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
-"""What the state of a load estimator means; learning is what comes before this module."""
+"""States of a load estimator, by index; "learning" precedes this module."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
 FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
-"""Durations in seconds (module docstring)."""
-LARGEST = np.array([0.3] * 3 + [0.015] * 3)
-"""Three times `change.OFFSET_DRIFT` [N, N m]."""
-VARIES = 0.5
-"""Noise never makes that much of a low-passed force [N]."""
-REACH = 1.0
-"""How far from So the centre of mass of something that is grasped or put down may be [m]."""
+"""Durations [s]: cross-fade, rest before offsets follow, their time constant, new load explains."""
+MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
+"""Largest residual that offsets follow, three times `change.OFFSET_DRIFT` [N, N m]."""
+MIN_FORCE_CHANGE_N = 0.5
+"""Smallest change of the low-passed force that noise cannot cause [N]."""
+MAX_COM_DISTANCE_M = 1.0
+"""Largest distance of So from the centre of mass of a grasped or released object [m]."""
 
-# At rest, low-passed by _SMOOTH [s], S turns slower than that [rad/s] and its specific force stays
-# that near to where it was [m/s^2].
-_SMOOTH, _TURNING, _MOVED = 0.05, 0.02, 0.1
+# Time constant of the low-pass [s]; largest angular velocity [rad/s] and change of the specific
+# force [m/s^2] at rest.
+_LOW_PASS_S, _MAX_RATE, _MAX_SHIFT = 0.05, 0.02, 0.1
 
-# Parts of the memory, before that of `change`: state; samples at rest; low-passed specific force,
-# angular velocity, residual; specific force at the beginning of the rest; least and largest
-# residual force since a new load has explained it; samples since they are `VARIES` apart.
-_STATE, _RESTED, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
-_WHERE, _LEAST, _MOST, _VARIED, _CHANGE = 14, 17, 20, 23, 24
+# Indices into the memory, before that of `change`: state; samples at rest; low-passed specific
+# force, angular velocity and residual; specific force at the start of the rest; smallest and
+# largest residual force of the new load; samples with a difference of `MIN_FORCE_CHANGE_N`.
+_STATE, _REST_SAMPLES, _S, _OMEGA, _RESIDUAL = 0, 1, 2, 5, 8
+_REST_S, _LOWEST, _HIGHEST, _CHANGED_SAMPLES, _CHANGE = 14, 17, 20, 23, 24
 
 SIZE = _CHANGE + change.SIZE
-"""Of the memory of `watched_update`."""
+"""Length of the memory of `watched_update`."""
 
 
 def watched_memory(theta: Array, covariance: Array) -> Array:
-    """The memory (SIZE,) of `watched_update` when a load has settled.
-
-    Args:
-        theta: (16,) [offsets; phi] that is known.
-        covariance: (16, 16) of it.
-    """
+    """Return the memory of `watched_update` for identified [offsets; phi] and covariance."""
     rest = np.zeros(_CHANGE)
     rest[_STATE] = SETTLED
     return np.concatenate([rest, change.change_memory(theta, covariance)])
@@ -90,62 +72,60 @@ def watched_memory(theta: Array, covariance: Array) -> Array:
 
 @njit(cache=True)
 def watched_state(memory):
-    """Index into `LOAD_STATES`; that of a memory of zeros is `LEARNING`."""
+    """Return the index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
     return int(memory[_STATE])
 
 
 @njit(cache=True)
-def _rests(memory, sample, period):
-    """Whether S has been at rest for a while."""
-    share = period / (_SMOOTH + period)
+def _is_at_rest(memory, sample, period):
+    share = period / (_LOW_PASS_S + period)
     s, omega = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY]
-    moved, turning = 0.0, 0.0
+    shift, rate = 0.0, 0.0
     for i in range(3):
         memory[_S + i] += share * (s[i] - memory[_S + i])
         memory[_OMEGA + i] += share * (omega[i] - memory[_OMEGA + i])
-        moved += (memory[_S + i] - memory[_WHERE + i]) ** 2
-        turning += memory[_OMEGA + i] ** 2
-    if moved > _MOVED**2 or turning > _TURNING**2:
-        memory[_RESTED] = 0.0
-        put(memory, _WHERE, memory, _S, 3)
-    memory[_RESTED] += 1.0
-    return memory[_RESTED] * period > REST
+        shift += (memory[_S + i] - memory[_REST_S + i]) ** 2
+        rate += memory[_OMEGA + i] ** 2
+    if shift > _MAX_SHIFT**2 or rate > _MAX_RATE**2:
+        memory[_REST_SAMPLES] = 0.0
+        put(memory, _REST_S, memory, _S, 3)
+    memory[_REST_SAMPLES] += 1.0
+    return memory[_REST_SAMPLES] * period > REST
 
 
 @njit(cache=True)
-def _varies(memory, residual, age, period):
-    """Whether a new load, `age` samples old, has explained a change of the residual force."""
+def _force_has_changed(memory, residual, age, period):
+    """Return whether a new load, `age` samples old, has explained a changed residual force."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
-    least, most = memory[_LEAST:_MOST], memory[_MOST:_VARIED]
-    share = 1.0 if age == 0.0 else period / (_SMOOTH + period)
+    lowest, highest = memory[_LOWEST:_HIGHEST], memory[_HIGHEST:_CHANGED_SAMPLES]
+    share = 1.0 if age == 0.0 else period / (_LOW_PASS_S + period)
     for i in range(_RESIDUAL, _RESIDUAL + 6):
         memory[i] += share * (residual[i - _RESIDUAL] - memory[i])
-    if age * period < 2.0 * _SMOOTH:
-        put(least, 0, low_passed, 0, 3)
-        put(most, 0, low_passed, 0, 3)
-    put(least, 0, np.minimum(least, low_passed), 0, 3)
-    put(most, 0, np.maximum(most, low_passed), 0, 3)
-    apart = ((most - least) ** 2).sum() > VARIES**2
-    memory[_VARIED] = memory[_VARIED] + 1.0 if apart else 0.0
-    return memory[_VARIED] * period > EXPLAINED
+    if age * period < 2.0 * _LOW_PASS_S:
+        put(lowest, 0, low_passed, 0, 3)
+        put(highest, 0, low_passed, 0, 3)
+    put(lowest, 0, np.minimum(lowest, low_passed), 0, 3)
+    put(highest, 0, np.maximum(highest, low_passed), 0, 3)
+    differs = ((highest - lowest) ** 2).sum() > MIN_FORCE_CHANGE_N**2
+    memory[_CHANGED_SAMPLES] = memory[_CHANGED_SAMPLES] + 1.0 if differs else 0.0
+    return memory[_CHANGED_SAMPLES] * period > EXPLAINED
 
 
 @njit(cache=True)
 def _is_within_reach(known, new):
-    """Whether what has come or gone has its centre of mass within `REACH`."""
     moment = ((new[7:10] - known[7:10]) ** 2).sum()
-    return moment < (REACH * (new[6] - known[6])) ** 2
+    return moment < (MAX_COM_DISTANCE_M * (new[6] - known[6])) ** 2
 
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """One sample, in place; compiled, checks nothing.
+    """Update by one sample; compiled, without checks.
 
     Args:
-        out: (16,) [offsets; phi] that is handed out, updated.
+        out: (16,) [offsets; phi] for the elimination, updated.
         memory: of `watched_memory`, updated.
-        sample: see `drake_teleop.load.sample`, its first 15 numbers.
-        fallback: (10,) phi of what is known of a load that has changed.
+        sample: (15 or more,) see `regressor`.
+        fallback: (10,) phi for a changed load.
         period: between samples [s].
         block, noise, window, hold, bound: of `change.change_parameters`.
     """
@@ -157,16 +137,16 @@ def watched_update(out, memory, sample, fallback, period, block, noise, window, 
     wrench = sample[WRENCH]
     for i in range(6):
         residual[i] = wrench[i] - known[i] - residual[i]
-    rests, verdict = _rests(memory, sample, period), change_state(watch)
-    varies = _varies(memory, residual, new_load_age(watch), period)
+    at_rest, verdict = _is_at_rest(memory, sample, period), change_state(watch)
+    force_changed = _force_has_changed(memory, residual, new_load_age(watch), period)
     if verdict == KNOWN:
         memory[_STATE] = SETTLED
-        if rests and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= LARGEST).all():
+        if at_rest and (np.abs(memory[_RESIDUAL : _RESIDUAL + 6]) <= MAX_OFFSET_RESIDUAL).all():
             for i in range(6):
                 known[i] += period / FOLLOW * residual[i]
     elif memory[_STATE] != OTHER_LOAD:
-        another = verdict == CHANGED and varies and _is_within_reach(known, new_load(watch))
-        memory[_STATE] = OTHER_LOAD if another else DISTURBED
+        other = verdict == CHANGED and force_changed and _is_within_reach(known, new_load(watch))
+        memory[_STATE] = OTHER_LOAD if other else DISTURBED
     put(target, 0, known, 0, 16)
     if memory[_STATE] == OTHER_LOAD:
         put(target, 6, fallback, 0, 10)

@@ -17,10 +17,9 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.load.compensation import scaled_wrench_into
-from drake_teleop.load.contact.detection import ContactDetector, flag_update
-from drake_teleop.load.contact.memory import FLAG
+from drake_teleop.load.contact.detection import FLAG, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
-from drake_teleop.load.sample import (
+from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     BEFORE_JOINTS,
@@ -74,7 +73,7 @@ class ContactDetection(LeafSystem):
 
         name: ContactDetection
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.load.sample`
+        - sample: the wrist sensor's, see `drake_teleop.load.regressor`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - contact: (1,) 1 in contact, else 0

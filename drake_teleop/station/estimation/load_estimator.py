@@ -22,7 +22,7 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.load.online.change import change_parameters
-from drake_teleop.load.online.methods import METHODS
+from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.online.watched import (
     LEARNING,
     SETTLED,
@@ -31,7 +31,7 @@ from drake_teleop.load.online.watched import (
     watched_state,
     watched_update,
 )
-from drake_teleop.load.sample import SATURATED
+from drake_teleop.load.regressor import SATURATED
 
 # Samples between two looks at whether it has settled.
 _CHECK = 16

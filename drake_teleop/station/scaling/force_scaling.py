@@ -15,8 +15,7 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quantities import quantity
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
-from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.load.sample import (
+from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     BEFORE_JOINTS,
@@ -26,6 +25,7 @@ from drake_teleop.load.sample import (
     SPECIFIC_FORCE,
     TIME,
     WRENCH,
+    non_contact_wrench_into,
     sample_size,
 )
 from drake_teleop.station.scaling.wrench_mapping import wrench_to_master_into
@@ -109,7 +109,7 @@ def fault_of(sample, estimate, time, believed):
     """What is wrong with the numbers that a wrench is to be made of, as a plain `Fault`.
 
     Args:
-        sample: of the wrist sensor, see `drake_teleop.load.sample`.
+        sample: of the wrist sensor, see `drake_teleop.load.regressor`.
         estimate: (16,) [offsets; phi].
         time: now [s].
         believed: (7,) the largest wrench that is a reading [N, N m], the largest age [s].
@@ -170,7 +170,7 @@ class ForceScaling(LeafSystem):
 
         name: ForceScaling
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.load.sample`
+        - sample: the wrist sensor's, see `drake_teleop.load.regressor`
         - load_estimate: (16,) Eq. (7), [offsets; phi]
         output_ports:
         - scaled_wrench_S: F' of Fig. 2

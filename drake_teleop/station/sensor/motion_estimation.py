@@ -42,7 +42,7 @@ from drake_teleop.common.vectors import (
     three,
     transposed,
 )
-from drake_teleop.load.sample import (
+from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     JOINT_POSITION,
@@ -329,7 +329,7 @@ def estimate_into(constants, memory, arm, reading, sample):
         constants, memory: of `motion_estimator`.
         arm: `ArmModel.table`.
         reading: see `drake_teleop.station.sensor.sensor_chain.read_into`.
-        sample: see `drake_teleop.load.sample`.
+        sample: see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
     starts = memory[0] == 0.0

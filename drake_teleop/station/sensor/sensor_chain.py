@@ -38,7 +38,12 @@ from drake_teleop.common.fault import LARGEST
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.vectors import apply, cross, cross_matrix, nine, plus_cross, put, three
-from drake_teleop.load.sample import ANGULAR_ACCELERATION, ANGULAR_VELOCITY, SPECIFIC_FORCE, WRENCH
+from drake_teleop.load.regressor import (
+    ANGULAR_ACCELERATION,
+    ANGULAR_VELOCITY,
+    SPECIFIC_FORCE,
+    WRENCH,
+)
 
 #: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
 NOISE_BLOCK = 128
@@ -348,7 +353,7 @@ def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 
 #: In the constants: offset of force and torque, which may be changed while the sensor runs.
 OFFSET = slice(0, 6)
-# The truth: as a sample, see `drake_teleop.load.sample`, but for the flag.
+# The truth: as a sample, see `drake_teleop.load.regressor`, but for the flag.
 TRUE_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)

@@ -37,8 +37,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import apply, cross, minus, nine, put, three, transposed
-from drake_teleop.load.regressor import non_contact_wrench_into
-from drake_teleop.load.sample import (
+from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
     BEFORE_JOINTS,
@@ -49,6 +48,7 @@ from drake_teleop.load.sample import (
     SPECIFIC_FORCE,
     WRENCH,
     WRENCH_AND_MOTION,
+    non_contact_wrench_into,
     sample_parts,
     sample_size,
 )
