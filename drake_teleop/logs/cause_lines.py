@@ -1,6 +1,6 @@
-"""Lines of a log description that correct the causes named in its record.
+"""Lines of a log description that correct the causes of a record.
 
-A line states the resulting value: that of the description with all causes corrected.
+Each line contains the value after the correction of all causes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drake_teleop.logs.read.description import NO_YAML, Description
 from drake_teleop.logs.read.tables import FORMATS
 
 Fields = dict[str, Any]
-"""Value of each field that a cause may correct, by its name in a description."""
+"""Values of the correctable fields, by their names in a description."""
 _HEAVIEST_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
@@ -34,12 +34,8 @@ _OTHERWISE = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Add the lines that correct them to the messages of causes.
-
-    Args:
-        causes: of a log.
-        log: as it was read, with its description.
-        by_pose: whether the positions of poses determine the acceleration, not an IMU.
+    """Add the correcting lines to the messages; `by_pose`: the acceleration is from poses, not from
+    an IMU.
     """
     texts = _corrected(causes, log, by_pose)[1]
     return tuple(
@@ -49,7 +45,7 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
 
 def doubted_force_unit(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Say which fields to set if a mass is beyond that of any load of a wrist sensor."""
+    """Return the fields to set if a mass is too large for a wrist sensor."""
     if abs(mass) < _HEAVIEST_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _corrected(causes, log, by_pose=True)[0]
@@ -64,7 +60,6 @@ def doubted_force_unit(mass: float, causes: Sequence[Cause], log: Log) -> str | 
 
 
 def _corrected(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
-    """Return all fields, and for each cause the lines that correct it."""
     assert log.described is not None
     fields = _fields(log.described, by_pose)
     column = _columns(fields[_FRAME])
@@ -116,7 +111,6 @@ def _fields(description: Description, by_pose: bool) -> Fields:
 
 
 def _columns(frame: Any) -> list[int] | None:
-    """Column of the file behind each axis of S, if its axes are signed axes of the file."""
     if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
         return None
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
@@ -184,7 +178,7 @@ _CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
     "sensor rotation": _rotation,
     "gravity direction": _gravity,
     "weight removed": _removed,
-    "payload configured": _removed,  # an estimate of it would count as exact
+    "payload configured": _removed,  # an estimated payload would count as exact
     "torque factor": _factor,
     "pose frame": _frame,
 }

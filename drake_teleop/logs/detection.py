@@ -1,26 +1,22 @@
-"""Detection of contact in a log, above the noise floor of free motion.
+"""Contact detection in a log, above the noise floor of free motion.
 
-Names in the summary of `drake-teleop detect` beside those that it has in common with `eliminate`;
-forces in N, torques in N m, frame S:
+Names in the summary of `drake-teleop detect` beside those of `eliminate`; forces in N, torques in
+N m, frame S:
 
 ====================== ==========================================================================
-load                   the identification's file; null if it was identified from the log itself
-free                   the log of free motion that floor and threshold are of; null for the parts
-                       of the log itself in which nothing stands out, see
-                       `drake_teleop.logs.contact`
-free_s                 how much free motion that was
+load                   identification file; null if identified from the log itself
+free, free_s           log of free motion (null: calm parts of the log), its duration
 statistic, threshold   see `drake_teleop.load.contact.statistics`
 noise                  [f; tau], standard deviation at rest
-per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
+per_acceleration       (6, 2) its growth per m/s^2 and per rad/s^2
 above_threshold        share of the samples whose statistic reaches the threshold
 in_contact             share of the samples in contact, with hysteresis
-force_threshold        a quarter above the largest |F_c| in the free motion: a threshold that is the
-                       same for all motions
-above_force_threshold  share of the samples above it: raw (tared at its first sample), gravity_only
-                       (null if no orientation is known) and eliminated
-contacts               list of start_s, stop_s, peak_N, peak_Nm; and at the peak of the force
-                       push (3), the direction in which the environment pushes, and point_m (3), of
-                       its line the point nearest to the origin of S; null if there is no force
+force_threshold        1.25 times the largest |F_c| in free motion
+above_force_threshold  share of samples above it: raw (tared at the first sample), gravity_only
+                       (null without orientation) and eliminated
+contacts               list of start_s, stop_s, peak_N, peak_Nm; at the peak push (3), direction
+                       of the force on the tool, and point_m (3) of its line nearest to the
+                       origin of S (null without force)
 ====================== ==========================================================================
 """
 
@@ -44,12 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """A log and where it is in contact, N samples.
-
-    Args:
-        eliminated: the log without its non-contact wrench.
-        others: as of `Detection`.
-    """
+    """Contacts of a log, with `eliminated`, the log without its non-contact wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 
@@ -63,24 +54,19 @@ def detect_log(
     cutoff_hz: float = 30.0,
     delay: str | float = "auto",
 ) -> DetectedLog:
-    """Finds contact in a log, after the zero-phase low-pass of `eliminate_log`.
-
-    The threshold is a quarter above what free motion reaches. It is worth as much as that motion:
-    it should be as fast, pass the same poses and be as long as what is judged by it.
+    """Find contact after the zero-phase low-pass of `eliminate_log`.
 
     Args:
         path: canonical table or log description.
-        load: identification.json, or what is in it; None identifies it from the log itself, which
-            contact disturbs.
-        free: log of free motion with the same load; None takes the parts of the log itself in
-            which nothing stands out.
+        load: identification.json or its content; None: identified from the log itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log
+            itself.
         statistic: one of `STATISTICS`.
         cutoff_hz: of the low-pass.
-        delay: as of `eliminate_log`.
+        delay: as in `eliminate_log`.
 
     Raises:
-        DrakeTeleopError: if a log or load file cannot be used or is of static poses, or for another
-            statistic.
+        DrakeTeleopError: for an unusable log or load file, static poses or an unknown statistic.
     """
     if load is None:
         load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
@@ -101,6 +87,7 @@ def detect_log(
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+    """Return the share of samples above a force, for each kind of wrench."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,
@@ -115,7 +102,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
 
 
 def draw_detection(found: DetectedLog) -> Any:
-    """|F| without and with the load's own on top; below, the statistic and its threshold."""
+    """Draw |F| before and after elimination, and the statistic with its threshold."""
     from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
 
     eliminated = found.eliminated

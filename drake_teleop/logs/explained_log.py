@@ -1,4 +1,4 @@
-"""The block means of a log, with its splines or its own motion."""
+"""Search for causes in a log, and the load within the model that explains it."""
 
 from __future__ import annotations
 
@@ -23,18 +23,12 @@ from drake_teleop.logs.read.rotations import rotation_matrices
 
 _MARGIN = 2.0  # knots, at either end
 _FEWEST = 100
-_SPREAD = 1.5  # of block deviations over stated ones, from which intervals are widened
-_HIGHEST = 25.0  # Hz, of block means
+_SPREAD = 1.5  # ratio of block to stated deviations that widens the intervals
+_HIGHEST = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Explain the wrench of a log; None if it is too short.
-
-    Args:
-        log: as it was read.
-        delay_s: of the motion behind the wrench [s].
-        found: the motion of its poses, if that is by splines.
-    """
+    """Explain the wrench of a log; None if it is too short. `found`: motion by splines."""
 
     def of(more: float) -> Instants:
         late = delay_s + more
@@ -73,7 +67,7 @@ def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 
 def _shake(splines: PoseSplines) -> float:
-    """Standard deviation of the splines' acceleration by noise of the positions [m/s^2]."""
+    """Return the noise of the acceleration caused by the positions [m/s^2]."""
     f = np.linspace(0.0, _HIGHEST, 500)
     share = passed(f, splines.spacing)
     if splines.aid is not None:
@@ -85,8 +79,8 @@ def _shake(splines: PoseSplines) -> float:
 def explained_load(load: Identification, why: Explanation) -> Identification:
     """Return the load within the model that explains the wrench, or its intervals widened.
 
-    Noise of an IMU's angular acceleration makes the inertia too small by its share of the variance;
-    that share of the inertia is in its deviations.
+    Noise of an IMU's angular acceleration reduces the inertia; its share is added to the
+    deviations.
     """
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
@@ -132,7 +126,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """The causes, with the finding for a displaced and rotated frame of the poses."""
+    """Return the causes, with the finding for a displaced and rotated pose frame."""
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)
@@ -140,7 +134,7 @@ def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
 
 
 def removed_note(why: Explanation) -> str:
-    """Say which weight `wrench.weight: removed` stands for; nothing without it."""
+    """Return a note about the weight behind `wrench.weight: removed`."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

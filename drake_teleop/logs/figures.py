@@ -1,83 +1,60 @@
-"""The figures of `drake-teleop identify` and `drake-teleop eliminate`.
+"""Figures of `drake-teleop identify` and `drake-teleop eliminate`.
 
 Names in the summaries (and in summary.json); forces in N, torques in N m, frame S:
 
 ====================== ==========================================================================
 both
 ====================== ==========================================================================
-log                    the file that was read
-samples, duration_s    samples used, and the time that they span
-rate_hz                of the log on its common clock; 0 for static poses
-cutoff_hz              zero-phase low-pass on everything; null if there was none
-delay_s                how far the motion lags behind the wrench; it was moved forward by this
-delay_source           "given", "estimated" (from this record), "load" (of the load file, because
-                       this record does not determine it), "undetermined" (0 was used), or
-                       "static" (poses at rest have none)
-notes                  what had to be assumed, and the findings, in words
-findings               list of name and message: suspected errors of the description; see
-                       `drake_teleop.logs.inspection`. Only looked for if the fit is poor
+samples, duration_s    used samples and their time span
+rate_hz                on the common clock; 0 for static poses
+cutoff_hz              of the zero-phase low-pass; null without
+delay_s                removed delay of the motion behind the wrench
+delay_source           "given", "estimated" (from this record), "load" (of the load file),
+                       "undetermined" (0 was used) or "static" (poses at rest)
+notes                  assumptions and findings, in words
+findings               list of name and message: suspected errors of the description
 ====================== ==========================================================================
 
 ====================== ==========================================================================
 identify
 ====================== ==========================================================================
-mass, mass_std         kg; standard deviations are null for what is not determined at all
-com, com_std           m; the standard deviation includes that of the mass
+mass, mass_std         kg; a standard deviation is null for an undetermined parameter
+com, com_std           m
 inertia_com            kg m^2, about the centre of mass, axes of S
-offsets, offsets_std   [f; tau]
-phi, phi_std           Eq. (6), in the order of this project
+offsets, phi           [f; tau]; Eq. (6); offsets_std, phi_std: standard deviations
 phi_interval           (10, 2) ends of the 95 % intervals
-verdicts               of each parameter: identified, weakly, not, prior; see
-                       `drake_teleop.load.identification.Identification.verdicts`
-identifiable           the names of what the record determines
-not_identifiable       the names of what it does not: do not use their values
-physically_consistent  whether phi belongs to a possible body
-determined             in words: how many independent combinations of offsets and load the record
-                       determines, which ones where single parameters are not, and what is weak
-method                 of the fit, in words
-rejected               share of the samples that a robust fit took for disturbed and left out
-condition_number       of the regression
-residual_rms           [f; tau], after the fit
-residual_rms_force     of |F|; residual_rms_torque of |tau|
-causes                 list of name, message, start_s, stop_s, values: what acts beside a rigid
-                       load with constant offsets; the load is that of the model with them
-loads                  list of start_s, stop_s, mass, com, phi and their standard deviations: the
-                       load of each stretch, if it changes; phi above is that of the first
-gripper                its file, if --gripper was given; otherwise this and the next are absent
-object                 of phi_total - phi_gr: mass, com, inertia_com, phi with their standard
-                       deviations, identifiable, not_identifiable and physically_consistent as
-                       above; consistency_margin and consistency_margin_std, see
-                       `drake_teleop.load.gripper.consistency_margin`
+verdicts               of each parameter: identified, weakly, not or prior
+identifiable           names of the determined parameters; others: not_identifiable
+physically_consistent  whether a rigid body can have phi
+determined             determined combinations of offsets and load, in words
+rejected               share of rejected samples
+residual_rms           [f; tau]; residual_rms_force, residual_rms_torque: of the magnitudes
+causes                 list of name, message, start_s, stop_s, values: effects beside a rigid
+                       load with constant offsets, included in the model
+loads                  list of start_s, stop_s, mass, com, phi, deviations: load of each part of
+                       the record, if it changes; phi above is that of the first
+gripper, object        with --gripper: its file; figures of phi_total - phi_gr, with
+                       consistency_margin and consistency_margin_std
 ====================== ==========================================================================
 
 ========================= =======================================================================
 eliminate
 ========================= =======================================================================
-load, gripper             the identification files; gripper is null if there is none
-sigma, sigma_object,      as given
-gamma, eta
 tare                      [f; tau], offsets of this record minus those of the load file
-tare_fraction             share of the samples that the offsets were taken from (those that agree)
-raw_rms                   rms of |F| with the offsets removed and nothing else
-gravity_only_rms          rms of |F| with offsets and m g removed; null if no orientation is known
-residual_rms              rms of |F_c|, the contact force: in free motion, what is left
-residual_peak             largest |F_c|
+tare_fraction             share of the samples that determined the offsets
+raw_rms                   rms of |F| without offsets
+gravity_only_rms          rms of |F| without offsets and m g; null without orientation
+residual_rms, ..._peak    rms and maximum of |F_c|, the contact force
 raw_torque_rms ...        the same four of the torque
 raw_rms_per_channel ...   the same four of each channel [f; tau]
-noise_floor               [f; tau], standard deviation of the contact wrench where it is quiet
-edge_s                    how much of the record is not judged and in no figure, because its motion
-                          or low-pass has measurements on one side only: ends, and beside gaps
-free                      the log of free motion that the threshold is of; null for what is quiet
-                          in the record itself, see `drake_teleop.logs.contact`
-threshold                 of contact, in standard deviations; null, as the next two, for static
-                          poses and for records that are too short to tell
-contacts                  as of `drake_teleop.logs.detection`: the same detector with the same times
-in_contact                share of the samples in `contacts`
-causal                    null, or, if --causal was given: mode, lag_s (by how much the output is
-                          late, or would be without prediction), offsets, tare_s (length of the
-                          start that they are of; null if of the load file), residual_rms
-                          and residual_torque_rms, noise_floor as above, and difference_rms and
-                          difference_torque_rms, of |F_causal - F_c| and |tau_causal - tau_c|
+noise_floor               [f; tau], standard deviation of the contact wrench without contact
+edge_s                    unjudged time at ends and gaps, excluded from all figures
+free                      log of free motion for the threshold, or null
+threshold                 of contact [standard deviations]; null for static or short records,
+                          as contacts (see `drake_teleop.logs.detection`) and in_contact
+in_contact                share of the samples in contact
+causal                    null without --causal; mode, lag_s, offsets, tare_s (null: offsets of
+                          the load file), residual, noise_floor and difference from F_c
 ========================= =======================================================================
 """
 
@@ -102,7 +79,7 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """What both summaries begin with."""
+    """Return the first fields of both summaries."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
@@ -119,7 +96,7 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """The load of a part of a record."""
+    """Return the load of a part of a record."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -135,7 +112,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """A load: values, uncertainties, and which of them mean something."""
+    """Return values and uncertainties of a load."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -155,7 +132,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """The same of an object without its gripper."""
+    """Return the figures of an object without its gripper."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -164,7 +141,7 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """What to know about the object; the mass is not significantly negative here."""
+    """Return warnings for an object without significantly negative mass."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
@@ -187,7 +164,7 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 
 
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
-    """What is left of the wrench, root mean square and peak."""
+    """Return rms and peak values of the wrenches."""
 
     def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.sqrt(np.mean(x**2, axis=0))
@@ -205,7 +182,7 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Noise floor and contacts, and what `--causal` adds."""
+    """Return noise floor, contacts and causal figures."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
@@ -251,7 +228,7 @@ def _reduced(
 
 
 def plain(value: Any) -> Any:
-    """The same with lists and numbers of Python instead of numpy's, and null for infinity."""
+    """Convert NumPy values to plain Python, and infinity to None."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

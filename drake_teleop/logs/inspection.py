@@ -1,22 +1,19 @@
-"""What `drake-teleop inspect` does: a log's quality, suspected errors, or a draft description.
+"""`drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
 
 Names in the summary (and in summary.json):
 
 =============== =================================================================================
-log             the file that was read
 kind            "description", "canonical", "unknown" (a table without known columns) or "bag"
-topics          of a bag: type, messages and rate_hz of each; otherwise empty
+topics          of a bag: type, messages and rate_hz of each
 streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_jumps (time stamps
-                that stand still or go back), repeated_rows, nan_rows, nan_longest (rows of the
-                longest block), and columns: of each min, max, mean, noise (standard deviation of
-                white noise, from third differences), saturated (samples at the end of the range)
-findings        list of name and message: what is suspicious and what to change
-fit             of a load to the description as given: mass [kg] and unexplained, the share of the
-                wrench's variance; null if the log cannot be read
-mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s (the best
-                constant), drift of the clock [s/s], unexplained; null without both
-delay_s         of the motion behind the wrench; null if the log does not determine it
-draft           the file with a draft description of an unknown table or a bag, or null
+                that repeat or decrease), repeated_rows, nan_rows, nan_longest (longest block), and
+                columns: of each min, max, mean, noise (white), saturated (samples at the limits)
+findings        list of name and message: suspicion and remedy
+fit             of a load to the given description: mass [kg], unexplained share of the variance
+mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s, drift of the
+                clock [s/s], unexplained; null without both
+delay_s         of the motion behind the wrench; null if undetermined
+draft           path of the draft description of an unknown table or a bag, or null
 =============== =================================================================================
 """
 
@@ -46,12 +43,12 @@ from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
 
 BANDWIDTH = 30.0
-"""Gaps are those that matter below this frequency [Hz]."""
+"""Bandwidth of interest, which determines the length of a gap [Hz]."""
 REPEATED = 0.05
-"""Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
+"""Smallest reported share of repeated rows, apart from blocks of `BLOCK` rows."""
 BLOCK = 5
 _SIGNIFICANT = 5.0
-"""Standard deviations above which a delay is a finding."""
+"""Smallest reported delay, in standard deviations."""
 _QUANTITIES = (
     "force",
     "torque",
@@ -65,12 +62,9 @@ _QUANTITIES = (
 
 
 def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
-    """Inspects a log and writes summary.json, and draft.yaml for an unknown table, into `out`.
+    """Inspect a canonical log, a description, any table or a bag.
 
-    Args:
-        log: a canonical log, a description, any table, or a bag.
-        out: folder for the results.
-        quiet: print nothing.
+    Write summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
 
     Returns:
         the summary, see the top of this module.
@@ -111,7 +105,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         except DrakeTeleopError:
             known = "f_x" in table.columns and "tau_x" in table.columns
             if known:
-                # A canonical log with NaN or a missing column: its own message is the best one.
+                # A canonical log with NaN or a missing column gets the specific message.
                 description = describe_canonical(log, _finite(table, list(table.columns)))
                 summary["kind"] = "canonical"
         tables = {log: table}
@@ -132,16 +126,14 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
 
 
 def _are_numbers(names: Sequence[str]) -> bool:
-    """Whether what stands where names are expected is the first row of the numbers."""
     with suppress(ValueError):
-        for name in names:  # those that occur twice are told apart by what polars adds to them
+        for name in names:  # polars adds a suffix to repeated names
             float(name.partition("_duplicated_")[0])
         return True
     return False
 
 
 def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
-    """Writes a draft, and says at its end and in the summary what it lacks."""
     write_text(path, draft)
     summary["draft"] = str(path)
     lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft else []
@@ -198,15 +190,14 @@ def _inspect(
 def _explained(
     description: Description, source: str, found: Conventions
 ) -> tuple[list[Finding], float | None]:
-    """Return findings and delay: those of identification where it names causes, or is surer.
+    """Return findings and delay, of identification if it names causes or is more precise.
 
-    Errors of the motion, and axes, are found in the conventions; what else they name may be the
-    effect of a cause.
+    Other findings than errors of motion and axes may be effects of a cause.
     """
     findings, delay = list(found.findings), found.delay_s
     try:
         identified = identify_log(source)
-    except DrakeTeleopError:  # which the findings explain, or `identify` reports
+    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
         return findings, delay
     deviation = identified.delay_deviation_s
     if identified.causes and all(finding.name in EFFECTS for finding in findings):
@@ -225,7 +216,6 @@ def _explained(
 def _stream(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], list[str]]:
-    """Figures and findings of one stream, and the columns that it uses."""
     columns = [
         str(column)
         for field in _QUANTITIES
@@ -287,10 +277,9 @@ def _repeated(
     rate: float | None,
     time: Any,
 ) -> list[Finding]:
-    """Whether rows were held by the recorder, and at what rate new ones came.
+    """Return a finding if the recorder repeated rows, with the rate of new rows.
 
-    A coarse sensor at rest repeats rows by itself; but then the row after a repeated one differs in
-    a channel or two, whereas after a row that was held most channels are new at once.
+    A coarse sensor at rest also repeats rows, but then few channels change in the next row.
     """
     held = int(same.sum())
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
@@ -365,7 +354,6 @@ def _clock(
 
 
 def _labels(columns: Sequence[str], table: Table) -> list[str]:
-    """One label for each number in a row; an array of an NPZ file has several."""
     labels: list[str] = []
     for column in columns:
         width = table.raw(column, column).shape[1]
@@ -374,13 +362,12 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    """Length of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
-    """Samples at the largest or smallest value, if they stand there as nowhere else."""
+    """Count samples at the ends of the range, if only these repeat."""
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
@@ -389,7 +376,6 @@ def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
 
 
 def _finite(table: Table, names: Sequence[str]) -> Table:
-    """The table's rows in which all these columns are finite."""
     if len({len(table.raw(name, name)) for name in names}) != 1:
         return table
     good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
@@ -401,7 +387,6 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
 
 
 def _increasing(table: Table, column: str) -> Table:
-    """The table's rows whose time stamps are later than all before."""
     t = table.single(column, column)
     later = np.ones(len(t), bool)
     later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]

@@ -1,4 +1,4 @@
-"""The load of a log whose motion is known by poses: `pose_motion` for `identify_log`."""
+"""Load of a log with poses: `pose_motion` for `identify_log`."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from drake_teleop.logs.read.tables import FORMATS
 from drake_teleop.logs.spline_motion import clock_note, motion_and_load, moved_by_splines
 
 ROBUST = ("robust", "consistent")
-"""Methods that take this way; the others have the motion differentiated and believe it."""
+"""Methods that use splines; the others differentiate the motion and take it as exact."""
 _LEAST = 1e-9
-# Samples that a log keeps, at least, and their rate over the cut-off of the low-pass.
+# Fewest kept samples, and their rate over the cut-off of the low-pass.
 _SHOWN, _RATE_OF_CUTOFF = 400_000, 0.25
-_CHUNK, _BESIDE = 2**14, 2**8  # of those, at a time, and beside them to smooth with
+_CHUNK, _BESIDE = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
 class PosedFit:
-    """What `fit_posed` found.
+    """Result of `fit_posed`.
 
     Attributes:
-        log: the samples that were used, with the motion of the splines, low-passed.
+        log: used samples with the motion of the splines, low-passed.
         fit: the load.
-        delay_s: that was taken out [s].
-        source: "given", "estimated", or "undetermined" (0 was taken).
+        delay_s: removed delay [s].
+        source: "given", "estimated", or "undetermined" (0 was used).
         motion: of the poses.
     """
 
@@ -52,15 +52,14 @@ class PosedFit:
 def fit_posed(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
-    """The load from wrench and poses, and whether the poses are of another frame.
+    """Return the load from wrench and poses, and a finding if the pose frame is not S.
 
-    No load where the method or the log is not of that kind. An IMU beside the poses is heard too:
-    if it tells another motion, or the poses are of another frame, its word is the better one.
+    The load is None for other methods or logs, or if an IMU contradicts the poses.
 
     Args:
-        log: as it was read.
+        log: as read.
         method: one of `METHODS`.
-        cutoff_hz: of the low-pass on what is shown, and on the residual that is stated.
+        cutoff_hz: of the low-pass on samples and residual.
         delay: of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
@@ -73,8 +72,8 @@ def fit_posed(
     shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
-    # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
-    if finding is not None or not found.fit.explained:  # then nothing of the load is what it seems
+    # Errors of gains beyond the stated ones make the load uncertain.
+    if finding is not None or not found.fit.explained:
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
@@ -86,7 +85,6 @@ def fit_posed(
 
 
 def _fewer(log: Log, cutoff_hz: float | None) -> Log:
-    """A very long log at a lower rate: enough for residuals, pictures and changes of the load."""
     stride = len(log) // _SHOWN
     if cutoff_hz is not None:
         stride = min(stride, int(_RATE_OF_CUTOFF / (cutoff_hz * log.dt)))
@@ -94,7 +92,7 @@ def _fewer(log: Log, cutoff_hz: float | None) -> Log:
         return log
     few = log.only(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
-    for start in range(0, len(few), _CHUNK):  # the whole would take as much memory again
+    for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
         before, stop = max(0, start - _BESIDE), start + _CHUNK + _BESIDE
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
@@ -105,7 +103,6 @@ def _fewer(log: Log, cutoff_hz: float | None) -> Log:
 def _fit(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
-    """As of `identify_batch`, with the estimate and covariance of the spectra."""
     kept = ~rejected
     theta = _consistent(found) if method == "consistent" else found.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
@@ -131,7 +128,7 @@ def _fit(
 
 
 def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
-    """(16,) the nearest load that a body can have; one of negative mass stays as it is."""
+    """(16,) nearest physically consistent load; a negative mass remains."""
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta

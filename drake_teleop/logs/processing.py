@@ -47,28 +47,27 @@ from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _BY_GAINS = {"gain", "sensor rotation", "torque factor"}
-"""Causes that stated errors of the gains explain."""
-_CONSTANT = 1e-6  # change of a channel over its largest value
+"""Causes that are explained by stated errors of gains."""
+_CONSTANT = 1e-6  # largest relative change of a constant channel
 _FEWEST_TO_TARE = 10
-_LARGEST_SCALE = 100.0  # as of `ForceScalingConfig`
+_LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 
 
 @dataclass(frozen=True, repr=False)
 class IdentifiedLog:
-    """A log and what was identified from it.
+    """Log with its identified load.
 
     Args:
-        log: the samples that were used: delay taken out, low-passed, none from gaps.
+        log: used samples: without delay and gaps, low-passed.
         identification: the result.
         predicted: (N, 6) offsets + V phi at the same instants.
-        delay_source: as in the summary: "estimated", "given" ...
-        rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
-        base: which combinations of offsets and load the samples that were used determine.
-        findings: suspected errors of the log's description; only looked for if the fit is poor.
-        causes: what acts beside a rigid load with constant offsets, with times and values; the load
-            is then that within the model that has them, at the start of the record.
-        loads: the load of each stretch, if it changes within the record.
-        delay_deviation_s: standard deviation of an estimated delay [s]; nan if it is unknown.
+        delay_source: as in the summary.
+        rejected: (N,) samples rejected by robust fits.
+        base: combinations of offsets and load that the samples determine.
+        findings: suspected errors of the description.
+        causes: effects beside a rigid load with constant offsets, included in the model.
+        loads: load of each part of the record, if it changes.
+        delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
 
     log: Log
@@ -88,30 +87,26 @@ class IdentifiedLog:
 
 @dataclass(frozen=True)
 class EliminatedLog:
-    """A log without its non-contact wrench. All arrays are low-passed and in S, sign of Eq. (1).
+    """Log without its non-contact wrench. Arrays are low-passed and in S, sign of Eq. (1).
 
     Args:
-        log: the log with its delay taken out, without what lay in gaps; not low-passed.
-        phi: (10,) the load that was used, see `usable_phi`; gripper and object together.
-        point_mass: names of the inertias that are not of the load file but of a point mass.
+        log: without delay and gaps; not low-passed.
+        phi: (10,) of gripper and object, see `usable_phi`.
+        point_mass: names of the inertias replaced by those of a point mass.
         offsets: (6,) of this record.
-        tare_fraction: share of the samples that `offsets` were taken from; 1 if not tared.
-        delay_s: how far the motion lagged behind the wrench [s].
-        delay_source: as in the summary: "estimated", "given" ...
+        tare_fraction: share of the samples that determined `offsets`; 1 if not tared.
+        delay_s: of the motion behind the wrench [s].
+        delay_source: as in the summary.
         measured: (N, 6) wrench without offsets.
         non_contact: (N, 6) V phi.
         contact: (N, 6) Eq. (13).
         scaled: (N, 6) gamma F_c + sigma V phi.
-        gravity_only: (N, 6) wrench without offsets and static weight, or None if the orientation
-            is not known.
-        noise_floor: (6,) of `contact`, one for all motions.
-        detection: where something is touched, see `drake_teleop.logs.contact`; None for static
-            poses and for records too short to tell.
-        causal: the same wrenches as a loop would have had them, or None if not asked for.
-        findings: suspected errors of the log's description; only looked for if the load hardly
-            explains the wrench in half of the record.
-        edge: (N,) samples at the ends of the record, and beside gaps of the poses, whose motion or
-            low-pass has measurements on one side only. They are neither judged nor in any figure.
+        gravity_only: (N, 6) wrench without offsets and weight; None without orientation.
+        noise_floor: (6,) of `contact`, independent of the motion.
+        causal: wrenches as in a control loop, if requested.
+        edge: (N,) unjudged samples at ends and gaps, excluded from all figures.
+        detection: contacts; None for static poses and very short records.
+        findings: suspected errors of the description, after a poor fit.
     """
 
     log: Log
@@ -134,7 +129,7 @@ class EliminatedLog:
 
     @property
     def touched(self) -> NDArray[np.bool_]:
-        """(N,) where something is touched; nowhere without a `detection`."""
+        """(N,) contact; False everywhere without a `detection`."""
         none = np.zeros(len(self.contact), bool)
         return none if self.detection is None else self.detection.touched
 
@@ -146,22 +141,20 @@ def identify_log(
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
 ) -> IdentifiedLog:
-    """Identifies the load and the sensor's offsets from a log.
+    """Identify the load and the sensor's offsets from a log.
 
-    Where poses have positions the motion is of splines, of them and of an IMU beside them, and the
-    noise of both is taken out: `drake_teleop.logs.pose_motion`. Otherwise wrench and motion pass
-    the same zero-phase low-pass, and the motion is taken as exact. Static poses are used as they
-    are.
+    With positions, motion is from splines (`drake_teleop.logs.pose_motion`). Otherwise wrench and
+    motion pass one zero-phase low-pass, and motion counts as exact. Static poses are unfiltered.
 
     Args:
         path: canonical table or log description.
         method: one of `drake_teleop.load.batch.methods.METHODS`.
         cutoff_hz: of the low-pass; None for none.
-        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
+        delay: of the motion behind the wrench [s], or "auto".
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, the method is unknown, or the result would be
-            worthless, see `drake_teleop.logs.check.conventions.question_fit`.
+        DrakeTeleopError: for an unusable log, an unknown method or a worthless result
+            (`question_fit`).
     """
     check_method(method)
     with one_blas_thread():
@@ -244,7 +237,6 @@ def _identified(
 
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
-    """Whether units and clocks of the motion are right and every channel of the wrench lives."""
     largest = np.abs(log.wrench).max(axis=0)
     if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT * largest).any():
         return False
@@ -272,51 +264,37 @@ def eliminate_log(
     free: str | Path | None = None,
     statistic: str = "level",
 ) -> EliminatedLog:
-    """Removes (or scales) the non-contact wrench of a known load in a log.
-
-    Where poses have positions the motion is of splines that the wrench chooses, as in
-    `identify_log`.
+    """Remove (or scale) the non-contact wrench of a known load in a log.
 
     Args:
-        path: canonical table or log description.
-        load: identification.json, or what is in it.
-        gripper: identification.json of the gripper without the object, or what is in it; `load`
-            is then gripper with object. Both about the same origin in the same frame S, which the
-            files cannot tell. None: one load.
-        sigma: share of the non-contact wrench that is kept; of the gripper's, if there is one.
-        sigma_object: share of the object's that is kept; None: sigma. Goes with a gripper only.
+        path, delay: as in `identify_log`.
+        load: identification.json, or its content.
+        gripper: the same of the gripper alone, in the same frame S; `load` is then gripper with
+            object.
+        sigma: kept share of the non-contact wrench, of the gripper if there is one.
+        sigma_object: kept share of the object's, with a gripper only; None: sigma.
         gamma: scale of the contact wrench.
-        eta: Eq. (14), the share that is kept of the object, and nothing of the gripper; without
-            `gripper` the whole load counts as the object. Goes with sigma = 0, gamma = 1 and no
-            sigma_object.
-        cutoff_hz: zero-phase low-pass on everything that comes out; None for none.
-        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
-        tare: take the sensor's offsets from this record (they drift between records), not from
-            `load`: the constant that most of the record agrees on, see `robust_offsets`.
-        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. Its motion is
-            differentiated, not of splines. Accelerations that were differentiated from poses have
-            seen half a smoother's window ahead, which a loop would have to wait for in addition.
-        causal_tare_s: length of the start of the record, with nothing touched, that the offsets of
-            the causal wrench are taken from [s]; None takes those of `load`. Either way they come
-            from the past alone.
-        free: log of free motion with the same load, which says what is no contact; None: what is
-            quiet in the record itself.
-        statistic: that contact is told by, one of
-            `drake_teleop.load.contact.noise_floor.STATISTICS`.
+        eta: kept share of the object, Eq. (14), instead of the other scales; the gripper is
+            removed.
+        cutoff_hz: zero-phase low-pass on all outputs; None for none.
+        tare: estimate the offsets from this record (`robust_offsets`), not from `load`.
+        causal: "delayed" or "predicted": also return `EliminatedLog.causal`.
+        causal_tare_s: contact-free start that determines its offsets [s]; None: those of `load`.
+        free: log of free motion with the same load; None: calm parts of the record itself.
+        statistic: of contact, one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
 
     Raises:
-        DrakeTeleopError: if a log or a load file cannot be used, eta is given together with
-            another scale, sigma_object without a gripper, causal or free for static poses, or
-            another statistic.
+        DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
+            with static poses, or an unknown statistic.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
-    statistic_index(statistic)  # refused here, if it is none
-    # One load without a gripper is all object.
+    statistic_index(statistic)  # raises an error for an unknown name before the long computation
+    # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
     if gripper is not None:
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
-        identified_object(identification, alone)  # An error for exchanged files.
+        identified_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
         _eliminated,
@@ -364,7 +342,6 @@ def _eliminated(
     causal: str | None = None,
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
-    """`eliminate_log` without its detection of contact."""
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
             "is for the causal wrench only", where="causal_tare_s", remedy="give causal as well"
@@ -443,7 +420,6 @@ def _eliminated(
 
 
 def _start(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The samples of `wrench` within `length_s` of the start."""
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _FEWEST_TO_TARE:
         raise DrakeTeleopError(
@@ -455,13 +431,9 @@ def _start(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np
 
 
 def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """phi with the inertias that were not identifiable replaced by those of a point mass.
+    """Replace unidentified inertias by those of a point mass; return phi (10,) and their names.
 
-    Their fitted values are arbitrary, and may be huge. What mass and centre of mass imply,
-    m (c'c E - c c'), is the smallest inertia that such a load can have about the origin of S.
-
-    Returns:
-        phi (10,), and the names of the inertias that were replaced.
+    m (c'c E - c c') is the smallest inertia about So for this mass and centre of mass.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(~identification.identifiable[10:])
@@ -473,7 +445,6 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
 def _suspected(
     path: Path, wrench: NDArray[np.float64], contact: NDArray[np.float64]
 ) -> tuple[Finding, ...]:
-    """Findings about a log whose load leaves most of the wrench, not only in a contact."""
     before, after = (float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact))
     if after < 0.3 * before:
         return ()
@@ -484,7 +455,6 @@ def _suspected(
 def _scales(
     sigma: float, sigma_object: float | None, gamma: float, eta: float | None, split: bool
 ) -> dict[str, float]:
-    """The three scales of `scaled_wrench`; without a gripper (`split`) the load is all object."""
     for name, value in (("sigma", sigma), ("sigma_object", sigma_object), ("gamma", gamma)):
         if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
             raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)

@@ -1,4 +1,4 @@
-"""Extensions of a model, in the order of plausibility, and what makes each of them a finding."""
+"""Extensions of a model in the order of plausibility, and their minimum effects."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ORDER = (
     "cable",
     "drift",
 )
-"""Of candidates with nearly the same likelihood the first is taken."""
+"""Order of plausibility: of nearly equal candidates the first is chosen."""
 _FACTORS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
 FACTORS = tuple(
     sign * ratio
@@ -38,7 +38,7 @@ FACTORS = tuple(
     for ratio in (1.0, *_FACTORS, *(1.0 / x for x in _FACTORS))
     if sign * ratio != 1.0
 )
-"""Known ratios of units and signs between torque and force."""
+"""Ratios of known units and signs between torque and force."""
 _HALF, _IMPOSSIBLE = 0.5, 1000.0
 _TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
 _MASS_SHARE, _MOMENT = 0.02, 0.004
@@ -48,18 +48,12 @@ _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
 _FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
 _SIMILAR, _AS_LIKELY, _FACTOR_STEPS = 0.2, 1.0, 4
-_DOUBTFUL = 30.0  # a score that widens intervals and names nothing
+_DOUBTFUL = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An extension that was fitted.
-
-    Attributes:
-        name: one of `ORDER`.
-        state: the larger model.
-        score: twice the gain of the log likelihood, less what its parameters cost.
-    """
+    """Fitted extension with twice the gain of the log likelihood minus its cost."""
 
     name: str
     state: State
@@ -67,11 +61,8 @@ class Candidate:
 
 
 def candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit the extensions that a state allows and keep those of sufficient effect.
-
-    Args:
-        state: the model so far.
-        first: whether it is the rigid load alone.
+    """Fit the possible extensions and keep those of sufficient effect; `first`: of the rigid load
+    alone.
     """
     model, data = state.model, state.data
     if first:
@@ -131,7 +122,7 @@ def _best(
 
 
 def negative(state: State) -> bool:
-    """Whether the mass, or the inertia about an axis through So, is clearly below zero."""
+    """Return whether the mass, or the inertia about an axis, is significantly negative."""
     mass, deviation = float(state.x[6]), float(np.sqrt(state.fit.covariance[6, 6]))
     if mass < _SURE * deviation:
         return mass < -4.0 * deviation
@@ -147,13 +138,13 @@ def negative(state: State) -> bool:
 
 
 def plausible(state: State) -> bool:
-    """Whether the parts of a model are what they can be in a laboratory."""
+    """Return whether the parameters are possible in a laboratory."""
     if negative(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
     if "weight" in parts:
         removed = part(state, "weight")[0][0]
-        # A robot adds no weight, and without inertia there is nothing to compare it with.
+        # A robot adds no weight, and a removed weight requires an inertia to compare with.
         if removed < -0.01 * state.x[6] or state.x[6] < _SURE * deviation:
             return False
     if "frame" in parts and np.linalg.norm(part(state, "frame")[0]) > _FARTHEST:
@@ -167,7 +158,7 @@ def plausible(state: State) -> bool:
 
 
 def part(state: State, name: str) -> tuple[Array, Array]:
-    """Values of an extension and their covariance."""
+    """Return values of an extension and their covariance."""
     where = state.model.slices[name]
     return state.x[where], state.fit.covariance[where, where]
 
@@ -179,14 +170,14 @@ def _tilted_enough(state: State) -> bool:
     size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
     cosine = float(true @ given) / (size * right)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    # Noise of the accelerations changes the size alone.
+    # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > abs(size / right - 1.0)
     share = _GRAVITY_SHARE if turned else _KNOWN_SHARE
     return bool(angle > _TILT_DEG and abs(size / right - 1.0) < share)
 
 
 def tilted(state: State) -> Array | None:
-    """Start of a large tilt, from the force alone: f = o + m a + R u with u = -m g."""
+    """Return start values for a large tilt, from the force alone: f = o + m a + R u, u = -m g."""
     y = state.data.only(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -235,7 +226,6 @@ def _drift_enough(state: State) -> bool:
 
 
 def _factor(state: State) -> Iterator[Candidate]:
-    """The most usual known ratio of nearly the greatest likelihood, then refined."""
     fits = []
     for factor in (1.0, *FACTORS):
         model = replace(state.model, factor=factor)
@@ -249,23 +239,23 @@ def _factor(state: State) -> Iterator[Candidate]:
         return
     free = best.extended(best.model.extended("torque factor"))
     value, covariance = part(free, "torque factor")
-    # A displaced pose frame resembles any factor, but has to be far away to resemble a large one.
+    # A displaced pose frame resembles any factor, but only a distant frame resembles a large one.
     far = not _SIMILAR < best.model.factor < 1.0 / _SIMILAR
     most = _FACTOR_MOST_FAR if far else _FACTOR_MOST
     limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _candidate("torque factor", state, best, more=1)
-    # A factor that is not quite a known one is no cause, but makes the load doubtful.
+    # A factor beside the known ratios is not a cause, but widens the intervals.
     yield found if abs(value[0]) < limit else replace(found, score=min(found.score, _DOUBTFUL))
 
 
 def _axes(state: State) -> Iterator[Candidate]:
-    """The signed permutation that explains the force best, by mass and first moment alone."""
+    """Yield the signed permutation that explains the force best."""
     from itertools import permutations, product
 
     y = state.data.only(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
     sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
-    # m s + alpha x h + omega x (omega x h) of the three axes of S, and a weight that was removed
+    # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight
     model = Model(parts=state.model.parts)
     used = [6, 7, 8, 9]
     if "weight" in model.parts:
@@ -293,5 +283,5 @@ def _axes(state: State) -> Iterator[Candidate]:
         larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _candidate("axes", state, larger, more=3)
-            # A negative mass is impossible, however well it explains the wrench.
+            # The given axes imply a negative mass, which is impossible.
             yield replace(found, score=found.score + (_IMPOSSIBLE if negative(state) else 0.0))

@@ -1,4 +1,4 @@
-"""Causes of a misfit in words: name, time, value with interval, and the line that corrects it."""
+"""Causes of a misfit in words: name, time, value with interval."""
 
 from __future__ import annotations
 
@@ -16,20 +16,19 @@ from drake_teleop.logs.causes.state import State
 _NEAR_S, _SHORT_S = 0.8, 1.2
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGES = ("zero change", "load change")
-"""Causes after which a record has no single load with constant offsets."""
+"""Causes that divide a record into parts with different offsets or loads."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One reason why a rigid load with constant offsets does not explain a wrench.
+    """Reason why a rigid load with constant offsets does not explain a wrench.
 
     Attributes:
-        name: "axes", "gravity direction", "weight removed", "payload configured",
-            "torque factor", "zero change", "load change", "drift", "gain", "pose frame",
-            "sensor rotation", "contact", "cable" or "no load".
-        message: cause, value with its interval, and what to change beside the description.
-        start_s: time from which it acts, since the start of the record [s]; None: throughout.
-        stop_s: time until which it acts [s]; None: to the end.
+        name: "axes", "gravity direction", "weight removed", "payload configured", "torque factor",
+            "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
+            "contact", "cable" or "no load".
+        message: cause, value with its interval, and remedy.
+        start_s, stop_s: time interval since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
     """
 
@@ -42,7 +41,7 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A part of a record with one load.
+    """Part of a record with one load.
 
     Attributes:
         start_s, stop_s: since the start of the record [s].
@@ -57,12 +56,12 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """(16,) whether the stretch determines a parameter of [offsets; phi] well enough."""
+        """(16,) whether the part determines a parameter of [offsets; phi]."""
         return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """The causes in the model of a state but for the given parts, in the order of their times."""
+    """Return the causes in a fitted model in the order of time, except the given parts."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -85,12 +84,7 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """The loads of a record whose load changes; of another, none.
-
-    Args:
-        state: the model.
-        covariance: (16, 16) of [offsets; phi] of the first stretch.
-    """
+    """Return the loads of a changing load; covariance (16, 16): of the first part."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []
@@ -258,7 +252,6 @@ def _change(state: State, i: int) -> Cause:
 
 
 def _beside(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    """Whether a short contact is that of the hand which changes the load."""
     near = any(span[0] - _NEAR_S < time < span[1] + _NEAR_S for time in times)
     return near and span[1] - span[0] < _SHORT_S
 

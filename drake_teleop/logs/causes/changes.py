@@ -17,13 +17,13 @@ _WORTH = 60.0
 _REFINED, _MOVES = (1.0, 0.25), 2  # instants
 _APART_S, _RAMP_COST = 0.4, 80.0
 RAMP_S = 0.5
-"""Length around a step that is left out where it takes its time [s]."""
+"""Shortest omitted time around a gradual step [s]."""
 _TRIED = 2
 _DEVIATIONS, _LEVELS, _MASS_SHARE, _MOMENT = 5.0, 2.0, 0.01, 0.002
 
 
 def change(state: State, kind: str) -> State | None:
-    """The state with one more step of "offsets" or "load" at the most likely time, or None."""
+    """Return the state with one more step of "offsets" or "load" at the most likely time."""
     best: State | None = None
     for time in _times(state, kind):
         found = _refined(state, kind, time)
@@ -37,7 +37,6 @@ def change(state: State, kind: str) -> State | None:
 
 
 def _times(state: State, kind: str) -> list[float]:
-    """Times of the largest gain of white least squares, to one instant."""
     data, rows = state.data, state.data.block
     scan = _Scan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
@@ -58,7 +57,7 @@ def _times(state: State, kind: str) -> list[float]:
 
 
 class _Scan:
-    """Gain by a step of offsets or load at any instant, with white noise of the state's size."""
+    """Gain by a step at any instant, with white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
@@ -81,7 +80,6 @@ class _Scan:
         return flat.T @ flat, flat.T @ e.ravel()
 
     def gain(self, n: int) -> float:
-        """Of a step before instant n."""
         j = -(-n // self._rows)
         gram, right = self._sums(n, j * self._rows)
         if j < len(self._gram):
@@ -100,14 +98,9 @@ def with_ramps(
     spans: Spans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit steps that take their time: the rows around each are left out.
+    """Fit gradual steps of `kinds` at `times` [s]; rows within `widths` (>= `RAMP_S`) are omitted.
 
-    Args:
-        state: has the parameters to begin with.
-        kinds: "offsets", "load" or both, at each time.
-        times: nearly the middles of the ramps [s].
-        spans: other rows that are left out.
-        widths: of the rows around each time [s]; at least `RAMP_S`.
+    `spans` are other omitted rows; `state` has the initial parameters.
     """
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
@@ -123,7 +116,7 @@ def with_ramps(
 
 
 def without_small_steps(state: State) -> State:
-    """Remove steps without an effect, one after the other, the least first."""
+    """Remove insignificant steps one by one, the least significant first."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _large_enough(state, i)]
         if not small:
@@ -136,7 +129,6 @@ def without_small_steps(state: State) -> State:
 
 
 def _significance(state: State, i: int) -> float:
-    """Wald statistic of a step per parameter."""
     where = state.model.slices[f"step {i}"]
     x, covariance = state.x[where], state.fit.covariance[where, where]
     return float(x @ inverted(covariance) @ x) / len(x)
@@ -145,7 +137,7 @@ def _significance(state: State, i: int) -> float:
 def _middle(
     state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
 ) -> float:
-    """Time at which half of the k-th change is done, from the residual within a span."""
+    """Return the time of half of the k-th change."""
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
     rows = np.flatnonzero(data.used & in_spans(data, (span,)))
@@ -166,8 +158,6 @@ def _middle(
 
 
 def _refined(state: State, kind: str, time: float) -> State:
-    """Fit a step at the times around the given one, with noise of their own."""
-
     def at(time: float, start: Array | None = None) -> State:
         model = replace(state.model, steps=(*state.model.steps, Step(kind, time)))
         return state.extended(model, start)
@@ -185,7 +175,6 @@ def _refined(state: State, kind: str, time: float) -> State:
 
 
 def _large_enough(state: State, i: int) -> bool:
-    """Whether a step is a change of mass, moment or offsets that matters."""
     where = state.model.slices[f"step {i}"]
     values = state.x[where]
     deviations = np.sqrt(np.diag(state.fit.covariance[where, where]))

@@ -1,4 +1,4 @@
-"""Stretches of a record in which something touches the load, by trimmed least squares."""
+"""Contacts of the load within a record, by trimmed least squares."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOUDER, _QUIET = 1.3, 1.25
 
 
 def contact_spans(state: State) -> Spans:
-    """(start, stop) of the stretches whose residual is far above the noise and the calm rest."""
+    """Return (start, stop) of blocks whose residual far exceeds noise and calm blocks."""
     blocks = _Blocks(state)
     loud = blocks.loud(blocks.usable)
     if loud is None or not loud.any():
@@ -36,16 +36,9 @@ def contact_spans(state: State) -> Spans:
 
 
 def phases(larger: State) -> State | None:
-    """Explain long contacts by other loads and other offsets, each with a time of its own.
+    """Explain long contacts by other loads and offsets; None if these do not explain the wrench.
 
-    The blocks of the contacts are fitted by themselves, again and again, with a load and offsets of
-    their own. If few runs of blocks with one load each cover the record, their borders are steps.
-
-    Args:
-        larger: the model with the contacts.
-
-    Returns:
-        the model with steps in the place of contacts; None if these do not explain the wrench.
+    The blocks are fitted repeatedly. If few runs cover the record, their borders become steps.
     """
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
@@ -71,7 +64,6 @@ def phases(larger: State) -> State | None:
 
 
 def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
-    """The flags in runs of at least so many, single gaps being closed."""
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], closed.astype(np.int8), [0]])))
@@ -82,7 +74,7 @@ def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
 
 
 class _Blocks:
-    """Normal equations of a state's model by blocks of rows, with white noise."""
+    """Normal equations of a model for blocks of rows."""
 
     def __init__(self, state: State) -> None:
         data = state.data
@@ -106,7 +98,7 @@ class _Blocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def loud(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Blocks among some whose residual is far above that of the calmest; None for too few."""
+        """Return the blocks with a residual far above the calmest; None for too few blocks."""
         found = self._calmest(np.flatnonzero(among))
         if found is None:
             return None
@@ -116,11 +108,7 @@ class _Blocks:
         return np.asarray((level > _LEVELS) & (level > _CALM * usual) & among)
 
     def _calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        """Residual of each block by the fit to the calmest ones, their level, the fit's step.
-
-        Trimmed least squares from many starts, the whole and stretches of 2, 4 and 8 s that grow.
-        Of the results that one counts which leaves least in all blocks, each up to a limit.
-        """
+        """Return residuals of the blocks, level of the calmest, and the fit's change."""
         if len(blocks) < 2 * _FEWEST_BLOCKS:
             return None
         starts = [blocks]
@@ -141,7 +129,6 @@ class _Blocks:
     def _trimmed(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
     ) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Mean squares of all blocks, the step, and the calmest share, from a start."""
         keep = max(_FEWEST_BLOCKS, int(share * len(blocks)))
         for _ in range(_ROUNDS):
             move = inverted(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
@@ -156,12 +143,7 @@ class _Blocks:
 
 
 def _by_motion(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
-    """(blocks,) usual level of a motion that changes as fast: motion is known up to a frequency.
-
-    The level beyond that at rest is in proportion to the second difference of the wrench that the
-    model expects with parameters x; the factor is twice that of the calmest quarter of the blocks
-    with a fast motion.
-    """
+    """(blocks,) residual level that errors of fast motion cause, by the calmest fast blocks."""
     data, rows = state.data, state.data.block
     y = data.with_steps(state.model.times)
     wrench = y @ state.model.wrench(x[None])[0].T
@@ -179,11 +161,9 @@ def _by_motion(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) 
 
 
 def contact_of_steps(state: State) -> State:
-    """Replace changes of the offsets by a contact between them, where the residual says so.
+    """Replace two changes of offsets by a contact between them if the residual requires it.
 
-    Two changes explain the level of a contact and leave a wrong load, with a good likelihood. They
-    are a contact if they cancel, or if the residual between them is mostly large and that of the
-    rest is not once the rows between them are left out.
+    Two changes explain the level of a contact, but with a wrong load.
     """
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
@@ -207,14 +187,13 @@ def contact_of_steps(state: State) -> State:
 
 
 def shrunk(state: State) -> State:
-    """Give rows at the ends of the contacts back to the rest, if their residual is small."""
+    """Return rows at the ends of contacts to the fit, if their residual is small."""
     dt = state.data.dt
     spans = [_loud(state, span) for span in state.spans]
     return State.of(state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans))
 
 
 def _loud(state: State, span: tuple[float, float]) -> tuple[float, float]:
-    """First and last time within a span at which the residual is large."""
     data = state.data
     inside = np.flatnonzero(data.used & in_spans(data, (span,)))
     y = data.with_steps(state.model.times)[:, state.model.columns]
@@ -227,7 +206,6 @@ def _loud(state: State, span: tuple[float, float]) -> tuple[float, float]:
 
 
 def _usual(state: State, span: tuple[float, float]) -> float:
-    """Largest usual residual of a channel over its white noise within a span."""
     chosen = state.rows.used & in_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
@@ -236,7 +214,6 @@ def _usual(state: State, span: tuple[float, float]) -> float:
 
 
 def _cancel(state: State, i: int, j: int) -> bool:
-    """Whether the second of two changes of offsets undoes the first."""
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False

@@ -1,8 +1,4 @@
-"""The delay of a motion behind a wrench, whatever load, axes, units and weight are.
-
-Each channel is fitted with the 16 signals of the motion alone. A fit of a load would put the delay
-where a wrong model fits best.
-"""
+"""Delay of a motion behind a wrench, independent of load, axes, units and weight."""
 
 from __future__ import annotations
 
@@ -16,7 +12,11 @@ _SIGNALS = slice(0, 16)
 
 
 def free_delay(data: Instants) -> float:
-    """Delay [s] of the least residual, within 0.25 s or a tenth of the record."""
+    """Return the delay [s] of the smallest residual, within 0.25 s or a tenth of the record.
+
+    Each channel is fitted with the 16 signals of the motion, because a wrong load model would bias
+    it.
+    """
     reach = min(_REACH, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
     spline = CubicSpline(data.t, data.y[:, _SIGNALS])

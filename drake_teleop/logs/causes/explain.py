@@ -1,4 +1,4 @@
-"""Why a wrench is not that of a rigid load: test, search, and the load within the result."""
+"""Explanation of a wrench: test, search, and the load within the result."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SURE = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What acts on a sensor, as far as a record shows it.
+    """Causes of a record and the load within their model.
 
     Attributes:
-        causes: what acts beside a rigid load with constant offsets; empty if nothing does.
-        explained: whether the residual is the sensor's noise.
-        theta: (16,) [offsets; phi] within the model; of the first stretch if the load changes.
+        causes: effects beside a rigid load with constant offsets.
+        explained: whether the residual is sensor noise.
+        theta: (16,) [offsets; phi] of the first part of the record.
         covariance: (16, 16) of theta.
-        deviations: (16,) of theta by what remains unexplained (`misfit_deviations`).
-        delay_s: of the motion behind the wrench, in addition to what `instants` had [s].
-        loads: the loads of a record whose load changes.
-        removed_weight: (4,) [m, m c] whose weight is already removed, or None.
-        given: parts of the model that are known to act, and are no causes.
+        deviations: (16,) of theta by the unexplained rest (`misfit_deviations`).
+        delay_s: additional delay of the motion behind the wrench [s].
+        loads: of a record whose load changes.
+        removed_weight: (4,) [m, m c] removed from the wrench, or None.
+        given: active parts of the model that are no causes.
         state: model and residual.
     """
 
@@ -53,24 +53,22 @@ class Explanation:
 
     @property
     def misfit(self) -> bool:
-        """Whether the residual is clearly not the sensor's noise, even if that is coloured."""
+        """Whether the residual is clearly not noise, even if coloured."""
         return not self.explained and clearly_wrong(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gains stand for errors of the whole matrix of gains."""
+        """Whether gains represent errors of the whole matrix of gains."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
 
 
 def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Explanation:
-    """Test whether a rigid load explains a record, and find what else acts if it does not.
+    """Test whether a rigid load explains a record, and search for causes if not.
 
-    Args:
-        data: the record.
-        later: returns the record with the motion of a delay [s] more.
-        given: parts of `Model` that are known to act, such as "weight".
+    `later` returns the record with additional delay [s]; `given` are active parts, such as
+    "weight".
     """
     with one_blas_thread():
         state, late, rejected = search(data, later, given)

@@ -1,15 +1,12 @@
 """Wrench and motion as block means at about 50 Hz, and their sums of products by block and lag.
 
-All columns of all models in this package are linear in the signals of one instant,
+All models of this package are linear in the signals of one instant,
 
-    y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
+y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
-with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. The means
-over a block are exact, because the models are linear in y and white noise stays white. The sums
-
-    G_d = sum of (y_n y_{n-d}^T + y_{n-d} y_n^T),   d = 0 ... 4 (G_0 once),
-
-contain everything that a fit with autoregressive noise of order 4 needs.
+with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. Means
+are exact because of this linearity. The sums of y_n y_{n-d}^T + y_{n-d} y_n^T, d = 0 ... 4,
+suffice for a fit with autoregressive noise of order 4.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ from scipy.signal import savgol_filter
 from drake_teleop.common.arrays import Array
 
 ORDER = 4
-"""Of the autoregressive noise."""
+"""Order of the autoregressive noise."""
 ONE, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
 FORCES, RATES, R, RP, TIME = (
     slice(16, 22),
@@ -36,16 +33,16 @@ FORCES, RATES, R, RP, TIME = (
 )
 WIDTH = 67
 MOTION = np.r_[0:16, 28:37]
-"""Columns that a load's wrench depends on; a step has these again, multiplied by u(t - t1)."""
+"""Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
 _RATE, _MOST = 50.0, 20_000
 _BLOCK_S, _BLOCKS, _FEWEST_ROWS = 0.25, 320, 5
 _EXACT, _LIVELY, _NOISY_SHARE = 5, 4.0, 1.0 / 64.0
-_WIDTHS = (5, 9, 15, 25)  # of smoothers of a noisy angular acceleration
-_FINEST = 1e-4  # of the wrench: no sensor has less noise
+_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular acceleration [rows]
+_FINEST = 1e-4  # smallest noise of a sensor, as a share of the wrench
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 Motion = Callable[[Array], tuple[Array, ...]]
-"""Of times (K,): s, omega, alpha (K, 3), and, if known, R_WS (K, 3, 3) and p (K, 3)."""
+"""Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +51,13 @@ class Instants:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals; 0 in rows that are not used.
+        y: (M, WIDTH) signals; 0 in unused rows.
         used: (M,) rows without gaps and edges.
-        white: (6,) standard deviation of the wrench's white noise in a block mean.
-        gravity_W: (3,) [m/s^2], or None if the orientation is unknown.
+        white: (6,) standard deviation of white wrench noise in a block mean.
+        gravity_W: (3,) [m/s^2], or None without orientation.
         positions: whether p is known.
-        shake: standard deviation of the acceleration in a block mean, of noise alone [m/s^2].
-        alpha_noise_share: of the variance of an IMU's angular acceleration, about the liveliest
-            axis, before it was smoothed.
+        shake: noise of the acceleration in a block mean [m/s^2].
+        alpha_noise_share: noise share of the variance of an IMU's angular acceleration.
     """
 
     t: Array
@@ -75,7 +71,7 @@ class Instants:
 
     @cached_property
     def lively(self) -> bool:
-        """Whether the record accelerates enough to tell inertia from weight."""
+        """Whether accelerations suffice to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _NOISY_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
@@ -83,7 +79,7 @@ class Instants:
 
     @property
     def dt(self) -> float:
-        """Time from one instant to the next [s]."""
+        """Time between instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
@@ -93,7 +89,7 @@ class Instants:
         return max(least, _FEWEST_ROWS, round(_BLOCK_S / self.dt))
 
     def only(self, used: NDArray[np.bool_]) -> Instants:
-        """The same with the rows `used` (M,) alone."""
+        """Return the record with other used rows (M,)."""
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def with_steps(self, times: tuple[float, ...]) -> Array:
@@ -128,15 +124,15 @@ def instants(
     lost: NDArray[np.bool_] | None = None,
     shake: float = 0.0,
 ) -> Instants:
-    """Block means of a record.
+    """Return block means of a record.
 
     Args:
         t: (N,) evenly spaced [s].
         wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        motion: a function of time, or what it returns at `t`.
-        gravity_W: (3,) [m/s^2]; None if `motion` has no orientation.
-        lost: (N,) samples that do not count.
-        shake: as in `Instants`.
+        motion: a function of time, or its values at `t`.
+        gravity_W: (3,) [m/s^2]; None without orientation.
+        lost: (N,) ignored samples.
+        shake: noise of the acceleration [m/s^2].
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_RATE * dt)), -(-len(t) // _MOST))
@@ -162,7 +158,7 @@ def instants(
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
-    """Smooth an angular acceleration that is noisy, as far as it needs; return its noise share."""
+    """Smooth a noisy angular acceleration in place; return its noise share."""
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
     for width in _WIDTHS:
@@ -174,7 +170,6 @@ def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
 
 
 def _noise_share(x: Array) -> float:
-    """Least share of white noise in the variance of the columns of x, by third differences."""
     noise = np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
@@ -186,7 +181,6 @@ def _put_motion(
     motion: Motion | tuple[Array, ...],
     gravity_W: Array | None,
 ) -> bool:
-    """Write the columns of the motion into y; return whether positions are known."""
     rows = len(y)
     if not callable(motion):
         columns = _columns([x[: rows * size] for x in motion], gravity_W)
@@ -197,7 +191,7 @@ def _put_motion(
         columns = _columns(found, gravity_W)
         _put(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(found) == 5
-    # Simpson's rule over a width that has the variance of `size` samples.
+    # Simpson's rule over an interval with the variance of `size` samples.
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     middle = t.reshape(rows, size).mean(axis=1)
     half = 0.5 * dt * np.sqrt(size**2 - 1.0)

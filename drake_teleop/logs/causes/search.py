@@ -1,4 +1,4 @@
-"""The absolute test of a fit, and the search for what else acts where it fails."""
+"""Absolute test of a fit, and search for causes if it fails (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _NAMED, _NEAR, _SHARE = 40.0, 25.0, 0.02
 _HALF, _FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.5, 0.2, 15.0, 0.9, 1000.0
 _ATTENUATED = 1.0 / 3.0
 _SMOOTH = 1.35
-"""Largest probe of good records; what is left beyond it could resemble any cause."""
+"""Largest probe of good records."""
 _STEPS, _LARGER = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
 _FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
-"""Causes whose many columns resemble others, and the margin by which they have to win."""
+"""Causes with many columns, which resemble others; required margins of their scores."""
 
 
 def explained(state: State) -> bool:
-    """Whether the residual is the sensor's noise: size, smooth columns, and likely extensions."""
+    """Return whether the residual is sensor noise: size, smooth columns, extensions."""
     if negative(state) or state.loudness > LOUD or state.probe > IMPLAUSIBLE:
         return False
     model = state.model
@@ -53,18 +53,12 @@ Found = tuple[State, float, list[Candidate]]
 
 
 def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Found:
-    """Find the model that explains a record.
+    """Return the model that explains a record, additional delay [s], and the last rejected
+    candidates.
 
-    A delay that was estimated with a wrong model may be wrong. If nothing explains the record, the
-    search starts again from the delay that the motion has in the least squares of all signals.
-
-    Args:
-        data: the record.
-        later: returns the record with the motion of a delay [s] more.
-        given: parts of the model from the start.
-
-    Returns:
-        the model, the delay that was added [s], and the candidates that the last round rejected.
+    If nothing explains the record, the search is repeated with the delay from `free_delay`,
+    because a wrong model may have caused a wrong delay. `later` returns the record with additional
+    delay [s].
     """
     found = _search(_begun(data, given), 0.0, later)
     if later is None or settled(found[0]) or explained(found[0]):
@@ -83,7 +77,7 @@ def settled(state: State) -> bool:
 
 
 def clearly_wrong(state: State) -> bool:
-    """Return whether smooth signals explain the residual, or it exceeds any coloured noise."""
+    """Return whether smooth signals explain the residual, or it exceeds coloured noise."""
     return state.probe > IMPLAUSIBLE or state.loudness > _COLOURED
 
 
@@ -94,7 +88,6 @@ def _begun(data: Instants, given: tuple[str, ...]) -> State:
 
 
 def _search(state: State, late: float, later: Later | None) -> Found:
-    """Add the most plausible extension until the record is explained or nothing explains more."""
     state, late = _in_time(state, late, later)
     last: list[Candidate] = []
     for number in range(ROUNDS):
@@ -123,17 +116,16 @@ def _search(state: State, late: float, later: Later | None) -> Found:
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove the cable if a third of its score comes from an inertial mass below the weight's.
+    """Remove the cable if an attenuated inertial mass explains a third of its score.
 
-    Noise of the accelerations makes the inertial mass too small if the load hardly accelerates. The
-    columns of a cable explain this effect, too.
+    Noise of the accelerations attenuates it if the load hardly accelerates.
     """
     best = max((x.score for x in found if x.name == "weight" and not plausible(x.state)), default=0)
     return [x for x in found if x.name != "cable" or best < _ATTENUATED * x.score]
 
 
 def _in_time(state: State, late: float, later: Later | None) -> tuple[State, float]:
-    """Take the remaining delay out of the motion, which the model has to first order only."""
+    """Remove the remaining delay from the motion; the model is linear in it."""
     for _ in range(_MOVES):
         if later is None or abs(state.x[DELAY]) < _LATE or abs(late) > _LATEST:
             break
@@ -145,11 +137,7 @@ def _in_time(state: State, late: float, later: Later | None) -> tuple[State, flo
 
 
 def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
-    """Return the most plausible candidate that reduces the residual to a fifth, or None.
-
-    Only candidates with at most twice the smallest residual compete. The likelihood does not show a
-    large and smooth misfit, because coloured noise predicts it as well.
-    """
+    """Return the most plausible candidate that reduces the residual to a fifth, or None."""
     calm = [x for x in found if x.name in _SMOOTH_CAUSES]
     calm = [x for x in calm if x.state.loudness < _FIFTH * state.loudness]
     least = min([x.state.loudness for x in calm], default=0.0)
@@ -158,7 +146,6 @@ def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | N
 
 
 def _phases(state: State, found: list[Candidate]) -> State | None:
-    """Replace a contact that halves the residual by changes of load and offsets that explain it."""
     for candidate in found:
         if candidate.name == "contact" and candidate.state.loudness < _HALF * state.loudness:
             return phases(candidate.state)
@@ -166,22 +153,18 @@ def _phases(state: State, found: list[Candidate]) -> State | None:
 
 
 def _effective(candidate: Candidate, state: State) -> bool:
-    """Whether the residual shrinks or becomes more like noise, and not its likelihood alone."""
     other = candidate.state
     smaller = other.loudness < _SMALLER * state.loudness
     if candidate.name == "cable":
-        return smaller  # its force is far above the noise
+        return smaller  # the force of a cable far exceeds the noise
     if candidate.name not in _STEPS and other.loudness > _LARGER * state.loudness:
-        return False  # coloured noise explains the residual that the candidate makes
+        return False  # the candidate increases the residual, and coloured noise predicts it
     better = smaller or other.probe < _SMALLER * state.probe
     return bool(better or negative(state) or candidate.score > _CERTAIN)
 
 
 def _winner(found: list[Candidate]) -> Candidate | None:
-    """The most plausible of the candidates with nearly the best score.
-
-    What it leaves has to be small for its score: a large misfit resembles many causes a little.
-    """
+    """Return the most plausible candidate with nearly the best score and a small misfit."""
     best = max([x.score for x in found], default=0.0)
     if best < _NAMED:
         return None

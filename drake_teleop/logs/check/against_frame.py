@@ -1,4 +1,4 @@
-"""Whether the poses are of the sensor's frame, from the wrench."""
+"""Frame of the poses, checked with the wrench."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.read_off import ReadOff
 
 SHORTEST = 4.0
-"""Records below have too few frequencies to tell [s]."""
-# A unit of the positions that is wrong, and centres of mass that no load has [m].
+"""Shorter records have too few frequencies [s]."""
+# Limit for the unit of the positions; plausible distances of a centre of mass [m].
 _UNIT, _NEAREST, _FARTHEST = 0.1, 2e-4, 1.5
 _TORQUE_UNITS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(TORQUES, 2))
 _SAME = 0.03
@@ -28,19 +28,12 @@ _OBLIQUE = 10.0
 
 
 def usable(log: Log) -> bool:
-    """Whether poses alone tell the motion of a log, for long enough."""
+    """Return whether the poses of a log suffice for its motion."""
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST
 
 
 def against_frame(wrench: Wrench, pose: Pose, log: Log, delay: float) -> list[Finding]:
-    """That the wrench has mirrored axes or other units, or the poses are of another frame than S.
-
-    Args:
-        wrench: as described.
-        pose: likewise.
-        log: the whole log, in which nothing else is wrong.
-        delay: of the motion behind the wrench, nearly [s].
-    """
+    """Return findings for mirrored axes, other units of the wrench, or another frame of the poses."""
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 
     if log.posed is None or not usable(log):
@@ -55,15 +48,12 @@ def against_frame(wrench: Wrench, pose: Pose, log: Log, delay: float) -> list[Fi
 
 
 def _of_position(pose: Pose, seen: ReadOff) -> Finding | None:
-    """That the positions are in another unit; noise in them makes `kappa` less than 1 as well."""
     if pose.position is None or not seen.usable or seen.mirrored:
         return None
     return position_unit(pose.position.unit, seen.kappa, seen.kappa_deviation)
 
 
 def _of_wrench(wrench: Wrench, seen: ReadOff) -> Finding | None:
-    """What the saturated model says of the wrench; a shift along the centre of mass says the same
-    as a wrong unit, and is the less likely of the two."""
     if not seen.usable or abs(seen.kappa - 1.0) > _UNIT:
         return None
     if seen.mirrored:
@@ -80,15 +70,7 @@ def _of_wrench(wrench: Wrench, seen: ReadOff) -> Finding | None:
 
 
 def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
-    """The shift and the turn, and the lines that say so; None without either.
-
-    Nothing where something else is wrong with the description: a unit of the positions, axes that
-    are mirrored, or a unit of the torque, which puts the centre of mass anywhere.
-
-    Args:
-        found: of the poses as they were described.
-        posed: how that was.
-    """
+    """Return the finding for a displaced or rotated pose frame, unless another error is likely."""
     frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
     if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
         return None
@@ -113,12 +95,10 @@ def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
 
 
 def _torque_unit(com: np.ndarray, shift: np.ndarray) -> bool:
-    """Whether a wrong unit of the torque explains the shift: com is the torque's, with it."""
     size = float(np.linalg.norm(com))
     off = [np.linalg.norm(com - unit * (com - shift)) for unit in _TORQUE_UNITS]
     return not _NEAREST < size < _FARTHEST or bool(min(off) < _SAME * size)
 
 
 def _written(x: np.ndarray) -> list:
-    """To four digits, without -0.0."""
     return list((np.round(x, 4) + 0.0).tolist())

@@ -1,4 +1,4 @@
-"""The wrench against Eqs. (1)-(2): edits of the description with which some load explains it."""
+"""Edits of the description with which a load explains the wrench, Eqs. (1)-(2)."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from drake_teleop.logs.read.delay import SEARCH_RANGE, estimate_delay
 from drake_teleop.logs.read.description import Description
 
 HARDLY = 0.9
-"""A load that leaves more than this share of the wrench's variance drowns in the rest."""
+"""Unexplained share of the wrench's variance above which a load is undetermined."""
 LAG = 0.002
-"""Delays below this are not mentioned [s]."""
+"""Shorter delays are not reported [s]."""
 
 
 def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
-    """Findings about wrench, orientation and clocks from the load, and the delay."""
+    """Return findings about wrench, orientation and clocks, and the delay."""
     log = data.read(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.thin(description)
 
     def fitted(edited: Description) -> LoadFit:
-        # A delay that was estimated under a wrong description may be wrong too.
+        # A wrong description may cause a wrong delay.
         log = _rewrenched(thin, description, edited) or data.thin(edited)
         fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fitted(description)
-    # Slow motion fits well enough with a wrong clock, but not with a delay within the range.
+    # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.good and inside):
@@ -56,7 +56,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
         fit = tried(fitted, edited)
         if fit is not None and fit.mass > 0:
             found.append((fit, finding, edited))
-    # A negative mass is impossible: then it is enough to be as good with a positive one.
+    # A negative mass is impossible: an equally good fit with a positive one suffices.
     limit = (
         given.unexplained * 1.01 if given.mass < 0 else given.unexplained / decisive_factor(given)
     )
@@ -70,7 +70,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
     delay = None if log.static else estimate_delay(data.read(edited), 30.0)
-    if finding is None:  # The clock of the wrench, which the edit set to the nearest 20 ms.
+    if finding is None:  # The edit shifted the clock of the wrench to the nearest 20 ms.
         assert description.wrench is not None and edited.wrench is not None
         shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
         return lag_finding(description, shift), shift
@@ -80,7 +80,6 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
 
 
 def _shows(log: Log, delay: float | None) -> bool:
-    """Whether the delay is five standard errors from none: twice a log likelihood ratio of 25."""
     if delay is None:
         return False
     none, aligned = load_fit(log), load_fit(undelayed(log, delay))
@@ -89,7 +88,6 @@ def _shows(log: Log, delay: float | None) -> bool:
 
 
 def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
-    """The log of another description of the wrench, without reading it again; None if it must."""
     a, b = old.wrench, new.wrench
     if a is None or b is None or "base" in (a.frame, b.frame):
         return None
@@ -104,7 +102,7 @@ def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
     ):
         if set(force) != set(again) or len(force) != 3:
             return None
-        given = x @ R_old  # In the axes of the file.
+        given = x @ R_old  # in the axes of the file
         parts.append(given[:, [force.index(column) for column in again]] @ R_new.T)
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
@@ -112,7 +110,6 @@ def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
 def _without_remedy(
     description: Description, log: Log, given: LoadFit, delay: float | None
 ) -> tuple[list[Finding], float | None]:
-    """What is left to say of a wrench that no load explains and no edit mends."""
     smooth = low_passed(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
@@ -125,21 +122,14 @@ def _without_remedy(
     if delay is None or unexplained_share(wrench, residual) > BELIEVABLE + given.noise:
         return [], None
     if fit.rejected.any():
-        # A contact pulls at the delay.
+        # Contacts bias the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)
     return lag_finding(description, delay), delay
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """That a record says nothing about the mass of a load, if so.
-
-    Args:
-        load: what was fitted.
-        unexplained: share of the wrench's variance that it leaves, besides noise. With 0.9 the
-            rest (contacts, with the sensor's cross-talk and drift) is at least three times as large
-            as the load's part, and a robust fit believes the samples that suit it.
-    """
+    """Return a finding if a record does not determine the mass of a load."""
     if load.verdicts[6] != "not" and unexplained < HARDLY:
         return None
     deviation = float(load.standard_deviations[6])
@@ -155,7 +145,6 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
 
 
 def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
-    """The clock of the wrench shifted within 2 s, or a quarter of the record, to the best fit."""
     if description.wrench is None:
         return
     reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
@@ -175,7 +164,7 @@ def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Descrip
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    """Return what to change if the motion is `delay` seconds behind the wrench."""
+    """Return the remedy if the motion is `delay` seconds behind the wrench."""
     if delay is None or abs(delay) <= LAG or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

@@ -1,4 +1,4 @@
-"""The IMU against the motion of the pose: edits that make the two agree."""
+"""IMU compared with the motion of the pose."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 def against_pose(
     description: Description, data: LogData
 ) -> tuple[list[Finding], Mounting | None, Description]:
-    """Findings about the IMU, its mounting, and the description with them taken into account."""
+    """Return findings about the IMU, its mounting, and the corrected description."""
 
     def mounting(edited: Description) -> Mounting | None:
         pose_alone = edited.model_copy(update={"imu": None})
@@ -35,8 +35,8 @@ def against_pose(
         if given.mirrored:
             better = [entry for entry in better if entry[3].angle_deg < 10]
         elif given.angle_deg > 10 and given.unexplained < BELIEVABLE:
-            # About one axis an inverted orientation looks like a turned IMU: the edit that leaves
-            # the IMU where it was said to be is the simpler explanation.
+            # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
+            # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[3].angle_deg < 10]
             limit = min(BELIEVABLE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
@@ -85,7 +85,6 @@ def against_pose(
 
 
 def _imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
-    """What is wrong with the clock of the IMU, and the description without it."""
     assert description.imu is not None and description.wrench is not None
     time = description.imu.time
     if not found.drift:

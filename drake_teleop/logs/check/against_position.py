@@ -1,4 +1,4 @@
-"""The accelerometer against the pose's positions, which nothing else uses beside an IMU."""
+"""Accelerometer compared with the pose's positions."""
 
 from __future__ import annotations
 
@@ -19,14 +19,9 @@ _FAR = 50.0
 
 
 def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
-    """That the positions are in another unit, or of a point that is not S.
+    """Return a finding for positions in another unit, or of another point than So.
 
     In S, a_P = k (a_S + alpha x r + omega x (omega x r)) with the unit k and the point r.
-
-    Args:
-        description: of the log, in which nothing else is wrong with the IMU.
-        data: of the log.
-        lag: of the IMU behind the pose [s].
     """
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
@@ -37,7 +32,7 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
     posed = data.thin(description.model_copy(update={"imu": None}))
     if sensed.gravity is None or posed.gravity is None:
         return []
-    # Each log begins with the wrench, so that the times are the same clock's.
+    # Both logs begin with the wrench, so that their times are on one clock.
     t = sensed.t[(sensed.t + lag <= sensed.t[-1]) & (sensed.t + lag >= sensed.t[0])]
     t = t[(t >= posed.t[0]) & (t <= posed.t[-1])]
     g = resample(t, posed.t, posed.gravity)
@@ -71,20 +66,14 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
 
 
 def position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
-    """That the positions are in another unit, if so.
-
-    Args:
-        now: the unit that is described.
-        kappa: what accelerates by another instrument, over the same by the positions.
-        deviation: its standard deviation.
-    """
+    """Return a finding for positions in another unit; `kappa`: their acceleration's inverse ratio."""
     if not abs(kappa) > _SURE * deviation:
         return None
     text = f"the acceleration by the position is {1.0 / kappa:.3g} times what is felt: it is not in"
     for unit, ratio in _UNITS.items():
         if unit != now and _NEAR[0] < kappa / ratio < _NEAR[1]:
             return Finding("units", f"{text} {now}; set pose.position.unit: {unit}")
-    if 1.0 / _FAR < abs(kappa) < _FAR:  # Noise, or something else that is wrong.
+    if 1.0 / _FAR < abs(kappa) < _FAR:  # noise or another error
         return None
     return Finding(
         "units",

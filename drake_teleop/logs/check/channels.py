@@ -1,4 +1,4 @@
-"""Channels of wrench and IMU that are dead, or stand twice where two should stand."""
+"""Dead and repeated channels of wrench and IMU."""
 
 from __future__ import annotations
 
@@ -25,16 +25,9 @@ _NOISY = 1e-6
 def channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """What is wrong with single channels; nothing else of them can be judged before it is mended.
+    """Return findings about single channels of "wrench" or "imu", which invalidate further checks.
 
-    A constant is dead only beside a channel of the same instrument that has noise: in a simulated
-    log a channel may be constant for good reasons. Two columns of numbers that are the same in all
-    rows are one column, in a simulated log as well.
-
-    Args:
-        stream: "wrench" or "imu".
-        description: of the log.
-        tables: its files by `source`, all of them.
+    A constant channel is dead only beside a noisy one: simulated channels may be constant.
     """
     described = getattr(description, stream)
     found: list[Finding] = []
@@ -60,7 +53,6 @@ def _numbers(table: Table, columns: Any, where: str) -> dict[str, NDArray[np.flo
 
 
 def _named_twice(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
-    """Of one quantity, or of two; `named` is where columns stood so far."""
     found = []
     for column, times in Counter(map(str, columns)).items():
         before = where if times > 1 else named.get(column)

@@ -1,9 +1,7 @@
-"""Errors of convention in a log, found by what they do to the laws of motion.
+"""Errors of convention in a log, found by the laws of motion.
 
-Every suspicion is an edit of the description (`edits`). The log is read again with it, thinned to
-about 100 Hz (`log_data`), and the edit is named only if the data then agree decisively better: with
-Eqs. (1)-(2) for some load (`against_load`), or, of the IMU, with the motion of the pose
-(`against_pose`). Nothing is changed in the log; a finding says what to change.
+Each suspicion is an edit of the description (`edits`). It is reported only if the data agree
+decisively better with it: with Eqs. (1)-(2) for some load, or, of an IMU, with the poses.
 """
 
 from __future__ import annotations
@@ -38,18 +36,18 @@ from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 _STILL = 0.3, 0.1
-"""Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""
-_SAME = 1e-6  # share of the largest reading by which a wrench changes that is read and not repeated
+"""Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
+_SAME = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """What the data say about a description.
+    """Result of the checks of a description.
 
     Args:
-        findings: the suspected errors.
-        fit: of a load, to the description as given but for what is wrong with the IMU.
-        mounting: of the IMU against the pose, if both are there and move enough.
+        findings: suspected errors.
+        fit: of a load, apart from errors of the IMU.
+        mounting: of the IMU against the pose, if determined.
         delay_s: of the motion behind the wrench, if determined [s].
     """
 
@@ -60,7 +58,7 @@ class Conventions:
 
 
 def check_log(path: Path) -> Conventions:
-    """`check_conventions` of a canonical log or a log description, arguments as `read_log`.
+    """Check a canonical log or a log description.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -74,23 +72,17 @@ def check_log(path: Path) -> Conventions:
 def question_fit(
     path: Path, log: Log, load: Identification, predicted: NDArray[np.float64], delay: float | None
 ) -> tuple[Finding, ...]:
-    """What `check_log` says of a log, if what was identified from it looks wrong; else nothing.
+    """Return the findings, except "lag", of a log whose identified load is suspicious.
 
     Args:
-        path: the log's file.
-        log: the samples that were used.
-        load: what was identified.
-        predicted: (N, 6) the wrench according to it.
-        delay: what was taken out [s]; None if it could not be estimated.
-
-    Returns:
-        the findings but for "lag", which identification takes out; "payload" in the figures of
-        this fit.
+        path: of the log.
+        log: used samples.
+        load: identified load.
+        predicted: (N, 6) wrench of that load.
+        delay: removed delay [s]; None if undetermined.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used as it is: the mass is negative, or a load
-            explains less than half of the wrench, or the accelerometer is in another unit, and a
-            finding says what to change.
+        DrakeTeleopError: if the result is worthless and a finding has a remedy.
     """
     if _never_changes(log):
         raise DrakeTeleopError(
@@ -102,7 +94,7 @@ def question_fit(
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < CLOCK)
     if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
-        # What a good fit hides; `check_log` takes longer than the fit.
+        # A good fit may hide errors, but `check_log` takes longer than the fit.
         return tuple(_findings(path, log))
     found = _findings(path, None)
     if any(finding.name == "payload" for finding in found):
@@ -131,17 +123,11 @@ def question_fit(
 
 
 def errors_of_motion(path: Path) -> tuple[Finding, ...]:
-    """Return the errors of the described motion that `check_log` finds."""
+    """Return the errors of the described motion."""
     return tuple(x for x in _findings(path, None) if x.name in OF_MOTION)
 
 
 def _findings(path: Path, doubted: Log | None) -> list[Finding]:
-    """What `check_log` says, if it can: the log was read, so that no failure of it is the log's.
-
-    Args:
-        path: of the log.
-        doubted: the samples that have to look wrong first; None if they do.
-    """
     with suppress(ValueError, ArithmeticError):
         if doubted is None or _doubted(path, doubted):
             return [finding for finding in check_log(path).findings if finding.name != "lag"]
@@ -149,7 +135,6 @@ def _findings(path: Path, doubted: Log | None) -> list[Finding]:
 
 
 def _check_moves(log: Log) -> None:
-    """Refuses a record at rest: any unit, axis and sign explains it as badly as any other."""
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
     if s < _STILL[0] and omega < _STILL[1]:
         seconds = log.t[-1] - log.t[0]
@@ -162,7 +147,6 @@ def _check_moves(log: Log) -> None:
 
 
 def _doubted(path: Path, log: Log) -> bool:
-    """Whether units or axes of wrench and IMU are questioned by the samples that were used."""
     if log.static or path.suffix.lower() in FORMATS:
         return False
     description = load_description(path)
@@ -175,21 +159,16 @@ def _doubted(path: Path, log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Compares the description with its data.
-
-    Args:
-        description: with absolute paths.
-        source: its file, for messages.
-        tables: its files, if they are read already.
+    """Compare the description with its data.
 
     Raises:
-        DrakeTeleopError: if the log cannot be read as it is described.
+        DrakeTeleopError: if the log cannot be read.
     """
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:
         return found
-    # A canonical table has no lines that could be changed.
+    # A canonical table has no description to edit.
     findings = (replace(f, message=f"{f.message} ({NO_YAML})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
@@ -203,10 +182,10 @@ def _check(data: LogData, description: Description) -> Conventions:
     if _never_changes(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
         return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
-    if "gravity" in log.free and log.described is not None:  # found once, not for each edit
+    if "gravity" in log.free and log.described is not None:  # determine it once, not for each edit
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
-    if dead:  # What that does to motion and load would be taken for something else.
+    if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
     findings = list(unit_findings(description, log))
     description = in_other_unit(description, log)
@@ -219,7 +198,7 @@ def _check(data: LogData, description: Description) -> Conventions:
     fit = load_fit(data.thin(description))
     if broken or (mounting is not None and mounting.mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
-    if "weight" in log.free:  # the checks below take the weight for the load's
+    if "weight" in log.free:  # the checks below require the weight of the load in the wrench
         return Conventions(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = drift_finding(description, data)
@@ -249,7 +228,7 @@ def _one_clock(
     mounting: Mounting | None,
     delay: float | None,
 ) -> list[Finding]:
-    """If IMU and wrench disagree with the pose by the same time, its clock is wrong, not theirs."""
+    """Merge two clock findings if IMU and wrench differ from the pose by the same time."""
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
         return findings

@@ -1,4 +1,4 @@
-"""A draft of a log description for a table whose columns nobody has described."""
+"""Draft of a log description for an unknown table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.logs.read.description import UNITS
 from drake_teleop.logs.read.tables import Table
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
-# How the names of vectors end, before the axis.
+# Ends of the names of vectors, before the axis.
 _VECTORS = {
     "force": "f|forces?",
     "torque": "t|m|tau|torques?|moment",
@@ -24,7 +24,7 @@ _VECTORS = {
     "orientation": "q|quat|quaternion|orientation",
     "position": "p|pos|position|translation",
 }
-# What the names of numbered columns are, and where in them the components of a vector.
+# Names of numbered columns, and positions of the components of a vector.
 _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
     r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)(f|ft)$": {
         "force": (0, 1, 2),
@@ -66,7 +66,7 @@ _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {r
 
 
 class _Found(NamedTuple):
-    """Columns of one kind, and the unit that stands in their names: "" if none does."""
+    """Columns of one kind, and the unit in their names ("" for none)."""
 
     columns: list[str]
     unit: str
@@ -76,15 +76,12 @@ _NOTHING = _Found([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
-    """A draft of a log description, guessed from names and magnitudes of a table's columns.
+    """Guess a log description (YAML) from names and magnitudes of a table's columns.
 
     Args:
         table: any table.
-        folder: where the draft will be, which its path to the table starts from.
-        header: whether the file holds their names.
-
-    Returns:
-        YAML text whose first line says that it is a draft, and what was not found.
+        folder: of the draft, start of the relative path to the table.
+        header: whether the file contains column names.
     """
     plain = {name: _plain(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
@@ -115,7 +112,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     if pose:
         draft["pose"] = stream(**pose)
     if not draft:
-        draft["wrench"] = wrench  # to begin with something
+        draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
@@ -139,7 +136,6 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
 
 
 def _plain(name: str) -> tuple[str, str]:
-    """A name in small letters, parts joined by _, and the unit that stands in brackets in it."""
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
@@ -150,7 +146,6 @@ def _base(plain: str) -> str:
 
 
 def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """By kind, the columns with x, y, z (w first) at the end of one and the same name."""
     found: dict[str, _Found] = {}
     for kind, names in _VECTORS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
@@ -169,7 +164,6 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
 
 
 def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """The same of columns whose names end with numbers; and of a matrix r11, r12 ... r33."""
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
@@ -189,7 +183,6 @@ def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
 
 
 def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """The same of arrays with several columns, which NPZ and MAT files hold, by their names."""
     found: dict[str, _Found] = {}
     arrays = _names_of_arrays(table)
     for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
@@ -207,17 +200,14 @@ def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found
 
 
 def _names_of_arrays(table: Table) -> list[str]:
-    """Of columns with several numbers in a row; without reading any, which Parquet leaves to us."""
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
 def _width(table: Table, found: _Found) -> int:
-    """How many numbers the columns have in a row."""
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
 def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
-    """Columns and unit of a vector: that of its name, or what its magnitude lets expect."""
     group: dict[str, Any] = {"columns": list(found.columns)}
     if found.unit:
         unit = _SAID.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
@@ -237,7 +227,6 @@ def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
 
 
 def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
-    """Orientation, and position if there is one."""
     if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif "matrix" in found:
@@ -254,10 +243,6 @@ def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
 
 
 def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
-    """The column of time: by its name, or the unit in that.
-
-    Of several, the first in the structure of a column that it goes with, or else of as many rows.
-    """
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
@@ -279,7 +264,6 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
 
 
 def _time_unit(table: Table, column: str) -> str:
-    """The unit in which the median step is between 50 us and 1 s, the longest such step."""
     step = float(np.median(np.abs(np.diff(table.single(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:

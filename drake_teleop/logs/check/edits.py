@@ -1,4 +1,4 @@
-"""Edits of a description: each would put one suspected error of convention right."""
+"""Edits of a description, each of which corrects one suspected error."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _gravity_field(description: Description) -> str | None:
 
 
 def unit_findings(description: Description, log: Log) -> Iterator[Finding]:
-    """That an accelerometer, or gravity at rest, is not in the unit that is given, if so."""
+    """Yield a finding for an accelerometer in another unit."""
     field = _gravity_field(description)
     unit = None if field is None else _right_unit(description, log, field)
     if field is None or unit is None:
@@ -39,7 +39,7 @@ def unit_findings(description: Description, log: Log) -> Iterator[Finding]:
 
 
 def in_other_unit(description: Description, log: Log) -> Description:
-    """The description with that unit exchanged."""
+    """Return the description with that unit corrected."""
     field = _gravity_field(description)
     unit = None if field is None else _right_unit(description, log, field)
     return description if unit is None else edit_field(description, f"{field}.unit", unit)
@@ -51,10 +51,6 @@ def _over_gravity(description: Description, log: Log) -> float:
 
 
 def _right_unit(description: Description, log: Log, field: str) -> str | None:
-    """The unit in which the median is gravity, if it is not the one that is given.
-
-    Units are 9.81 or more apart; a median that far from gravity is no motion.
-    """
     given = _field(description, field).unit
     number = _over_gravity(description, log) / description.scale(given)
     for unit in ("m/s^2", "g", "mm/s^2"):
@@ -71,7 +67,7 @@ def _field(description: Description, path: str) -> Any:
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
-    """The description with one field changed."""
+    """Return the description with one field changed."""
     first, *rest = path.split(".", 1)
     if rest:
         model: Any = getattr(description, first)
@@ -80,11 +76,11 @@ def edit_field(description: Description, path: str, value: Any) -> Description:
 
 
 Edit = tuple[Finding, Description]
-"""What was seen, and the description without it."""
+"""Finding, and the corrected description."""
 
 
 def pose_edits(description: Description) -> Iterator[Edit]:
-    """Orientations in another form, gravity or an accelerometer that point the other way."""
+    """Yield other forms of orientation and reversed gravity."""
     pose, imu = description.pose, description.imu
     if imu is not None and imu.specific_force is not None:
         yield (
@@ -139,7 +135,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
 
 
 def tried(function: Callable[[Description], Any], edited: Description) -> Any:
-    """What the function makes of an edited description; None if such a log cannot be read."""
+    """Return the result for an edited description; None if it cannot be read."""
     try:
         return function(edited)
     except DrakeTeleopError:
@@ -147,7 +143,7 @@ def tried(function: Callable[[Description], Any], edited: Description) -> Any:
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """A wrench of the other sign or in other axes, other units of the motion, and `pose_edits`."""
+    """Yield other signs, axes and units of wrench and motion, and `pose_edits`."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     yield (

@@ -1,4 +1,4 @@
-"""Something suspicious in a log, and what to change in its description."""
+"""Suspicious property of a log."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ OF_MOTION = (
 )
 """Errors of the described motion, which resemble causes."""
 CLOCK = 0.05
-"""Larger disagreements of clocks are no lag of a filter, but of the clocks [s]."""
+"""Larger delays are errors of a clock, not the lag of a filter [s]."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something suspicious in a log.
+    """Suspicious property of a log.
 
     Args:
-        name: what it is, in one word for programs: "sign", "units" ...
-        message: what was seen and what to change.
+        name: category for programs: "sign", "units" ...
+        message: observation and remedy.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Least squares of channels that have an offset each."""
+"""Least squares of channels with one offset each."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ _WORST_CONDITION = 1e8
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Coefficients and their standard deviations, (k,) both."""
+    """Coefficients and their standard deviations, both (k,)."""
 
     x: Array
     deviations: Array
 
 
 def fit_with_offset(columns: Array, target: Array, independent: float) -> Fit | None:
-    """The coefficients x of columns x + offsets = target; None if they are not determined.
+    """Solve columns x + offsets = target; return None if x is undetermined.
 
     Args:
         columns: (N, c, k).
-        target: (N, c)
-        independent: how many of the N rows say something new.
+        target: (N, c).
+        independent: number of independent rows.
     """
     if len(columns) == 0:
         return None

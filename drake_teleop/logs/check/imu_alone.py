@@ -1,8 +1,7 @@
-"""The IMU against itself: its three quantities are bound to each other, whatever the load is.
+"""Consistency of the three quantities of an IMU.
 
 - The angular acceleration is the derivative of the angular velocity.
-- Turned back by the gyroscope for a few seconds, the specific force is in the mean minus gravity:
-  what is accelerated is braked.
+- Rotated back by the gyroscope for a few seconds, the mean specific force is minus gravity.
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ from drake_teleop.logs.read.rotations import rotation_matrices
 
 Array = NDArray[np.float64]
 DEGREES = (40.0, 80.0)
-"""Ratios of two speeds that only degrees explain: 180 / pi, but for noise and gains."""
+"""Range of the ratio 180 / pi of two speeds with noise and gain errors."""
 OFF = 0.02
-"""Gravity is questioned from 2 % on; one sensor in its first calibration is within 1 %."""
+"""Smallest reported error of gravity; calibrated sensors are within 1 %."""
 _SURE = 5.0
 _ALIKE = 0.8
 _BAND_HZ = 5.0
@@ -34,12 +33,7 @@ _TURNING_HZ, _STRAY, _CLEARLY = 25.0, 0.05, 3.0
 
 
 def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Findings about an IMU, and the description without what they name, as far as it can say so.
-
-    Args:
-        description: of the log.
-        log: about 100 Hz of it.
-    """
+    """Return findings about an IMU, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
         return [], description
@@ -63,7 +57,6 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
 
 
 def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
-    """Degrees where radians are declared, or the other way round: finding, field and unit."""
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
@@ -91,12 +84,7 @@ def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
-    """Whether the gyroscope's axes are others than the accelerometer's, and its columns in order.
-
-    Of the 48 ways to name and sign three axes another has to bring the mean specific force of
-    windows `_CLEARLY` times as near to gravity, and to that of the next window, as the one that is
-    described does.
-    """
+    """Return a finding for axes of the gyroscope that differ from the accelerometer."""
     assert imu.angular_velocity is not None
     few = log.only(slice(None, None, max(1, round(1.0 / (_TURNING_HZ * log.dt)))))
     given = _astray(few, np.eye(3), gravity)
@@ -124,7 +112,6 @@ def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | Non
 
 
 def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
-    """Whether the angular acceleration is in other axes than the gyroscope, which are right."""
     if imu.angular_acceleration is None:
         return None
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
@@ -160,7 +147,7 @@ class MeanGravity:
 
 
 def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
-    """From the mean of each window; None if the record is too short."""
+    """Return the ratio from all windows; None if the record is too short."""
     forces = _mean_forces(log, np.eye(3))[0]
     if len(forces) < _FEWEST:
         return None
@@ -169,15 +156,7 @@ def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
 
 
 def _mean_forces(log: Log, P: Array) -> Array:
-    """Mean specific force of windows, (2, n, 3) [m/s^2]: of each, and of it half its length later.
-
-    Both are turned back to the window's start by the gyroscope, and weighed by a Hann window, so
-    that a motion that stays in place counts for little. n is 0 if the record is too short.
-
-    Args:
-        log: of even steps.
-        P: (3, 3) the right angular velocity over that of the log.
-    """
+    """(2, n, 3) Hann-weighted mean specific force of windows, and half a window later [m/s^2]."""
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
@@ -197,7 +176,7 @@ def _mean_forces(log: Log, P: Array) -> Array:
 
 
 def _astray(log: Log, P: Array, gravity: float) -> float:
-    """How far the means are from gravity, and from each other [rms, of gravity]; nan without."""
+    """Return the rms distance of the means from gravity and from each other."""
     means = _mean_forces(log, P) / gravity
     if means.shape[1] == 0:
         return np.nan
@@ -206,7 +185,6 @@ def _astray(log: Log, P: Array, gravity: float) -> float:
 
 
 def _gravity(imu: Imu, log: Log, gravity: float) -> Finding | None:
-    """That the accelerometer reads another gravity than is described, in a unit that is right."""
     found = mean_gravity(log, gravity)
     if found is None or not 0.7 < found.ratio < 1.4:
         return None

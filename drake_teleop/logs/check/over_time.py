@@ -1,4 +1,4 @@
-"""A clock of the motion that runs faster or slower than that of the wrench, told by the load."""
+"""Clock drift between motion and wrench, from the load."""
 
 from __future__ import annotations
 
@@ -18,16 +18,12 @@ from drake_teleop.logs.read.description import Description
 
 PARTS, _FEWEST = 8, 4
 _LEAST, _CROOKED = 0.03, 0.15
-"""A delay that changes by less [s] is no clock, nor one that strays from a line by this share."""
+"""Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
 _BETTER = 0.5
 
 
 def drift_finding(description: Description, data: LogData) -> tuple[list[Finding], Description]:
-    """That the delay grows steadily, and the description without that.
-
-    IMU and pose are compared with each other elsewhere; this is for the motion of one stream. The
-    finding has to halve what a load leaves unexplained, each time with the best constant delay.
-    """
+    """Return a finding for a steadily growing delay, and the corrected description."""
     name = "imu" if description.pose is None else "pose"
     stream = getattr(description, name)
     if stream is None or description.wrench is None or (description.imu and description.pose):
@@ -55,7 +51,6 @@ def drift_finding(description: Description, data: LogData) -> tuple[list[Finding
 
 
 def _line(log: Log) -> tuple[float, float] | None:
-    """Delay at the start [s] and its slope, if it lies on a line that is steep enough."""
     span = float(log.t[-1] - log.t[0])
     edges = np.linspace(0, len(log), PARTS + 1).astype(int)
     found = []
@@ -76,7 +71,6 @@ def _line(log: Log) -> tuple[float, float] | None:
 
 
 def _left(log: Log) -> float:
-    """The share of the wrench that a load leaves, with the best constant delay."""
     try:
         return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
     except DrakeTeleopError:

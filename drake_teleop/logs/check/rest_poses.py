@@ -1,4 +1,4 @@
-"""Whether poses at rest are enough, and different enough."""
+"""Number and variety of poses at rest."""
 
 from __future__ import annotations
 
@@ -8,17 +8,13 @@ from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.read.canonical import Log
 
 ENOUGH = 6
-"""Fewer poses leave nothing to check a fit by."""
+"""Fewest poses that allow a check of the fit."""
 SPREAD = 0.15
-"""Least deviation of the direction of gravity of poses that tell offsets from a load."""
+"""Smallest deviation of gravity's direction that separates offsets from a load."""
 
 
 def rest_finding(log: Log) -> Finding | None:
-    """That there are too few poses, or that they are too alike, if so.
-
-    Args:
-        log: of poses at rest; another one is not looked at.
-    """
+    """Return a finding for too few or too similar poses at rest."""
     if not log.static:
         return None
     if len(log) < ENOUGH:

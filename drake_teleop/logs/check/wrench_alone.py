@@ -1,11 +1,7 @@
-"""The wrench against the motion, without one load for both force and torque.
+"""Axes and units of a wrench, without one load for both force and torque.
 
-- Force is linear in the specific force, whatever the frames and axes are: f = m Q s + what angular
-  motion adds. Q = 1 if wrench and motion are in the same axes; det Q = -1 if axes are mirrored.
-- m c follows from the force alone, of angular motion, and from the torque alone, of the specific
-  force. Their ratio is the ratio of the units of torque and force.
-
-No load fit shows either for sure: a wrong unit of the torque leaves hardly anything unexplained.
+Force is linear in the specific force in any axes. m c follows from force and from torque; the
+ratio is that of their units.
 """
 
 from __future__ import annotations
@@ -38,14 +34,7 @@ FORCES, TORQUES = ("N", "lbf"), ("N m", "N mm", "lbf in")
 def wrench_findings(
     description: Description, log: Log, delays: tuple[float, ...] = (0.0,)
 ) -> tuple[list[Finding], Description]:
-    """A unit or axes of the wrench that are wrong, and the description without that.
-
-    Args:
-        description: of the log, in which the motion is right.
-        log: about 100 Hz of it.
-        delays: of which one is that of the motion behind the wrench, nearly [s]; what fits a load
-            best is none where axes are mirrored and no load fits.
-    """
+    """Return findings for unit or axes of the wrench, and the corrected description."""
     wrench = description.wrench
     if wrench is None or wrench.frame == "base" or log.static:
         return [], description
@@ -66,8 +55,7 @@ def _smooth(log: Log) -> Log:
 
 
 def _force_by_motion(log: Log, independent: float) -> tuple[Array, float]:
-    """Force over specific force (3, 3) whatever the axes are, and its deviation [kg]; inf if none
-    is determined."""
+    """Return force over specific force (3, 3) and its deviation [kg]."""
     s, omega, alpha = log.motion
     squares = np.stack([omega[:, i] * omega[:, k] for i in range(3) for k in range(i, 3)], axis=1)
     columns = np.hstack([s, alpha, squares])
@@ -80,7 +68,6 @@ def _force_by_motion(log: Log, independent: float) -> tuple[Array, float]:
 
 
 def _axes(description: Description, wrench: Wrench, M: Array, deviation: float) -> Finding | None:
-    """From the force over the specific force, and its deviation."""
     U, masses, Vt = np.linalg.svd(M)
     mass = float(masses.mean())
     if deviation >= _KNOWN * mass or masses[0] - masses[2] > _SPREAD * mass:
@@ -93,7 +80,7 @@ def _axes(description: Description, wrench: Wrench, M: Array, deviation: float) 
         return mirrored_finding(wrench, near) if mirrored else None
     sure = np.degrees(_SURE * deviation / mass)
     if angle < max(_OBLIQUE, sure) or (description.imu is None and description.pose is not None):
-        return None  # The frame of poses alone is `against_frame`'s.
+        return None  # `against_frame` checks the frame of poses without an IMU.
     right_angled = oblique < _OBLIQUE
     old = np.array(wrench.frame) if isinstance(wrench.frame, tuple) else np.eye(3)
     frame = np.round((near if right_angled else Q).T @ old, 4) + 0.0
@@ -109,7 +96,7 @@ def _angle(R: Array) -> float:
 
 
 def mirrored_finding(wrench: Wrench, near: Array) -> Finding:
-    """Of axes that a signed permutation mirrors: the lines if only one sign is wrong."""
+    """Return the finding for mirrored axes, with the columns of wrong sign."""
     order, signs = np.abs(near).argmax(axis=1), near.sum(axis=1)
     text = "the axes of the wrench are those of the motion mirrored"
     columns = wrench.force.columns, wrench.torque.columns
@@ -131,7 +118,6 @@ def mirrored_finding(wrench: Wrench, near: Array) -> Finding:
 def _unit(
     wrench: Wrench, log: Log, independent: float
 ) -> tuple[Finding, Callable[[Description], Description]] | None:
-    """Units of force and torque that are wrong, and the edit."""
     V = regressor(*log.motion)
     force = fit_with_offset(V[:, :3, :4], log.wrench[:, :3], independent)
     torque = fit_with_offset(V[:, 3:, 1:], log.wrench[:, 3:], independent)
@@ -164,16 +150,13 @@ def _norm(x: Array) -> float:
 def other_units(
     wrench: Wrench, mass: float, moments: tuple[Array, Array], deviations: tuple[float, float]
 ) -> tuple[Finding, dict[str, str]] | None:
-    """The units of force and torque that make one centre of mass of two, if others do.
+    """Return the finding, and the units of force and torque that make both centres of mass equal.
 
     Args:
         wrench: as described.
-        mass: by the force, in the unit that was described [kg].
-        moments: m c by the force, and by the torque, of any shape but the same [kg m].
+        mass: from the force, in the described unit [kg].
+        moments: m c from the force, and from the torque [kg m].
         deviations: standard deviations of their lengths.
-
-    Returns:
-        the finding, and the unit of each field to change; none if it is of no unit that is known.
     """
     by_force, by_torque = moments
     size = _norm(by_torque)
@@ -206,10 +189,6 @@ def other_units(
 def _unknown_unit(
     now: Mapping[str, str], both: tuple[Array, Array], deviation: float
 ) -> Finding | None:
-    """Of a centre of mass in one direction, but `_FAR` times as far by the one as by the other.
-
-    A shorter way may be where the poses are of another place.
-    """
     by_force, by_torque = both
     size, torque = _norm(by_force), _norm(by_torque)
     if deviation > _KNOWN * size or float(np.sum(by_force * by_torque)) < _PARALLEL * size * torque:
