@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.conventions import check_log
+from drake_teleop.logs.processing import check_log
 
 Array = NDArray[np.float64]
 SPAN = 24.0

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.description import NO_YAML, UNITS, Description
 from drake_teleop.logs.read.tables import FORMATS
 
 Fields = dict[str, Any]
@@ -23,6 +23,9 @@ Fields = dict[str, Any]
 _HEAVIEST_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
+_FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
+_FORCE_UNITS, _TORQUE_UNITS = ("N", "lbf"), ("N m", "N mm", "lbf in")
+_SAME_RATIO = 1e-3
 _PLACES = ("pose.position_in_sensor", "imu.position")
 _TURNS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
 _DIGITS = {_GRAVITY: 4, _PLACES[0]: 5, _PLACES[1]: 5}
@@ -93,6 +96,8 @@ def _fields(description: Description, by_pose: bool) -> Fields:
         _FRAME: frame if isinstance(frame, str) else np.array(frame),
         _FORCE: np.array(wrench.force.scale),
         _TORQUE: np.array(wrench.torque.scale),
+        _FORCE_UNIT: wrench.force.unit,
+        _TORQUE_UNIT: wrench.torque.unit,
         _WEIGHT: weight if isinstance(weight, str) else np.array(weight),
         _GRAVITY: description.gravity_W,
     }
@@ -156,6 +161,14 @@ def _removed(fields: Fields, values: dict[str, Any]) -> None:
 
 
 def _factor(fields: Fields, values: dict[str, Any]) -> None:
+    """Exchange the unit of torque or force if that explains the factor, otherwise scale."""
+    force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
+    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
+    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]
+    for ratio, name, unit in ratios:
+        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
+            fields[name] = unit
+            return
     fields[_TORQUE] = fields[_TORQUE] / values["factor"]
 
 

@@ -13,7 +13,7 @@ from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
 from drake_teleop.logs.read.alignment import undelayed

@@ -30,12 +30,11 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.writing import make_folder, output_folder, write_json, write_text
-from drake_teleop.logs.check.against_load import lag_finding
-from drake_teleop.logs.check.conventions import Conventions, check_conventions
+from drake_teleop.logs.check.conventions import check_conventions
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import draft_description
-from drake_teleop.logs.check.finding import EFFECTS, Finding
 from drake_teleop.logs.check.load_fit import white_noise
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
@@ -47,8 +46,6 @@ BANDWIDTH = 30.0
 REPEATED = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `BLOCK` rows."""
 BLOCK = 5
-_SIGNIFICANT = 5.0
-"""Smallest reported delay, in standard deviations."""
 _QUANTITIES = (
     "force",
     "torque",
@@ -168,12 +165,12 @@ def _inspect(
         if stream is not None and stream.time.column is not None:
             clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
     try:
-        found = check_conventions(description, source, clean)
+        found = check_log(Path(source), check_conventions(description, source, clean))
     except DrakeTeleopError as error:
         findings.append(Finding("unusable", str(error)))
     else:
-        more, summary["delay_s"] = _explained(description, source, found)
-        findings += more
+        findings += found.findings
+        summary["delay_s"] = found.delay_s
         summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
         if found.mounting is not None:
             summary["mounting"] = {
@@ -185,32 +182,6 @@ def _inspect(
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
-
-
-def _explained(
-    description: Description, source: str, found: Conventions
-) -> tuple[list[Finding], float | None]:
-    """Return findings and delay, of identification if it names causes or is more precise.
-
-    Other findings than errors of motion and axes may be effects of a cause.
-    """
-    findings, delay = list(found.findings), found.delay_s
-    try:
-        identified = identify_log(source)
-    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
-        return findings, delay
-    deviation = identified.delay_deviation_s
-    if identified.causes and all(finding.name in EFFECTS for finding in findings):
-        found_delay = identified.identification.delay_s if np.isfinite(deviation) else delay
-        return [Finding(cause.name, cause.message) for cause in identified.causes], found_delay
-    if identified.delay_source != "estimated" or not np.isfinite(deviation):
-        return findings, delay
-    findings = [finding for finding in findings if finding.name != "lag"]
-    if not findings:
-        delay = identified.identification.delay_s
-        if abs(delay) > _SIGNIFICANT * deviation:
-            findings += lag_finding(description, delay)
-    return findings, delay
 
 
 def _stream(

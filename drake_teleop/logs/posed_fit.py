@@ -13,8 +13,8 @@ from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.against_frame import frame_finding, usable
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.check.pose_checks import pose_finding, usable
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, widened
 from drake_teleop.logs.read.canonical import Log
@@ -65,9 +65,11 @@ def fit_posed(
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()
     found, source = motion_and_load(log, delay)
-    finding = None if log.free else frame_finding(found, log.posed)
-    if log.posed.imu is not None and not (found.imu_agrees and finding is None):
-        return None, () if finding is None else (finding,)
+    finding = None if log.free else pose_finding(found, log)
+    if log.posed.imu is not None:
+        if not found.imu_agrees or (finding is not None and not _is_sensor_rotated(found)):
+            return None, () if finding is None else (finding,)
+        finding = None  # the search of causes names the rotation
     moved, one_sided = moved_by_splines(_fewer(log, cutoff_hz), found)
     shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
@@ -82,6 +84,11 @@ def fit_posed(
             finding = replace(finding, message=f"{finding.message} ({NO_YAML})")
     findings = () if finding is None else (finding,)
     return PosedFit(shown, fit, found.delay_s, source, found), findings
+
+
+def _is_sensor_rotated(found: PoseEstimate) -> bool:
+    """Return whether the sensor is rotated against both the poses and the IMU."""
+    return found.frame.turned and not found.frame.shifted
 
 
 def _fewer(log: Log, cutoff_hz: float | None) -> Log:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,8 +25,14 @@ from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.cause_lines import doubted_force_unit
 from drake_teleop.logs.causes.cause import Cause, Stretch
-from drake_teleop.logs.check.conventions import check_log, errors_of_motion, question_fit
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.against_load import lag_finding
+from drake_teleop.logs.check.conventions import (
+    Conventions,
+    check_file,
+    errors_of_motion,
+    question_fit,
+)
+from drake_teleop.logs.check.corrections import EFFECTS, Finding
 from drake_teleop.logs.contact import (
     Detection,
     detect_contact,
@@ -50,6 +57,7 @@ _BY_GAINS = {"gain", "sensor rotation", "torque factor"}
 """Causes that are explained by stated errors of gains."""
 _CONSTANT = 1e-6  # largest relative change of a constant channel
 _FEWEST_TO_TARE = 10
+_SIGNIFICANT_DELAY = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 
 
@@ -140,6 +148,7 @@ def identify_log(
     method: str = DEFAULT_METHOD,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
+    checks: Conventions | None = None,
 ) -> IdentifiedLog:
     """Identify the load and the sensor's offsets from a log.
 
@@ -151,6 +160,7 @@ def identify_log(
         method: one of `drake_teleop.load.batch.methods.METHODS`.
         cutoff_hz: of the low-pass; None for none.
         delay: of the motion behind the wrench [s], or "auto".
+        checks: of this log, if already known.
 
     Raises:
         DrakeTeleopError: for an unusable log, an unknown method or a worthless result
@@ -158,11 +168,16 @@ def identify_log(
     """
     check_method(method)
     with one_blas_thread():
-        return _identified(path, method, cutoff_hz, delay)
+        check = partial(check_file, Path(path)) if checks is None else lambda: checks
+        return _identified(path, method, cutoff_hz, delay, check)
 
 
 def _identified(
-    path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
+    path: str | Path,
+    method: str,
+    cutoff_hz: float | None,
+    delay: str | float,
+    check: Callable[[], Conventions],
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
     as_read = log
@@ -194,7 +209,7 @@ def _identified(
     causes: tuple[Cause, ...] = ()
     errors: tuple[Finding, ...] = ()
     if why is not None and why.causes and why.misfit:
-        errors = errors_of_motion(Path(path))
+        errors = errors_of_motion(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -212,7 +227,7 @@ def _identified(
     if errors:
         findings = errors
     elif not causes and not raw.free:
-        findings = question_fit(Path(path), log, result, predicted, known_delay) or other
+        findings = question_fit(log, result, predicted, known_delay, check) or other
     doubt = doubted_force_unit(result.mass, causes, raw)
     if doubt is not None:
         findings = (*findings, Finding("units", doubt))
@@ -245,6 +260,42 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
     still = by_splines and not log.specific_force.any()
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     return still or 5.0 < weight < 20.0
+
+
+def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
+    """Check a log and its description, with the causes that identification finds.
+
+    Causes replace findings that may be their effects.
+
+    Args:
+        path: canonical table or log description.
+        checks: of the description without causes, if already known.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be read.
+    """
+    checks = check_file(path) if checks is None else checks
+    try:
+        identified = identify_log(path, checks=checks)
+    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
+        return checks
+    findings, delay = checks.findings, checks.delay_s
+    deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
+    if identified.causes and all(finding.name in EFFECTS for finding in findings):
+        causes = tuple(Finding(cause.name, cause.message) for cause in identified.causes)
+        return replace(
+            checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
+        )
+    if all(finding.name == "lag" for finding in findings):
+        findings = (*findings, *identified.findings)
+    description = identified.log.described
+    if identified.delay_source == "estimated" and np.isfinite(deviation) and description:
+        findings = tuple(finding for finding in findings if finding.name != "lag")
+        if not findings:
+            delay = own_delay
+            if abs(delay) > _SIGNIFICANT_DELAY * deviation:
+                findings = tuple(lag_finding(description, delay))
+    return replace(checks, findings=findings, delay_s=delay)
 
 
 def eliminate_log(

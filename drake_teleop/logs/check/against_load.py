@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.edits import edit_field, load_edits, tried
-from drake_teleop.logs.check.finding import CLOCK, Finding
+from drake_teleop.logs.check.corrections import CLOCK, Finding, edit_field, load_edits, tried
 from drake_teleop.logs.check.load_fit import (
     BELIEVABLE,
     LoadFit,
@@ -29,6 +30,10 @@ HARDLY = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
 LAG = 0.002
 """Shorter delays are not reported [s]."""
+_PARTS, _FEWEST_PARTS = 8, 4
+_SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
+"""Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
+_HALVED = 0.5
 
 
 def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
@@ -184,3 +189,58 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
             f" to say so in the description, add {delay:.4f} to wrench.time.offset",
         )
     ]
+
+
+def drift_finding(description: Description, data: LogData) -> tuple[list[Finding], Description]:
+    """Return a finding for a steadily growing delay, and the corrected description."""
+    name = "imu" if description.pose is None else "pose"
+    stream = getattr(description, name)
+    if stream is None or description.wrench is None or (description.imu and description.pose):
+        return [], description
+    log = data.thin(description)
+    line = _delay_line(log)
+    if line is None:
+        return [], description
+    late, slope = line
+    start = data.start(stream, description) - data.start(description.wrench, description)
+    scale = 1.0 / (1.0 + slope)
+    lag = scale * (late + slope * start)
+    offset, factor = stream.time.offset - lag, scale * stream.time.scale
+    edited = edit_field(description, f"{name}.time.offset", offset)
+    edited = edit_field(edited, f"{name}.time.scale", factor)
+    if _unexplained(data.thin(edited)) > _HALVED * _unexplained(log):
+        return [], description
+    finding = Finding(
+        "clock",
+        f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against that of the"
+        f" wrench; set {name}.time.offset: {offset:.3f}"
+        f" and {name}.time.scale: {factor:.6f}",
+    )
+    return [finding], edited
+
+
+def _delay_line(log: Log) -> tuple[float, float] | None:
+    span = float(log.t[-1] - log.t[0])
+    edges = np.linspace(0, len(log), _PARTS + 1).astype(int)
+    found = []
+    for a, b in pairwise(edges):
+        part = log.only(slice(int(a), int(b)))
+        delay = estimate_delay(part, 15.0)
+        if delay is not None:
+            found.append((0.5 * float(part.t[0] + part.t[-1]), delay))
+    if len(found) < _FEWEST_PARTS:
+        return None
+    t, delays = np.array(found).T
+    slope, late = np.polyfit(t, delays, 1)
+    change = abs(slope) * span
+    deviation = float(np.std(delays - late - slope * t))
+    if change < _SMALLEST_DRIFT_S or deviation > _LARGEST_DEVIATION * change or abs(slope) > 0.2:
+        return None
+    return float(late + slope * log.t[0]), float(slope)
+
+
+def _unexplained(log: Log) -> float:
+    try:
+        return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
+    except DrakeTeleopError:
+        return np.inf

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.tables import Table

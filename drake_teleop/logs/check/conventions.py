@@ -1,11 +1,13 @@
 """Errors of convention in a log, found by the laws of motion.
 
-Each suspicion is an edit of the description (`edits`). It is reported only if the data agree
-decisively better with it: with Eqs. (1)-(2) for some load, or, of an IMU, with the poses.
+Each suspicion is a correction of the description (`corrections`). It is reported only if the data
+agree decisively better with it: with Eqs. (1)-(2) for some load, or, of an IMU, with the poses.
+`drake_teleop.logs.causes` finds axes and units of the wrench and the frame of the poses.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,27 +18,30 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.against_frame import against_frame
-from drake_teleop.logs.check.against_load import against_load, payload_finding
-from drake_teleop.logs.check.against_pose import against_pose
-from drake_teleop.logs.check.against_position import position_finding
+from drake_teleop.logs.check.against_load import against_load, drift_finding, payload_finding
 from drake_teleop.logs.check.channels import channel_findings
-from drake_teleop.logs.check.edits import in_other_unit, unit_findings
-from drake_teleop.logs.check.finding import CLOCK, OF_MOTION, Finding
-from drake_teleop.logs.check.imu_alone import against_itself
+from drake_teleop.logs.check.corrections import (
+    CLOCK,
+    OF_MOTION,
+    Finding,
+    in_other_unit,
+    unit_findings,
+)
+from drake_teleop.logs.check.imu_checks import against_itself, against_pose
 from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.check.over_time import drift_finding
-from drake_teleop.logs.check.rest_poses import rest_finding
-from drake_teleop.logs.check.wrench_alone import wrench_findings
+from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import NO_YAML, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
 _STILL = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
+_FEWEST_POSES = 6
+"""Fewest poses that allow a check of the fit."""
+_SMALLEST_SPREAD = 0.15
+"""Smallest deviation of gravity's direction that separates offsets from a load."""
 _SAME = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
@@ -57,8 +62,8 @@ class Conventions:
     delay_s: float | None
 
 
-def check_log(path: Path) -> Conventions:
-    """Check a canonical log or a log description.
+def check_file(path: Path) -> Conventions:
+    """Compare a canonical log or a log description with its data.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -70,16 +75,20 @@ def check_log(path: Path) -> Conventions:
 
 
 def question_fit(
-    path: Path, log: Log, load: Identification, predicted: NDArray[np.float64], delay: float | None
+    log: Log,
+    load: Identification,
+    predicted: NDArray[np.float64],
+    delay: float | None,
+    check: Callable[[], Conventions],
 ) -> tuple[Finding, ...]:
     """Return the findings, except "lag", of a log whose identified load is suspicious.
 
     Args:
-        path: of the log.
         log: used samples.
         load: identified load.
         predicted: (N, 6) wrench of that load.
         delay: removed delay [s]; None if undetermined.
+        check: compares the log's description with its data.
 
     Raises:
         DrakeTeleopError: if the result is worthless and a finding has a remedy.
@@ -94,9 +103,9 @@ def question_fit(
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     clocks = log.static or (delay is not None and abs(delay) < CLOCK)
     if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
-        # A good fit may hide errors, but `check_log` takes longer than the fit.
-        return tuple(_findings(path, log))
-    found = _findings(path, None)
+        # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
+        return tuple(_findings(check)) if _is_suspicious(log) else ()
+    found = _findings(check)
     if any(finding.name == "payload" for finding in found):
         own = payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
@@ -122,15 +131,14 @@ def question_fit(
     return tuple(found)
 
 
-def errors_of_motion(path: Path) -> tuple[Finding, ...]:
+def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
     """Return the errors of the described motion."""
-    return tuple(x for x in _findings(path, None) if x.name in OF_MOTION)
+    return tuple(x for x in _findings(check) if x.name in OF_MOTION)
 
 
-def _findings(path: Path, doubted: Log | None) -> list[Finding]:
-    with suppress(ValueError, ArithmeticError):
-        if doubted is None or _doubted(path, doubted):
-            return [finding for finding in check_log(path).findings if finding.name != "lag"]
+def _findings(check: Callable[[], Conventions]) -> list[Finding]:
+    with suppress(ValueError, ArithmeticError):  # the log itself was readable
+        return [finding for finding in check().findings if finding.name != "lag"]
     return []
 
 
@@ -140,20 +148,22 @@ def _check_moves(log: Log) -> None:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
-            " rms): a load cannot be told from offsets",
+            " rms): load and offsets cannot be separated",
             where=log.source,
             remedy="record 10 s of brisk turns about all axes, as `drake-teleop excite` designs",
         )
 
 
-def _doubted(path: Path, log: Log) -> bool:
-    if log.static or path.suffix.lower() in FORMATS:
+def _is_suspicious(log: Log) -> bool:
+    """Return whether a channel of the wrench is constant or the IMU contradicts itself."""
+    if log.static or log.described is None or Path(log.source).suffix.lower() in FORMATS:
         return False
-    description = load_description(path)
     few = log.only(slice(None, None, max(1, int(0.01 / log.dt))))
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
         return True
-    return bool(against_itself(description, few)[0] or wrench_findings(description, few)[0])
+    with suppress(ValueError, ArithmeticError):
+        return bool(against_itself(log.described, few)[0])
+    return False
 
 
 def check_conventions(
@@ -205,18 +215,9 @@ def _check(data: LogData, description: Description) -> Conventions:
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
-    thin = data.thin(description)
-    delay = None if thin.static else estimate_delay(thin, 30.0)
-    more, description = wrench_findings(description, thin, (0.0, delay or 0.0))
-    findings += more
-    if any(finding.name in ("swapped axes", "mounting") for finding in more):
-        return Conventions(tuple(findings), fit, mounting, None)
     more, delay = against_load(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
-    wrench, pose = description.wrench, description.pose
-    if wrench and pose and all(finding.name == "lag" for finding in findings):
-        findings += against_frame(wrench, pose, log, delay or 0.0)
-    rest = rest_finding(log)
+    rest = _rest_finding(log)
     if rest is not None:
         findings.append(rest)
     return Conventions(tuple(findings), fit, mounting, delay)
@@ -241,3 +242,26 @@ def _one_clock(
         f" set pose.time.offset: {description.pose.time.offset - delay:.3f}",
     )
     return [finding, *(other for other in findings if other.name != "clock")]
+
+
+def _rest_finding(log: Log) -> Finding | None:
+    """Return a finding for too few or too similar poses at rest."""
+    if not log.static:
+        return None
+    if len(log) < _FEWEST_POSES:
+        return Finding(
+            "static poses",
+            f"{len(log)} poses at rest are too few to check the fit; record 12, turned about two"
+            " horizontal axes",
+        )
+    up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
+    least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
+    if least >= _SMALLEST_SPREAD:
+        return None
+    angle = float(np.degrees(np.arcsin(least)))
+    return Finding(
+        "static poses",
+        f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg,"
+        " which does not separate offsets from the load; add poses that are turned by 45 deg or"
+        " more about two horizontal axes",
+    )

@@ -1,18 +1,41 @@
-"""Edits of a description, each of which corrects one suspected error."""
+"""Findings, and corrections of a description, each of which corrects one suspected error."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.rotations import right_angled_rotations
+
+EFFECTS = ("lag", "units", "frame", "payload")
+"""Findings that may be the effect of a cause, such as drift."""
+OF_MOTION = (
+    *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
+    "base axes",
+)
+"""Errors of the described motion, which resemble causes."""
+CLOCK = 0.05
+"""Larger delays are errors of a clock, not the lag of a filter [s]."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Suspicious property of a log.
+
+    Args:
+        name: category for programs: "sign", "units" ...
+        message: observation and remedy.
+    """
+
+    name: str
+    message: str
 
 
 def _gravity_field(description: Description) -> str | None:
