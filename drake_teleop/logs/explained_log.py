@@ -9,7 +9,6 @@ import numpy as np
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.cause_lines import with_lines
-from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
@@ -63,10 +62,10 @@ def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return instants(log.t, log.wrench, motion, gravity, lost, _shake(splines))
+    return instants(log.t, log.wrench, motion, gravity, lost, _acceleration_noise(splines))
 
 
-def _shake(splines: PoseSplines) -> float:
+def _acceleration_noise(splines: PoseSplines) -> float:
     """Return the noise of the acceleration caused by the positions [m/s^2]."""
     f = np.linspace(0.0, _HIGHEST, 500)
     share = passed(f, splines.spacing)
@@ -138,7 +137,7 @@ def removed_note(why: Explanation) -> str:
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(part(why.state, "weight")[1][0, 0]))
+    deviation = float(np.sqrt(why.state.extension("weight")[1][0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

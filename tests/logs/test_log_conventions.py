@@ -12,7 +12,7 @@ import planted
 import polars as pl
 import pytest
 import yaml
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from planted import NTNU_FRAME, findings, good, ntnu_log, written
 from scipy.spatial.transform import Rotation
 

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import worth_stating
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.state import State
 
-_NEAR_S, _SHORT_S = 0.8, 1.2
+_HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
@@ -79,7 +78,7 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
         out.append(_factor(state))
     out += [_gain(state, c) for c in model.gains]
     changes = [_change(state, i) for i in range(len(model.steps))]
-    changes += [_contact(*span) for span in state.spans if not _beside(span, model.times)]
+    changes += [_contact(*span) for span in state.spans if not _is_hand_contact(span, model.times)]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
@@ -117,7 +116,7 @@ def _axes(Q: Array) -> Cause:
 
 def _gravity(state: State) -> Cause:
     assert state.data.gravity_W is not None
-    change, covariance = part(state, "gravity")
+    change, covariance = state.extension("gravity")
     given = state.data.gravity_W
     true = given - change
     cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
@@ -135,7 +134,7 @@ def _gravity(state: State) -> Cause:
 
 
 def _weight(state: State) -> Cause:
-    removed, covariance = part(state, "weight")
+    removed, covariance = state.extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
     own = float(np.sqrt(state.fit.covariance[6, 6]))
@@ -171,7 +170,7 @@ def _factor(state: State) -> Cause:
 
 
 def _gain(state: State, c: int) -> Cause:
-    value, covariance = part(state, f"gain {c}")
+    value, covariance = state.extension(f"gain {c}")
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
         "gain",
@@ -182,7 +181,7 @@ def _gain(state: State, c: int) -> Cause:
 
 
 def _frame(state: State) -> Cause:
-    r, covariance = part(state, "frame")
+    r, covariance = state.extension("frame")
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
     return Cause(
         "pose frame",
@@ -193,7 +192,7 @@ def _frame(state: State) -> Cause:
 
 
 def _rotation(state: State) -> Cause:
-    rho, covariance = part(state, "rotation")
+    rho, covariance = state.extension("rotation")
     angle = float(np.degrees(np.linalg.norm(rho)))
     wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
     return Cause(
@@ -206,7 +205,7 @@ def _rotation(state: State) -> Cause:
 
 def _drift(state: State) -> Cause:
     name = "drift" if "drift" in state.model.parts else "linear drift"
-    rows = part(state, name)[0].reshape(6, -1)
+    rows = state.extension(name)[0].reshape(6, -1)
     size = 2.0 * np.abs(rows).sum(axis=1)
     return Cause(
         "drift",
@@ -217,7 +216,7 @@ def _drift(state: State) -> Cause:
 
 
 def _cable(state: State) -> Cause:
-    K = part(state, "cable")[0][3:9]
+    K = state.extension("cable")[0][3:9]
     stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
     return Cause(
         "cable",
@@ -228,7 +227,7 @@ def _cable(state: State) -> Cause:
 
 
 def _change(state: State, i: int) -> Cause:
-    step, (values, covariance) = state.model.steps[i], part(state, f"step {i}")
+    step, (values, covariance) = state.model.steps[i], state.extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":
         return Cause(
@@ -251,9 +250,9 @@ def _change(state: State, i: int) -> Cause:
     )
 
 
-def _beside(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    near = any(span[0] - _NEAR_S < time < span[1] + _NEAR_S for time in times)
-    return near and span[1] - span[0] < _SHORT_S
+def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
+    near = any(span[0] - _HAND_DISTANCE_S < time < span[1] + _HAND_DISTANCE_S for time in times)
+    return near and span[1] - span[0] < _HAND_CONTACT_S
 
 
 def _contact(start: float, stop: float) -> Cause:

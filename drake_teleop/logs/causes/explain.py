@@ -17,10 +17,16 @@ from drake_teleop.logs.causes.intervals import (
     misfit_deviations,
 )
 from drake_teleop.logs.causes.model import DELAY, LOAD
-from drake_teleop.logs.causes.search import Later, clearly_wrong, explained, search, settled
+from drake_teleop.logs.causes.search import (
+    WithDelay,
+    is_clear_misfit,
+    is_noise,
+    may_be_coloured_noise,
+    search,
+)
 from drake_teleop.logs.causes.state import State
 
-_NO_MASS, _NO_MASS_DEVIATIONS, _SURE = 0.010, 4.0, 20.0
+_NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +60,7 @@ class Explanation:
     @property
     def misfit(self) -> bool:
         """Whether the residual is clearly not noise, even if coloured."""
-        return not self.explained and clearly_wrong(self.state)
+        return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
@@ -64,30 +70,36 @@ class Explanation:
         return len(model.gains) > 1 or bool(model.gains and others)
 
 
-def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Explanation:
+def explain(
+    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
+) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if not.
 
-    `later` returns the record with additional delay [s]; `given` are active parts, such as
+    `with_delay` returns the record with an additional delay [s]; `given` are active parts, such as
     "weight".
     """
     with one_blas_thread():
-        state, late, rejected = search(data, later, given)
+        state, delay_s, rejected = search(data, with_delay, given)
         blocks, gains = block_deviations(state), gain_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
-        noise = explained(state)
-        if not causes and (noise or settled(state)) and _no_load(state, covariance):
-            causes = [_nothing_mounted(state, covariance)]
+        only_noise = is_noise(state)
+        if (
+            not causes
+            and (only_noise or may_be_coloured_noise(state))
+            and _no_load(state, covariance)
+        ):
+            causes = [_no_load_cause(state, covariance)]
         removed = None
         if "weight" in state.model.parts:
             removed = state.x[state.model.slices["weight"]]
         return Explanation(
             causes=tuple(causes),
-            explained=noise,
+            explained=only_noise,
             theta=state.x[LOAD],
             covariance=covariance,
             deviations=misfit_deviations(state, rejected, blocks, gains),
-            delay_s=late + float(state.x[DELAY]),
+            delay_s=delay_s + float(state.x[DELAY]),
             loads=tuple(stretches(state, covariance)),
             removed_weight=removed,
             state=state,
@@ -97,11 +109,11 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
 
 def _no_load(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
-    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SURE * deviation))
+    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
     return bool(mass < least and deviation < 0.1)
 
 
-def _nothing_mounted(state: State, covariance: Array) -> Cause:
+def _no_load_cause(state: State, covariance: Array) -> Cause:
     most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
     return Cause(
         "no load",

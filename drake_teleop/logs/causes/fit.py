@@ -15,7 +15,7 @@ from drake_teleop.logs.causes.instants import FORCES, ORDER
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.rows import Rows
 
-_STEPS, _CONVERGED, _PLAIN_STEPS = 12, 0.02, 2
+_MAX_ITERATIONS, _CONVERGENCE, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
 _RIDGE, _FLOOR = 1e-11, 1e-14
 
 
@@ -56,7 +56,9 @@ class Fit:
         return 0.5 * (gram + gram.T), right
 
 
-def fit(model: Model, rows: Rows, start: Array | None = None, *, steps: int = _STEPS) -> Fit:
+def fit(
+    model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+) -> Fit:
     """Fit a model to rows from `start` (size,) in at most `steps` iterations."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
@@ -68,21 +70,21 @@ def fit(model: Model, rows: Rows, start: Array | None = None, *, steps: int = _S
     found = Fit(model, rows, x, np.zeros(0), model.residual(x), filters, np.maximum(both, floor))
     for step in range(steps):
         gram, right = found.normal(model, x)
-        inverse = inverted(gram)
+        inverse = regularized_inverse(gram)
         move = inverse @ right
         move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
         x = x + move
         residual = model.residual(x)
-        order = 0 if step + 1 < _PLAIN_STEPS else ORDER
+        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else ORDER
         filters, power = rows.noise(residual, floor, order)
         found = Fit(model, rows, x, inverse, residual, filters, power)
-        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED
-        if still and step > _PLAIN_STEPS:
+        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
+        if still and step > _UNWEIGHTED_ITERATIONS:
             break
     return found
 
 
-def inverted(gram: Array) -> Array:
+def regularized_inverse(gram: Array) -> Array:
     """Invert a Gram matrix with a small ridge on its scaled diagonal."""
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))

@@ -42,7 +42,7 @@ _LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
 """Largest change of a parameter in an iteration [m, rad, 1]."""
 _R_OF_STEP = slice(16, 25)
 _LARGEST_DELAY = 0.03  # s, in an iteration
-_SMALL = 1e-4  # rad, step of the numerical derivative
+_ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _V = coefficients()[:, 6:, 7:19]
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -108,7 +108,7 @@ class Model:
         if not wide:
             kept[R], kept[RP] = False, False
             for i in range(len(self.steps)):
-                kept[_after(i)][_R_OF_STEP] = False
+                kept[_step_columns(i)][_R_OF_STEP] = False
         return np.flatnonzero(kept)
 
     @cached_property
@@ -142,13 +142,13 @@ class Model:
         out[..., :WIDTH] = _load(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
-                out[..., _after(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                out[..., _step_columns(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _V[:, :4, :3])
             out[..., G] += static  # - V(-g) w
         if "cable" in parts:
             out[..., :WIDTH] += _cable(x[:, parts["cable"]])
-        turned = self._turned(x)
+        turned = self._rotations(x)
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
         factor = np.full(len(x), self.factor)
         if "torque factor" in parts:
@@ -165,7 +165,7 @@ class Model:
         out[:, channels, RATES.start + channels] += x[:, DELAY, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _after(i).start] += x[:, self.slices[f"step {i}"]]
+                out[:, :, _step_columns(i).start] += x[:, self.slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
             if name in self.slices:
                 rows = x[:, self.slices[name]].reshape(-1, 6, degree)
@@ -188,7 +188,7 @@ class Model:
             M[:, :3, PRODUCTS] += _centripetal(r)
         return M
 
-    def _turned(self, x: Array) -> Array:
+    def _rotations(self, x: Array) -> Array:
         if "rotation" not in self.slices:
             return self.axes[None]
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
@@ -200,7 +200,7 @@ class Model:
         """
         steps = np.ones(self.size)
         if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _SMALL
+            steps[self.slices["rotation"]] = _ROTATION_STEP
         moves = np.diag(steps)
         both = self.wrench(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
@@ -213,7 +213,7 @@ class Model:
         return np.asarray(out[:, self.columns])
 
 
-def _after(i: int) -> slice:
+def _step_columns(i: int) -> slice:
     return slice(WIDTH + len(MOTION) * i, WIDTH + len(MOTION) * (i + 1))
 
 

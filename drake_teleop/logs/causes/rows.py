@@ -12,7 +12,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.logs.causes.instants import ORDER, Instants
 from drake_teleop.logs.causes.model import Model
 
-_FEWEST_OF_NOISE = 50
+_MIN_NOISE_ROWS = 50
 """Fewest rows for an autoregression."""
 Spans = tuple[tuple[float, float], ...]
 """(start, stop) of contacts [s]."""
@@ -86,7 +86,7 @@ class Rows:
         history = np.stack([e[self.whole - d] for d in range(ORDER + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(self.whole), 1)
-        if order == 0 or len(self.whole) < _FEWEST_OF_NOISE:
+        if order == 0 or len(self.whole) < _MIN_NOISE_ROWS:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(ORDER)
         inner += 1e-300 * np.eye(ORDER)

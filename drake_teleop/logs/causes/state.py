@@ -14,7 +14,7 @@ from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.rows import Rows, Spans, in_spans
 
 _SEGMENTS = 6
-_SPRINGS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +60,11 @@ class State:
         """(size,) parameters."""
         return self.fit.x
 
+    def extension(self, name: str) -> tuple[Array, Array]:
+        """Return the parameters of an extension and their covariance."""
+        where = self.model.slices[name]
+        return self.x[where], self.fit.covariance[where, where]
+
     @property
     def rows(self) -> Rows:
         """The rows outside of contacts."""
@@ -83,13 +88,13 @@ class State:
         return np.asarray(Rows(self.data, self.data.used, (), self.model.columns).whole)
 
     @cached_property
-    def loudness(self) -> float:
+    def residual_ratio(self) -> float:
         """Largest ratio of rms residual and white noise of a channel."""
         white = np.maximum(self.data.white, 1e-12)
         return float(np.max(self.rows.rms(self.fit.residual) / white))
 
     @cached_property
-    def probe(self) -> float:
+    def smooth_misfit(self) -> float:
         """Gain of twice the log likelihood per degree of freedom by generic smooth columns.
 
         These are all signals, offsets of six parts of the record, R and springs, for each channel.
@@ -100,7 +105,7 @@ class State:
 
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by the columns of `probe`, and their number."""
+        """Gain of twice the log likelihood by the columns of `smooth_misfit`, and their number."""
         columns = self.data.y[:, self._smooth()]
         if self.data.positions:
             columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
@@ -150,7 +155,7 @@ def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[floa
 def _springs() -> Array:
     """(18, 27) entries of R_SW K p for six symmetric K."""
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(_SPRINGS):
+    for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log
@@ -37,7 +36,7 @@ def describe_gravity(
     log, deviation = read(start), np.inf
     why = explain(log_instants(log), lambda late: log_instants(undelayed(log, late)), ("gravity",))
     if why.theta[6] > 0.0:
-        change, covariance = part(why.state, "gravity")
+        change, covariance = why.state.extension("gravity")
         true = description.gravity_W - change
         true *= STANDARD_GRAVITY / np.linalg.norm(true)
         across = np.eye(3) - np.outer(true, true) / STANDARD_GRAVITY**2

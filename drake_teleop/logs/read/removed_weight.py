@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.logs.causes.delay import free_delay
+from drake_teleop.logs.causes.instants import free_delay
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.log_instants import log_instants
