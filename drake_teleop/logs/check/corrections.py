@@ -14,7 +14,7 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.rotations import right_angled_rotations
 
-EFFECTS = ("lag", "units", "frame", "payload")
+EFFECTS = ("lag", "units", "payload")
 """Findings that may be the effect of a cause, such as drift."""
 OF_MOTION = (
     *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
