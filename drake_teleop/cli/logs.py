@@ -89,7 +89,7 @@ def identify_command(
         summary |= {"gripper": str(gripper), "object": object_figures(alone)}
         summary["notes"] += object_notes(alone)
     summary = plain(summary)
-    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
+    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, stack_pictures
     from drake_teleop.logs.report import write_report
 
     with output_folder(out):
@@ -98,7 +98,7 @@ def identify_command(
             alone.save(out / "object.json")
         write_picture(out / "fit.png", draw_fit(found))
         write_picture(out / "knowledge.png", draw_knowledge(found))
-        one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
+        stack_pictures(out / "fit.png", out / "knowledge.png", out / "report.png")
         write_report(out / "report.html", found, summary, alone)
         write_json(out / "summary.json", summary)
     if not quiet:

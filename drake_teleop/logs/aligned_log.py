@@ -16,7 +16,7 @@ from drake_teleop.logs.read.alignment import ends, low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, moved_by_splines
+from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, use_spline_motion
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def aligned_log(
         found = motion_of_known_load(log, delay, coefficients, usual_s)
     if found is not None:
         motion, source = found
-        moved, one_sided = moved_by_splines(log, motion)
+        moved, one_sided = use_spline_motion(log, motion)
         moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
         plain = undelayed(log, motion.delay_s) if differentiate else None
         if weight_removed:

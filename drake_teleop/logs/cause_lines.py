@@ -20,16 +20,16 @@ from drake_teleop.logs.read.tables import FORMATS
 
 Fields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
-_HEAVIEST_KG = 1000.0
+_MAX_MASS_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
 _FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
 _FORCE_UNITS, _TORQUE_UNITS = ("N", "lbf"), ("N m", "N mm", "lbf in")
 _SAME_RATIO = 1e-3
-_PLACES = ("pose.position_in_sensor", "imu.position")
-_TURNS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
-_DIGITS = {_GRAVITY: 4, _PLACES[0]: 5, _PLACES[1]: 5}
-_OTHERWISE = {
+_POSITIONS = ("pose.position_in_sensor", "imu.position")
+_ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
+_DIGITS = {_GRAVITY: 4, _POSITIONS[0]: 5, _POSITIONS[1]: 5}
+_OTHER_REMEDIES = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
     "pose frame": "add the position to pose, or an accelerometer",
@@ -40,49 +40,49 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
     """Add the correcting lines to the messages; `by_pose`: the acceleration is from poses, not from
     an IMU.
     """
-    texts = _corrected(causes, log, by_pose)[1]
+    texts = _correct_fields(causes, log, by_pose)[1]
     return tuple(
         replace(cause, message=f"{cause.message}; {text}") if text else cause
         for cause, text in zip(causes, texts, strict=True)
     )
 
 
-def doubted_force_unit(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
     """Return the fields to set if a mass is too large for a wrist sensor."""
-    if abs(mass) < _HEAVIEST_KG or log.described is None or log.described.wrench is None:
+    if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected(causes, log, by_pose=True)[0]
+    fields = _correct_fields(causes, log, by_pose=True)[0]
     ratio = fields[_TORQUE] / fields[_FORCE]
-    text = _written(_TORQUE, ratio)
+    text = _yaml_value(_TORQUE, ratio)
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
         f" {log.described.wrench.force.unit}; set {_FORCE} to the value of one unit of the file"
         f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE} to {text} times that{_where(log)}"
+        f" and {_TORQUE} to {text} times that{_no_yaml_note(log)}"
     )
 
 
-def _corrected(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
+def _correct_fields(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
     assert log.described is not None
     fields = _fields(log.described, by_pose)
     column = _columns(fields[_FRAME])
     touched: list[list[str]] = []
     for cause in causes:
-        before = {name: _written(name, value) for name, value in fields.items()}
+        before = {name: _yaml_value(name, value) for name, value in fields.items()}
         if cause.name == "gain":
             _gain(fields, cause.values, column)
         elif cause.name in _CORRECTIONS:
             _CORRECTIONS[cause.name](fields, cause.values)
-        touched.append([k for k, x in before.items() if _written(k, fields[k]) != x])
+        touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
     texts = []
     for cause, names in zip(causes, touched, strict=True):
-        lines = " and ".join(f"{name}: {_written(name, fields[name])}" for name in names)
-        otherwise = _OTHERWISE.get(cause.name, "")
-        texts.append(f"set {lines}{_where(log)}" if lines else otherwise)
+        lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
+        otherwise = _OTHER_REMEDIES.get(cause.name, "")
+        texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
     return fields, texts
 
 
-def _where(log: Log) -> str:
+def _no_yaml_note(log: Log) -> str:
     return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
 
 
@@ -121,7 +121,7 @@ def _columns(frame: Any) -> list[int] | None:
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
 
 
-def _written(name: str, value: Any) -> str:
+def _yaml_value(name: str, value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
     if name in (_FRAME, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
@@ -147,7 +147,7 @@ def _axes(fields: Fields, values: dict[str, Any]) -> None:
 def _rotation(fields: Fields, values: dict[str, Any]) -> None:
     """Rotate all motion to the axes of the wrench, which are those of S."""
     R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
-    for name in {*_TURNS, *_PLACES} & set(fields):
+    for name in {*_ROTATIONS, *_POSITIONS} & set(fields):
         fields[name] = R @ fields[name]
 
 
@@ -156,7 +156,7 @@ def _gravity(fields: Fields, values: dict[str, Any]) -> None:
     fields[_GRAVITY] = true * np.linalg.norm(fields[_GRAVITY]) / np.linalg.norm(true)
 
 
-def _removed(fields: Fields, values: dict[str, Any]) -> None:
+def _weight(fields: Fields, values: dict[str, Any]) -> None:
     fields[_WEIGHT] = "removed"
 
 
@@ -181,7 +181,7 @@ def _gain(fields: Fields, values: dict[str, Any], column: list[int] | None) -> N
 
 
 def _frame(fields: Fields, values: dict[str, Any]) -> None:
-    for name in _PLACES:
+    for name in _POSITIONS:
         if name in fields:
             fields[name] = fields[name] + values["position_in_sensor"]
 
@@ -190,8 +190,8 @@ _CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
     "axes": _axes,
     "sensor rotation": _rotation,
     "gravity direction": _gravity,
-    "weight removed": _removed,
-    "payload configured": _removed,  # an estimated payload would count as exact
+    "weight removed": _weight,
+    "payload configured": _weight,  # an estimated payload would count as exact
     "torque factor": _factor,
     "pose frame": _frame,
 }

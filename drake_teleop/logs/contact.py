@@ -23,23 +23,23 @@ from drake_teleop.load.contact.wrench_axis import wrench_axis
 from drake_teleop.logs.read.alignment import low_pass
 from drake_teleop.logs.read.canonical import Log
 
-FEWEST = 100
+MIN_SAMPLES = 100
 """Fewest samples for a noise floor."""
 
 # Smallest noise floor [N, N m]: residuals of a noise-free simulation are rounding errors.
 _RESOLUTION = np.repeat([1e-3, 1e-4], 3)
 # Without orientation, gravity is the specific force below this frequency.
 _GRAVITY_HZ = 0.5
-_QUIET = 4.0
-_PERIOD_HZ = 30.0  # assumed cut-off without a low-pass
+_QUIET_DEVIATIONS = 4.0
+_DEFAULT_CUTOFF_HZ = 30.0  # assumed cut-off without a low-pass
 _BLOCK_S, _BLOCKS = 0.1, 20
-_STEPS, _ROUNDS = 4, 3
-_OWN_MARGIN, _LEAST = 1.6, 5.0  # times 1.25 is about `RARE`
-_MOST = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
-_LOWER, _MIDDLE = (-math.log(-math.log(share)) for share in (0.25, 0.5))
-_MUCH, _LOUD = 0.4, 10.0
+_CONCENTRATION_STEPS, _ROUNDS = 4, 3
+_RECORD_MARGIN, _MIN_REACHED = 1.6, 5.0  # times 1.25 is about `RARE`
+_MAX_FLOOR_SAMPLES = 30_000  # largest number of samples for a noise floor, in spans of ten blocks
+_GUMBEL_QUARTILE, _GUMBEL_MEDIAN = (-math.log(-math.log(share)) for share in (0.25, 0.5))
+_MAX_CONTACT_SHARE, _MAX_NOISE_RATIO = 0.4, 10.0
 # Share of contact above which different offsets are not attributed to drift.
-_SOME = 0.2
+_CONTACT_SHARE_OF_SHIFT = 0.2
 
 
 class Samples(NamedTuple):
@@ -107,7 +107,7 @@ def detect_contact(
     free: tuple[Samples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
-    """Find contact; return None for fewer than `FEWEST` judged samples.
+    """Find contact; return None for fewer than `MIN_SAMPLES` judged samples.
 
     Without `free`, short contacts slightly above the threshold are removed.
 
@@ -124,18 +124,18 @@ def detect_contact(
     Raises:
         DrakeTeleopError: for an unknown statistic, or too little free motion.
     """
-    period = 1.0 / (cutoff_hz or _PERIOD_HZ)
-    inner = _judged(rows, dt, period, edge)
+    period = 1.0 / (cutoff_hz or _DEFAULT_CUTOFF_HZ)
+    inner = _judged_samples(rows, dt, period, edge)
     judged = rows.at(inner)
-    if len(judged.contact) < FEWEST:
+    if len(judged.contact) < MIN_SAMPLES:
         return None
     hold = round(period / dt)
     # A held value decays by the factor e within a period.
     if free is None:
         fade = math.exp(-dt / period)
-        floor, threshold, train = _own_floor(judged, dt, hold, fade, covariance, statistic)
+        floor, threshold, train = _floor_from_record(judged, dt, hold, fade, covariance, statistic)
     else:
-        train = free[0].at(_judged(free[0], free[1], period))
+        train = free[0].at(_judged_samples(free[0], free[1], period))
         floor = fit_noise_floor(*train, covariance, fade=math.exp(-free[1] / period))
         threshold = max(RARE, floor.threshold(statistic))
     values, touched = np.zeros((len(rows.contact), 3)), np.zeros(len(rows.contact), bool)
@@ -152,11 +152,11 @@ def detect_contact(
         touched=touched,
         free_s=len(train.contact) * (dt if free is None else free[1]),
         force_threshold=MARGIN * float(np.linalg.norm(train.contact[:, :3], axis=1).max()),
-        notes=() if free is not None else _doubts(floor, touched, usual),
+        notes=() if free is not None else _detection_notes(floor, touched, usual),
     )
 
 
-def _judged(
+def _judged_samples(
     rows: Samples, dt: float, period: float, edge: NDArray[np.bool_] | None = None
 ) -> slice | NDArray[np.bool_]:
     ends, judged = max(1, round(period / dt)), np.zeros(len(rows.contact), bool)
@@ -168,7 +168,7 @@ def _judged(
     return slice(int(at[0]), int(at[-1]) + 1) if one_piece else judged
 
 
-def _own_floor(
+def _floor_from_record(
     rows: Samples,
     dt: float,
     hold: int,
@@ -181,30 +181,30 @@ def _own_floor(
 
     n = len(rows.contact)
     block = max(hold, round(_BLOCK_S / dt))
-    some = np.arange(n) // (10 * block) % math.ceil(n / _MOST) == 0
+    selected = np.arange(n) // (10 * block) % math.ceil(n / _MAX_FLOOR_SAMPLES) == 0
     quiet = _quiet(rows.contact, noise_floor(rows.contact))
-    if (quiet & some).sum() < FEWEST:
-        quiet = some = np.ones(n, bool)
-    for _ in range(_STEPS if n >= _BLOCKS * block else 0):
-        floor = fit_noise_floor(*rows.at(quiet & some), covariance, fade=fade)
+    if (quiet & selected).sum() < MIN_SAMPLES:
+        quiet = selected = np.ones(n, bool)
+    for _ in range(_CONCENTRATION_STEPS if n >= _BLOCKS * block else 0):
+        floor = fit_noise_floor(*rows.at(quiet & selected), covariance, fade=fade)
         half = _quieter_half(statistics(floor, *rows)[:, 0], block)
-        if (half & some).sum() < FEWEST:
+        if (half & selected).sum() < MIN_SAMPLES:
             break
         quiet = half
     for attempt in range(_ROUNDS):
-        train = rows.at(quiet & some)
+        train = rows.at(quiet & selected)
         floor = fit_noise_floor(*train, covariance, fade=fade)
         values = statistics(floor, *train)[:, statistic_index(statistic)]
         reached = _extrapolated(values, block, n)
         if attempt > 0:
             reached = min(reached, float(values.max()))
-        reached = max(_LEAST, reached)
+        reached = max(_MIN_REACHED, reached)
         detector = ContactDetector(floor, MARGIN * reached, statistic=statistic, hold=hold)
-        far = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
-        if (some & far).sum() < FEWEST or attempt == _ROUNDS - 1:
+        without_contact = maximum_filter1d(detector.detect(*rows), 2 * block + 1) == 0
+        if (selected & without_contact).sum() < MIN_SAMPLES or attempt == _ROUNDS - 1:
             break
-        quiet = far
-    return floor, _OWN_MARGIN * reached, rows.at(quiet)
+        quiet = without_contact
+    return floor, _RECORD_MARGIN * reached, rows.at(quiet)
 
 
 def _quieter_half(level: NDArray[np.float64], block: int) -> NDArray[np.bool_]:
@@ -219,9 +219,9 @@ def _extrapolated(values: NDArray[np.float64], block: int, samples: int) -> floa
     count = len(values) // block
     largest = values[: count * block].reshape(count, block).max(axis=1)
     lower, middle = np.log(np.quantile(np.maximum(largest, 1.0), [0.25, 0.5]))
-    scale = (middle - lower) / (_MIDDLE - _LOWER)
+    scale = (middle - lower) / (_GUMBEL_MEDIAN - _GUMBEL_QUARTILE)
     rare = -math.log(-math.log(1.0 - 1.0 / max(3, samples // block)))
-    return math.exp(lower + scale * (rare - _LOWER))
+    return math.exp(lower + scale * (rare - _GUMBEL_QUARTILE))
 
 
 def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
@@ -243,34 +243,35 @@ def _spans(touched: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.flatnonzero(np.diff(np.concatenate([[False], touched, [False]]))).reshape(-1, 2)
 
 
-def _doubts(
+def _detection_notes(
     floor: NoiseFloor, touched: NDArray[np.bool_], usual: NDArray[np.float64]
 ) -> tuple[str, ...]:
     remedy = "; give a log of free motion with --free"
-    if touched.mean() > _MUCH:
-        share = f"{100 * touched.mean():.0f} % of the record are taken for contact"
-        return (f"{share}: what free motion is cannot be told from so little of it{remedy}",)
-    louder = float((floor.noise / np.maximum(usual, _RESOLUTION)).max())
-    if louder > _LOUD:
+    if touched.mean() > _MAX_CONTACT_SHARE:
         return (
-            f"what is left of the wrench at rest is {louder:.0f} times what the identification of"
-            " the load left: most of the record may be in contact, and that is not found"
+            f"{100 * touched.mean():.0f} % of the record are contact: the rest is too short to"
+            f" determine the noise floor{remedy}",
+        )
+    noise_ratio = float((floor.noise / np.maximum(usual, _RESOLUTION)).max())
+    if noise_ratio > _MAX_NOISE_RATIO:
+        return (
+            f"the noise floor at rest is {noise_ratio:.0f} times the residual of the"
+            " identification: most of the record may be in contact, which is not detected"
             f"{remedy}",
         )
     return ()
 
 
-def shifted(shift: NDArray[np.float64], found: Detection) -> tuple[str, ...]:
+def offset_shift_note(shift: NDArray[np.float64], found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact: its offsets are `shift` (6,) from the
     free motion's.
     """
     force = float(np.linalg.norm(shift[:3]))
-    if force <= found.force_threshold or found.touched.mean() < _SOME:
+    if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
         return ()
     return (
-        f"the constant that most of the record agrees on is {force:.2g} N from that of the free"
-        " motion: either the sensor drifted, or most of the record is contact, which is then taken"
-        " for an offset and the rest for contact",
+        f"the offsets of the record differ by {force:.2g} N from those of the free motion: either"
+        " the sensor drifted, or most of the record is contact, which changes the offsets",
     )
 
 
@@ -313,7 +314,7 @@ def noise_floor(contact: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _quiet(contact: NDArray[np.float64], floor: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.asarray((np.abs(contact) <= _QUIET * floor).all(axis=1))
+    return np.asarray((np.abs(contact) <= _QUIET_DEVIATIONS * floor).all(axis=1))
 
 
 def contacts_of(

@@ -31,7 +31,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.contact import FEWEST, Detection
+from drake_teleop.logs.contact import MIN_SAMPLES, Detection
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def detect_log(
         raise DrakeTeleopError(
             f"{len(found.log)} samples are too few to tell contact from noise",
             where=found.log.source,
-            remedy=f"give a record of more than {FEWEST} samples",
+            remedy=f"give a record of more than {MIN_SAMPLES} samples",
         )
     return DetectedLog(**vars(found.detection), eliminated=found)
 

@@ -20,32 +20,32 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.log_instants import log_instants
 from drake_teleop.logs.read.rotations import rotation_matrices
 
-_MARGIN = 2.0  # knots, at either end
-_FEWEST = 100
-_SPREAD = 1.5  # ratio of block to stated deviations that widens the intervals
-_HIGHEST = 25.0  # Hz, bandwidth of block means
+_MARGIN_KNOTS = 2.0  # knots, at either end
+_MIN_ROWS = 100
+_MAX_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
     """Explain the wrench of a log; None if it is too short. `found`: motion by splines."""
 
-    def of(more: float) -> Instants:
+    def with_delay(more: float) -> Instants:
         late = delay_s + more
         if found is not None:
-            return _of_splines(log, found, late)
+            return _spline_instants(log, found, late)
         return log_instants(undelayed(log, late))
 
-    data = of(0.0)
-    if data.used.sum() < _FEWEST:
+    data = with_delay(0.0)
+    if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain(data, of, log.free)
+    why = explain(data, with_delay, log.free)
     if log.described is None:
         return why
     causes = with_lines(why.causes, log, by_pose=found is not None)
     return replace(why, causes=causes)
 
 
-def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
+def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
     assert log.posed is not None
     splines, gravity = found.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
@@ -56,7 +56,7 @@ def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN * splines.spacing
+    stamps, margin = splines.poses.t, _MARGIN_KNOTS * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
@@ -67,7 +67,7 @@ def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 def _acceleration_noise(splines: PoseSplines) -> float:
     """Return the noise of the acceleration caused by the positions [m/s^2]."""
-    f = np.linspace(0.0, _HIGHEST, 500)
+    f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed(f, splines.spacing)
     if splines.aid is not None:
         share = share * splines.aid.share(f)[0]
@@ -98,7 +98,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _SPREAD:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & worth_stating(np.sqrt(np.diag(wide)), load.phi)

@@ -41,11 +41,11 @@ from drake_teleop.logs.read.clocks import shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
 
-BANDWIDTH = 30.0
+BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
-REPEATED = 0.05
-"""Smallest reported share of repeated rows, apart from blocks of `BLOCK` rows."""
-BLOCK = 5
+MIN_REPEATED_SHARE = 0.05
+"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
+MIN_REPEATED_BLOCK = 5
 _QUANTITIES = (
     "force",
     "torque",
@@ -256,7 +256,7 @@ def _repeated(
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > REPEATED or _longest(same) >= BLOCK
+    enough = same.mean() > MIN_REPEATED_SHARE or _longest(same) >= MIN_REPEATED_BLOCK
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest(same)
@@ -293,7 +293,7 @@ def _clock(
             "the time stamps never increase", where=at, remedy="name another column, or time.rate"
         )
     median = float(np.median(forward))
-    gaps, back = int((steps > shortest_gap(median, BANDWIDTH)).sum()), int((steps <= 0).sum())
+    gaps, back = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()), int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
         "duration_s": float(t[-1] - t[0]),
@@ -343,7 +343,7 @@ def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest(held & ends), _longest(held & ~ends)
-    return int(ends.sum()) if inside >= BLOCK and inside > 2 * outside else 0
+    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK and inside > 2 * outside else 0
 
 
 def _finite(table: Table, names: Sequence[str]) -> Table:

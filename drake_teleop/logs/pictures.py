@@ -45,7 +45,7 @@ VERDICT_WORDS = dict(
         strict=True,
     )
 )
-_POINTS, _LONGEST_WINDOW = 4000, 2**14
+_MAX_POINTS, _MAX_WINDOW = 4000, 2**14
 # Lighter than the grey of the style, because it is under all other curves.
 _MEASURED = "#A3AAB5"
 
@@ -66,7 +66,7 @@ def draw_knowledge(found: IdentifiedLog) -> Figure:
     return figure
 
 
-def one_page(upper: Path, lower: Path, page: Path) -> None:
+def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
     """Write two PNG files of equal width as one, the first above the second."""
     from matplotlib.image import imread, imsave
 
@@ -84,7 +84,7 @@ def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], ND
     Returns:
         frequencies (m,) without zero [Hz], densities (m, k) [unit of x / sqrt(Hz)].
     """
-    length = min(len(x), max(16, len(x) // 8), _LONGEST_WINDOW)
+    length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
     window = np.hanning(length + 1)[:-1, None]
     starts = range(0, len(x) - length + 1, max(1, length // 2))
     power = np.mean(
@@ -237,7 +237,7 @@ def _draw(
     static: bool,
 ) -> None:
     # More points than pixels only make the drawing slow.
-    every = max(1, len(t) // _POINTS)
+    every = max(1, len(t) // _MAX_POINTS)
     for order, (name, values, colour) in enumerate(curves):
         if static:
             size = 7.0 if order == 0 else 3.0

@@ -20,14 +20,14 @@ from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, wid
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML
 from drake_teleop.logs.read.tables import FORMATS
-from drake_teleop.logs.spline_motion import clock_note, motion_and_load, moved_by_splines
+from drake_teleop.logs.spline_motion import clock_note, motion_and_load, use_spline_motion
 
 ROBUST = ("robust", "consistent")
 """Methods that use splines; the others differentiate the motion and take it as exact."""
-_LEAST = 1e-9
+_SMALLEST_NOISE = 1e-9
 # Fewest kept samples, and their rate over the cut-off of the low-pass.
-_SHOWN, _RATE_OF_CUTOFF = 400_000, 0.25
-_CHUNK, _BESIDE = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
+_MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
+_CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def fit_posed(
         if not found.imu_agrees or (finding is not None and not _is_sensor_rotated(found)):
             return None, () if finding is None else (finding,)
         finding = None  # the search of causes names the rotation
-    moved, one_sided = moved_by_splines(_fewer(log, cutoff_hz), found)
+    moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
     shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
@@ -91,16 +91,16 @@ def _is_sensor_rotated(found: PoseEstimate) -> bool:
     return found.frame.turned and not found.frame.shifted
 
 
-def _fewer(log: Log, cutoff_hz: float | None) -> Log:
-    stride = len(log) // _SHOWN
+def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
+    stride = len(log) // _MIN_KEPT_SAMPLES
     if cutoff_hz is not None:
-        stride = min(stride, int(_RATE_OF_CUTOFF / (cutoff_hz * log.dt)))
+        stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
     few = log.only(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
     for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
-        before, stop = max(0, start - _BESIDE), start + _CHUNK + _BESIDE
+        before, stop = max(0, start - _NEIGHBOURS), start + _CHUNK + _NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
     bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
@@ -115,7 +115,7 @@ def _fit(
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _LEAST * size + 1e-30))
+    equations = NormalEquations(np.maximum(noise, _SMALLEST_NOISE * size + 1e-30))
     equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()

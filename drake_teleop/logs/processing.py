@@ -23,7 +23,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.cause_lines import doubted_force_unit
+from drake_teleop.logs.cause_lines import implausible_mass_message
 from drake_teleop.logs.causes.cause import Cause, Stretch
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
@@ -37,9 +37,9 @@ from drake_teleop.logs.contact import (
     Detection,
     detect_contact,
     noise_floor,
+    offset_shift_note,
     robust_offsets,
     samples_of,
-    shifted,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,
@@ -53,10 +53,10 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
-_BY_GAINS = {"gain", "sensor rotation", "torque factor"}
+_GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
 """Causes that are explained by stated errors of gains."""
-_CONSTANT = 1e-6  # largest relative change of a constant channel
-_FEWEST_TO_TARE = 10
+_CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
+_MIN_TARE_SAMPLES = 10
 _SIGNIFICANT_DELAY = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 
@@ -204,7 +204,7 @@ def _identified(
     result = fit.identification
     motion = None if posed is None else posed.motion
     why = explain_log(raw, delay_s, motion) if _can_be_explained(raw, posed is not None) else None
-    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _BY_GAINS:
+    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _GAIN_CAUSES:
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors: tuple[Finding, ...] = ()
@@ -228,9 +228,9 @@ def _identified(
         findings = errors
     elif not causes and not raw.free:
         findings = question_fit(log, result, predicted, known_delay, check) or other
-    doubt = doubted_force_unit(result.mass, causes, raw)
-    if doubt is not None:
-        findings = (*findings, Finding("units", doubt))
+    mass_message = implausible_mass_message(result.mass, causes, raw)
+    if mass_message is not None:
+        findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
@@ -253,7 +253,7 @@ def _identified(
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
     largest = np.abs(log.wrench).max(axis=0)
-    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT * largest).any():
+    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * largest).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
@@ -357,9 +357,9 @@ def eliminate_log(
         tare=tare,
     )
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s)
-    calm = None if free is None else eliminated(free)
-    if calm is not None and (found.log.static or calm.log.static):
-        source = (calm if calm.log.static else found).log.source
+    free_motion = None if free is None else eliminated(free)
+    if free_motion is not None and (found.log.static or free_motion.log.static):
+        source = (free_motion if free_motion.log.static else found).log.source
         raise DrakeTeleopError("holds poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
@@ -371,12 +371,15 @@ def eliminate_log(
         identification.residual_rms,
         edge=found.edge,
         free=None
-        if calm is None
-        else (samples_of(calm.log, calm.contact, cutoff_hz).at(~calm.edge), calm.log.dt),
+        if free_motion is None
+        else (
+            samples_of(free_motion.log, free_motion.contact, cutoff_hz).at(~free_motion.edge),
+            free_motion.log.dt,
+        ),
         statistic=statistic,
     )
-    if calm is not None and tare and detection is not None:
-        notes = shifted(found.offsets - calm.offsets, detection)
+    if free_motion is not None and tare and detection is not None:
+        notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
@@ -434,21 +437,26 @@ def _eliminated(
         gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
-    late = None
+    causal_wrench = None
     if causal is not None and aligned.differentiated is not None:
-        before, motion = identification.offsets, aligned.differentiated.motion
+        causal_offsets, motion = identification.offsets, aligned.differentiated.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            before = _start(log, causal_tare_s, untouched).mean(axis=0)
-        late = causal_wrenches(
-            contact_wrench(log.wrench, before, *motion, phi),
-            scaled_wrench(log.wrench, before, *motion, phi_gripper, phi_object, **scales),
+            causal_offsets = _start_samples(log, causal_tare_s, untouched).mean(axis=0)
+        causal_wrench = causal_wrenches(
+            contact_wrench(log.wrench, causal_offsets, *motion, phi),
+            scaled_wrench(log.wrench, causal_offsets, *motion, phi_gripper, phi_object, **scales),
             log.dt,
             cutoff_hz=cutoff_hz,
             delay_s=delay_s,
             mode=causal,
         )
-        late = replace(late, offsets=before, contact=late.contact[known], scaled=late.scaled[known])
+        causal_wrench = replace(
+            causal_wrench,
+            offsets=causal_offsets,
+            contact=causal_wrench.contact[known],
+            scaled=causal_wrench.scaled[known],
+        )
     contact = smooth(contact)
     return EliminatedLog(
         log=log.only(known),
@@ -464,19 +472,19 @@ def _eliminated(
         scaled=smooth(scaled),
         gravity_only=gravity_only,
         noise_floor=noise_floor(contact[~edge]),
-        causal=late,
+        causal=causal_wrench,
         edge=edge,
-        findings=_suspected(Path(path), log.wrench - offsets, contact),
+        findings=_suspected_errors(Path(path), log.wrench - offsets, contact),
     )
 
 
-def _start(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+def _start_samples(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     rows = log.t - log.t[0] < length_s
-    if rows.all() or rows.sum() < _FEWEST_TO_TARE:
+    if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
             f"the first {length_s:g} s are {rows.sum()} of {len(log)} samples",
             where="causal_tare_s",
-            remedy=f"give a start of {_FEWEST_TO_TARE} samples or more, less than the record",
+            remedy=f"give a start of {_MIN_TARE_SAMPLES} samples or more, less than the record",
         )
     return wrench[rows]
 
@@ -493,11 +501,13 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)
 
 
-def _suspected(
+def _suspected_errors(
     path: Path, wrench: NDArray[np.float64], contact: NDArray[np.float64]
 ) -> tuple[Finding, ...]:
-    before, after = (float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact))
-    if after < 0.3 * before:
+    causal_offsets, after = (
+        float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)
+    )
+    if after < 0.3 * causal_offsets:
         return ()
     found = check_log(path).findings
     return tuple(finding for finding in found if finding.name not in ("lag", "payload"))

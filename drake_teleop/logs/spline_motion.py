@@ -21,8 +21,8 @@ from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 
-_DELAY_KNOWN = 0.005  # s, standard deviation
-_KNOTS = 2.0
+_MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
+_EDGE_KNOTS = 2.0
 _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
@@ -74,7 +74,7 @@ def _with_delay(
 ) -> tuple[_Motion, str]:
     known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
     found = motion(known)
-    if known is None and not found.delay_deviation < _DELAY_KNOWN:
+    if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
 
@@ -93,7 +93,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
     )
 
 
-def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
+def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
     """Return the log with spline motion and without delay, and its edge samples (N,).
 
     Within two knots of an end or a gap of the poses the acceleration is noisy.
@@ -109,7 +109,7 @@ def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_
         angular_acceleration=alpha,
         gravity=splines.gravity(t, gravity_W),
     )
-    stamps, margin = splines.poses.t, _KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _EDGE_KNOTS * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
     change = np.zeros(len(t) + 1)

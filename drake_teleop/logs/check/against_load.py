@@ -12,9 +12,15 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.corrections import CLOCK, Finding, edit_field, load_edits, tried
+from drake_teleop.logs.check.corrections import (
+    MIN_CLOCK_ERROR_S,
+    Finding,
+    edit_field,
+    load_edits,
+    try_edit,
+)
 from drake_teleop.logs.check.load_fit import (
-    BELIEVABLE,
+    VALID_SHARE,
     LoadFit,
     decisive_factor,
     load_fit,
@@ -26,9 +32,9 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import SEARCH_RANGE, estimate_delay
 from drake_teleop.logs.read.description import Description
 
-HARDLY = 0.9
+UNDETERMINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
-LAG = 0.002
+SMALLEST_LAG_S = 0.002
 """Shorter delays are not reported [s]."""
 _PARTS, _FEWEST_PARTS = 8, 4
 _SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
@@ -44,7 +50,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
 
     def fitted(edited: Description) -> LoadFit:
         # A wrong description may cause a wrong delay.
-        log = _rewrenched(thin, description, edited) or data.thin(edited)
+        log = _edit_wrench(thin, description, edited) or data.thin(edited)
         fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
@@ -53,22 +59,22 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.good and inside):
-        edits += _shifted(description, thin)
+        edits += _clock_edits(description, thin)
     if not given.good:
         edits = [*load_edits(description), *edits]
     found: list[tuple[LoadFit, Finding | None, Description]] = []
     for finding, edited in edits:
-        fit = tried(fitted, edited)
+        fit = try_edit(fitted, edited)
         if fit is not None and fit.mass > 0:
             found.append((fit, finding, edited))
     # A negative mass is impossible: an equally good fit with a positive one suffices.
     limit = (
         given.unexplained * 1.01 if given.mass < 0 else given.unexplained / decisive_factor(given)
     )
-    limit = min(limit, BELIEVABLE + given.noise)
+    limit = min(limit, VALID_SHARE + given.noise)
     found = [entry for entry in found if entry[0].unexplained < limit]
     if not found and given.good:
-        return lag_finding(description, delay) if _shows(thin, delay) else [], delay
+        return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
         return _without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
@@ -84,7 +90,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     return [Finding(finding.name, message), *lag_finding(description, delay)], delay
 
 
-def _shows(log: Log, delay: float | None) -> bool:
+def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
     none, aligned = load_fit(log), load_fit(undelayed(log, delay))
@@ -92,7 +98,7 @@ def _shows(log: Log, delay: float | None) -> bool:
     return bool(gain > 25.0)
 
 
-def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
+def _edit_wrench(log: Log, old: Description, new: Description) -> Log | None:
     a, b = old.wrench, new.wrench
     if a is None or b is None or "base" in (a.frame, b.frame):
         return None
@@ -101,14 +107,14 @@ def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
         return None
     R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
     parts = []
-    for x, force, again in (
+    for x, force, new_columns in (
         (log.wrench[:, :3], a.force.columns, b.force.columns),
         (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
     ):
-        if set(force) != set(again) or len(force) != 3:
+        if set(force) != set(new_columns) or len(force) != 3:
             return None
         given = x @ R_old  # in the axes of the file
-        parts.append(given[:, [force.index(column) for column in again]] @ R_new.T)
+        parts.append(given[:, [force.index(column) for column in new_columns]] @ R_new.T)
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
@@ -124,7 +130,7 @@ def _without_remedy(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > BELIEVABLE + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_SHARE + given.noise:
         return [], None
     if fit.rejected.any():
         # Contacts bias the delay.
@@ -135,7 +141,7 @@ def _without_remedy(
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     """Return a finding if a record does not determine the mass of a load."""
-    if load.verdicts[6] != "not" and unexplained < HARDLY:
+    if load.verdicts[6] != "not" and unexplained < UNDETERMINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
@@ -149,7 +155,7 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     )
 
 
-def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
+def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
     if description.wrench is None:
         return
     reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
@@ -170,10 +176,10 @@ def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Descrip
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
     """Return the remedy if the motion is `delay` seconds behind the wrench."""
-    if delay is None or abs(delay) <= LAG or description.wrench is None:
+    if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
-    if abs(delay) > CLOCK:
+    if abs(delay) > MIN_CLOCK_ERROR_S:
         offset = description.wrench.time.offset + delay
         return [
             Finding(

@@ -19,7 +19,7 @@ _FIELDS = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
-_NOISY = 1e-6
+_MIN_NOISE_SHARE = 1e-6
 
 
 def channel_findings(
@@ -38,8 +38,8 @@ def channel_findings(
             continue
         where = f"{stream}.{field}"
         numbers = _numbers(tables[described.source], quantity.columns, where)
-        twice = _named_twice(where, quantity.columns, named)
-        found += twice or [*_dead(where, numbers), *_equal(where, numbers)]
+        twice = _repeated_names(where, quantity.columns, named)
+        found += twice or [*_dead_channels(where, numbers), *_equal_channels(where, numbers)]
     return found
 
 
@@ -52,7 +52,7 @@ def _numbers(table: Table, columns: Any, where: str) -> dict[str, NDArray[np.flo
     return numbers
 
 
-def _named_twice(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
+def _repeated_names(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
     found = []
     for column, times in Counter(map(str, columns)).items():
         before = where if times > 1 else named.get(column)
@@ -69,10 +69,10 @@ def _named_twice(where: str, columns: Any, named: dict[str, str]) -> list[Findin
     return found
 
 
-def _dead(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _dead_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise(np.stack(list(numbers.values()), axis=1))
-    alive = noise > _NOISY * (np.array(list(spread.values())) + 1e-300)
+    alive = noise > _MIN_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []
@@ -87,7 +87,7 @@ def _dead(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     ]
 
 
-def _equal(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _equal_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     return [
         Finding(
             "repeated channel",

@@ -21,14 +21,14 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import against_load, drift_finding, payload_finding
 from drake_teleop.logs.check.channels import channel_findings
 from drake_teleop.logs.check.corrections import (
-    CLOCK,
-    OF_MOTION,
+    MIN_CLOCK_ERROR_S,
+    MOTION_ERRORS,
     Finding,
     in_other_unit,
     unit_findings,
 )
 from drake_teleop.logs.check.imu_checks import against_itself, against_pose
-from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
+from drake_teleop.logs.check.load_fit import GOOD_SHARE, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
@@ -36,13 +36,13 @@ from drake_teleop.logs.read.description import NO_YAML, Description, load_descri
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
-_STILL = 0.3, 0.1
+_REST_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
 _FEWEST_POSES = 6
 """Fewest poses that allow a check of the fit."""
 _SMALLEST_SPREAD = 0.15
 """Smallest deviation of gravity's direction that separates offsets from a load."""
-_SAME = 1e-6  # smallest change of a live wrench, as a share of the largest reading
+_CONSTANT_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ def question_fit(
         )
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    clocks = log.static or (delay is not None and abs(delay) < CLOCK)
-    if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
+    clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
+    if load.mass > 0 and unexplained < GOOD_SHARE and clocks and 5.0 < weight < 20.0:
         # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
         return tuple(_findings(check)) if _is_suspicious(log) else ()
     found = _findings(check)
@@ -133,7 +133,7 @@ def question_fit(
 
 def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
     """Return the errors of the described motion."""
-    return tuple(x for x in _findings(check) if x.name in OF_MOTION)
+    return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
 
 
 def _findings(check: Callable[[], Conventions]) -> list[Finding]:
@@ -144,7 +144,7 @@ def _findings(check: Callable[[], Conventions]) -> list[Finding]:
 
 def _check_moves(log: Log) -> None:
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _STILL[0] and omega < _STILL[1]:
+    if s < _REST_RMS[0] and omega < _REST_RMS[1]:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
@@ -184,7 +184,7 @@ def check_conventions(
 
 
 def _never_changes(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _SAME * np.abs(log.wrench).max()).all())
+    return bool((np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * np.abs(log.wrench).max()).all())
 
 
 def _check(data: LogData, description: Description) -> Conventions:
@@ -233,7 +233,7 @@ def _one_clock(
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
         return findings
-    if abs(mounting.lag_s + delay) > CLOCK:
+    if abs(mounting.lag_s + delay) > MIN_CLOCK_ERROR_S:
         return findings
     assert description.pose is not None
     finding = Finding(

@@ -16,12 +16,12 @@ from drake_teleop.logs.read.rotations import right_angled_rotations
 
 EFFECTS = ("lag", "units", "payload")
 """Findings that may be the effect of a cause, such as drift."""
-OF_MOTION = (
+MOTION_ERRORS = (
     *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
     "base axes",
 )
 """Errors of the described motion, which resemble causes."""
-CLOCK = 0.05
+MIN_CLOCK_ERROR_S = 0.05
 """Larger delays are errors of a clock, not the lag of a filter [s]."""
 
 
@@ -157,7 +157,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
         )
 
 
-def tried(function: Callable[[Description], Any], edited: Description) -> Any:
+def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
     """Return the result for an edited description; None if it cannot be read."""
     try:
         return function(edited)

@@ -39,11 +39,11 @@ _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
 _HOMOGENEOUS = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _IN_BASE = r"tcp_force$|^o_f_ext"
-_REMARKS = {
+_ROBOT_NOTES = {
     r"tcp_force$": "The payload that the controller was told is not in the TCP's force: tell it 0.",
     r"f_ext": "An external wrench is estimated, and without the load that the robot was told.",
 }
-_SAID = {
+_UNIT_NAMES = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
     "µs": "us",
     "°": "deg",
@@ -65,14 +65,14 @@ _FILL_IN = "FILL IN"
 _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
-class _Found(NamedTuple):
+class _Columns(NamedTuple):
     """Columns of one kind, and the unit in their names ("" for none)."""
 
     columns: list[str]
     unit: str
 
 
-_NOTHING = _Found([], "")
+_NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
@@ -83,7 +83,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         folder: of the draft, start of the relative path to the table.
         header: whether the file contains column names.
     """
-    plain = {name: _plain(name) for name in table.columns}
+    plain = {name: _normalized(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
@@ -91,11 +91,11 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _time(table, plain, beside), **groups}
 
-    none = _Found([_FILL_IN] * 3, "")
+    none = _Columns([_FILL_IN] * 3, "")
     wrench = stream(
         **{kind: _group(table, kind, found.get(kind, none)) for kind in ("force", "torque")}, sign=1
     )
-    forces = [_base(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
+    forces = [_without_number(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
     if any(re.search(_IN_BASE, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
@@ -119,7 +119,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     }
     times = {stream["time"]["column"] for stream in draft.values()}
     used |= times
-    arrays = _names_of_arrays(table)
+    arrays = _array_names(table)
     used |= {name.partition("[")[0] for name in used}
     parts = {
         name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
@@ -130,23 +130,23 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         "above all wrench.sign, units and frames, and inspect it.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
         *([_WITHOUT_TIME] if _FILL_IN in times else []),
-        *(text for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
+        *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return yaml_text(draft, head=head)
 
 
-def _plain(name: str) -> tuple[str, str]:
+def _normalized(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
-def _base(plain: str) -> str:
+def _without_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    found: dict[str, _Found] = {}
+def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
     for kind, names in _VECTORS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
         ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
@@ -159,58 +159,58 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
         whole = [group for group in groups.values() if len(group) == len(axes)]
         for group in (whole or list(groups.values()))[:1]:
             columns = [group[axis] for axis in axes if axis in group]
-            found[kind] = _Found(columns, plain[columns[0]][1])
+            found[kind] = _Columns(columns, plain[columns[0]][1])
     return found
 
 
-def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
+def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
-            groups.setdefault(_base(words), []).append(name)
-    found: dict[str, _Found] = {}
+            groups.setdefault(_without_number(words), []).append(name)
+    found: dict[str, _Columns] = {}
     for start, kinds in _NUMBERED.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
             for kind, places in kinds.items():
                 columns = [groups[base][k] for k in places]
-                found[kind] = _Found(columns, plain[columns[0]][1])
+                found[kind] = _Columns(columns, plain[columns[0]][1])
     by_words = {words: name for name, (words, _) in plain.items()}
     if all(word in by_words for word in _MATRIX):
-        found["matrix"] = _Found([by_words[word] for word in _MATRIX], "")
+        found["matrix"] = _Columns([by_words[word] for word in _MATRIX], "")
     return found
 
 
-def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    found: dict[str, _Found] = {}
-    arrays = _names_of_arrays(table)
+def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
+    arrays = _array_names(table)
     for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, unit = plain[name]
-            whole = _Found([name], unit)
+            whole = _Columns([name], unit)
             fits = _width(table, whole) == width
             if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[kind] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS.items():
-            found[kind] = _Found([f"{name}[{k}]" for k in places], "")
+            found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
     return found
 
 
-def _names_of_arrays(table: Table) -> list[str]:
+def _array_names(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width(table: Table, found: _Found) -> int:
+def _width(table: Table, found: _Columns) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
-def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
+def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
     if found.unit:
-        unit = _SAID.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
+        unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
         group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
         return group
     if _FILL_IN in found.columns or kind in ("force", "torque"):
@@ -226,7 +226,7 @@ def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
     return group
 
 
-def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
+def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
     if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif "matrix" in found:
@@ -256,7 +256,7 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
                 len(table.columns[name]) != rows,
             )
         )
-    unit = _SAID.get(plain[named[0]][1].lower(), "")
+    unit = _UNIT_NAMES.get(plain[named[0]][1].lower(), "")
     return {
         "column": named[0],
         "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),

@@ -12,8 +12,15 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.logs.check.corrections import CLOCK, Edit, Finding, edit_field, pose_edits, tried
-from drake_teleop.logs.check.load_fit import BELIEVABLE, DECISIVE, EXPLAINED
+from drake_teleop.logs.check.corrections import (
+    MIN_CLOCK_ERROR_S,
+    Edit,
+    Finding,
+    edit_field,
+    pose_edits,
+    try_edit,
+)
+from drake_teleop.logs.check.load_fit import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
 from drake_teleop.logs.read.canonical import Log
@@ -22,16 +29,16 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 Array = NDArray[np.float64]
-DEGREES = (40.0, 80.0)
+DEGREE_RATIOS = (40.0, 80.0)
 """Range of the ratio 180 / pi of two speeds with noise and gain errors."""
-OFF = 0.02
+MIN_GRAVITY_ERROR = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
-_SURE = 5.0
-_ALIKE = 0.8
+_SIGNIFICANT = 5.0
+_MIN_CORRELATION = 0.8
 _BAND_HZ = 5.0
-_HALF = 0.5
-_WINDOW, _FEWEST, _MOST = (2.0, 8.0), 6, 60
-_TURNING_HZ, _STRAY, _CLEARLY = 25.0, 0.05, 3.0
+_MAX_OWN_SHARE = 0.5
+_WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
+_ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 
 
 def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
@@ -39,7 +46,7 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
         return [], description
-    unit = _angle_unit(imu, log)
+    unit = _angle_unit_finding(imu, log)
     if unit is not None:
         return [unit[0]], edit_field(description, *unit[1:])
     if imu.specific_force is None or imu.frame == "base":
@@ -54,26 +61,31 @@ def against_itself(description: Description, log: Log) -> tuple[list[Finding], D
     alpha = _alpha_axes(imu, log)
     if alpha is not None:
         return [alpha], description
-    scale = _gravity(imu, log, gravity)
+    scale = _gravity_finding(imu, log, gravity)
     return ([] if scale is None else [scale]), description
 
 
-def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
+def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
     assert imu.angular_velocity is not None
     if imu.angular_acceleration is None:
         return None
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    said, seen = (low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate))
-    sizes = float(np.linalg.norm(said)), float(np.linalg.norm(seen))
-    if min(sizes) == 0.0 or float(np.sum(said * seen)) < _ALIKE * sizes[0] * sizes[1]:
+    given_alpha, derived_alpha = (
+        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
+    )
+    sizes = float(np.linalg.norm(given_alpha)), float(np.linalg.norm(derived_alpha))
+    if (
+        min(sizes) == 0.0
+        or float(np.sum(given_alpha * derived_alpha)) < _MIN_CORRELATION * sizes[0] * sizes[1]
+    ):
         return None
     ratio = sizes[0] / sizes[1]
     field, now = "angular_acceleration", imu.angular_acceleration.unit
-    if DEGREES[0] < ratio < DEGREES[1] and now == "rad/s^2":
+    if DEGREE_RATIOS[0] < ratio < DEGREE_RATIOS[1] and now == "rad/s^2":
         unit = "deg/s^2"
-    elif DEGREES[0] < 1.0 / ratio < DEGREES[1] and now == "deg/s^2":
+    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and now == "deg/s^2":
         unit = "rad/s^2"
-    elif DEGREES[0] < 1.0 / ratio < DEGREES[1] and imu.angular_velocity.unit == "rad/s":
+    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and imu.angular_velocity.unit == "rad/s":
         field, unit = "angular_velocity", "deg/s"
     else:
         return None
@@ -88,14 +100,15 @@ def _angle_unit(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
     """Return a finding for axes of the gyroscope that differ from the accelerometer."""
     assert imu.angular_velocity is not None
-    few = log.only(slice(None, None, max(1, round(1.0 / (_TURNING_HZ * log.dt)))))
-    given = _astray(few, np.eye(3), gravity)
-    if not given > _STRAY:
+    few = log.only(slice(None, None, max(1, round(1.0 / (_ROTATION_HZ * log.dt)))))
+    given = _gravity_misfit(few, np.eye(3), gravity)
+    if not given > _MIN_MISFIT:
         return None
     best, P = min(
-        ((_astray(few, P, gravity), P) for P in _signed_permutations()), key=lambda entry: entry[0]
+        ((_gravity_misfit(few, P, gravity), P) for P in _signed_permutations()),
+        key=lambda entry: entry[0],
     )
-    if _CLEARLY * best > given:
+    if _MIN_RATIO * best > given:
         return None
     order = np.abs(P).argmax(axis=1)
     text = "the axes of the gyroscope are not those of the accelerometer"
@@ -117,11 +130,15 @@ def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
     if imu.angular_acceleration is None:
         return None
     rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
-    said, seen = (low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate))
-    size = float(np.linalg.norm(said) * np.linalg.norm(seen)) + 1e-300
-    alike = said.T @ seen / size
+    given_alpha, derived_alpha = (
+        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
+    )
+    size = float(np.linalg.norm(given_alpha) * np.linalg.norm(derived_alpha)) + 1e-300
+    alike = given_alpha.T @ derived_alpha / size
     best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
-    if np.sum(alike * best) < _ALIKE or np.trace(alike) > _HALF * np.sum(alike * best):
+    if np.sum(alike * best) < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * np.sum(
+        alike * best
+    ):
         return None
     axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
     return Finding(
@@ -151,7 +168,7 @@ class MeanGravity:
 def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
     """Return the ratio from all windows; None if the record is too short."""
     forces = _mean_forces(log, np.eye(3))[0]
-    if len(forces) < _FEWEST:
+    if len(forces) < _MIN_WINDOWS:
         return None
     ratios = np.linalg.norm(forces, axis=1) / gravity
     return MeanGravity(float(np.mean(ratios)), float(np.std(ratios, ddof=1) / np.sqrt(len(ratios))))
@@ -159,10 +176,10 @@ def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
 
 def _mean_forces(log: Log, P: Array) -> Array:
     """(2, n, 3) Hann-weighted mean specific force of windows, and half a window later [m/s^2]."""
-    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW))
+    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
-    starts = np.linspace(0, len(log) - 3 * half, min(count, _MOST)).astype(int)
+    starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_WINDOWS)).astype(int)
     take = starts[:, None] + np.arange(3 * half)
     omega, s = log.angular_velocity[take] @ P.T, log.specific_force[take]
     steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
@@ -177,7 +194,7 @@ def _mean_forces(log: Log, P: Array) -> Array:
     return means
 
 
-def _astray(log: Log, P: Array, gravity: float) -> float:
+def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
     """Return the rms distance of the means from gravity and from each other."""
     means = _mean_forces(log, P) / gravity
     if means.shape[1] == 0:
@@ -186,21 +203,24 @@ def _astray(log: Log, P: Array, gravity: float) -> float:
     return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
 
 
-def _gravity(imu: Imu, log: Log, gravity: float) -> Finding | None:
+def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
     found = mean_gravity(log, gravity)
     if found is None or not 0.7 < found.ratio < 1.4:
         return None
     off = found.ratio - 1.0
-    if abs(off) < OFF + 3.0 * found.deviation or abs(off) < _SURE * found.deviation:
+    if (
+        abs(off) < MIN_GRAVITY_ERROR + 3.0 * found.deviation
+        or abs(off) < _SIGNIFICANT * found.deviation
+    ):
         return None
     assert imu.specific_force is not None
-    seen = found.ratio * gravity
+    measured_gravity = found.ratio * gravity
     remedy = f"divide the columns of imu.specific_force by {found.ratio:.4f}, or calibrate them"
-    if imu.specific_force.unit != "g" and abs(seen / 9.80665 - 1.0) < 0.01:
-        remedy = f"set gravity: {seen:.4g}"
+    if imu.specific_force.unit != "g" and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
+        remedy = f"set gravity: {measured_gravity:.4g}"
     return Finding(
         "gravity",
-        f"the accelerometer reads {seen:.4g} m/s^2 of gravity in the mean,"
+        f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
         f" {100 * abs(off):.2g} % (+- {100 * found.deviation:.1g})"
         f" {'more' if off > 0 else 'less'} than the description says:"
         f" the mass would be wrong by as much; {remedy}",
@@ -220,27 +240,27 @@ def against_pose(
     if given is None:
         return [], None, description
     findings: list[Finding] = []
-    if given.unexplained > EXPLAINED or given.mirrored or given.angle_deg > 10:
+    if given.unexplained > GOOD_SHARE or given.mirrored or given.angle_deg > 10:
         better = [
             (found.unexplained, finding, edited, found)
             for finding, edited in pose_edits(description)
-            if (found := tried(mounting, edited)) and not found.mirrored
+            if (found := try_edit(mounting, edited)) and not found.mirrored
         ]
-        limit = min(BELIEVABLE, given.unexplained / DECISIVE)
+        limit = min(VALID_SHARE, given.unexplained / MIN_IMPROVEMENT)
         if given.mirrored:
             better = [entry for entry in better if entry[3].angle_deg < 10]
-        elif given.angle_deg > 10 and given.unexplained < BELIEVABLE:
+        elif given.angle_deg > 10 and given.unexplained < VALID_SHARE:
             # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
             # that keeps the described mounting is the simpler explanation.
             better = [entry for entry in better if entry[3].angle_deg < 10]
-            limit = min(BELIEVABLE, 1.5 * given.unexplained + 1e-4)
+            limit = min(VALID_SHARE, 1.5 * given.unexplained + 1e-4)
         best = min(better, key=lambda entry: entry[0], default=None)
         if best and best[0] < limit:
             findings.append(best[1])
             description, given = best[2], best[3]
-    if given.unexplained > BELIEVABLE and not given.mirrored:
+    if given.unexplained > VALID_SHARE and not given.mirrored:
         return findings, given, description
-    if abs(given.lag_s) > CLOCK or given.drift:
+    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
         finding, description = _imu_clock(description, given, data)
         findings.append(finding)
     if given.speed_ratio is not None and 40 < given.speed_ratio < 80:

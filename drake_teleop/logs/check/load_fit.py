@@ -16,15 +16,15 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured
 from drake_teleop.logs.read.canonical import Log
 
-EXPLAINED = 0.02
+GOOD_SHARE = 0.02
 """Unexplained share of the variance, beside white noise, of a good fit with positive mass."""
-BELIEVABLE = 0.05
+VALID_SHARE = 0.05
 """Largest unexplained share, beside noise, of a valid hypothesis."""
-DECISIVE = 4.0
+MIN_IMPROVEMENT = 4.0
 """Smallest factor by which an edit reduces the unexplained share."""
-_FALSE_ALARMS, _EDITS = 1e-6, 50
-_CUTOFF = 15.0
-_SAMPLES = 1500
+_FALSE_ALARMS, _TESTED_EDITS = 1e-6, 50
+_CUTOFF_HZ = 15.0
+_MAX_SAMPLES = 1500
 
 
 @dataclass(frozen=True)
@@ -46,14 +46,14 @@ class LoadFit:
     @property
     def good(self) -> bool:
         """Whether some load of positive mass explains the wrench."""
-        return self.mass > 0 and self.unexplained < EXPLAINED + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
 
 
 def load_fit(log: Log) -> LoadFit:
     """Fit a constant offset and a load to a log, low-passed at 15 Hz."""
     cutoff = _cutoff(log)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
-    rows = slice(None, None, max(1, len(log) // _SAMPLES))
+    rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
     scale = _scale(wrench)
@@ -66,14 +66,14 @@ def load_fit(log: Log) -> LoadFit:
     size = np.linalg.norm(matrix, axis=0) + 1e-12
     theta = np.linalg.lstsq(matrix / size, (w / scale).ravel(), rcond=1e-6)[0] / size
     total = float((w / scale).var(axis=0).sum()) + 1e-30
-    left_over = float((w / scale - V @ theta).var(axis=0).sum()) / total
+    unexplained = float((w / scale - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFit(left_over, float(theta[0]), independent=max(1.0, len(w) - 8.0))
+        return LoadFit(unexplained, float(theta[0]), independent=max(1.0, len(w) - 8.0))
     # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise = passed * float(((white_noise(log.wrench) / scale) ** 2).sum()) / total
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
-    return LoadFit(left_over, float(theta[0]), noise, independent)
+    return LoadFit(unexplained, float(theta[0]), noise, independent)
 
 
 def unexplained_share(wrench: NDArray[np.float64], residual: NDArray[np.float64]) -> float:
@@ -92,7 +92,7 @@ def white_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cutoff(log: Log) -> float | None:
-    return None if log.static else min(_CUTOFF, 0.2 / log.dt)
+    return None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
 
 
 def _scale(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -104,4 +104,4 @@ def _scale(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
 def decisive_factor(fit: LoadFit) -> float:
     """Return the factor by which another description must reduce the residual."""
     n = max(1.0, fit.independent)
-    return max(DECISIVE, float(fdtri(n, n, 1 - _FALSE_ALARMS / _EDITS)))
+    return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))

@@ -17,8 +17,8 @@ from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import MINIMUM_SAMPLES, read_description
 from drake_teleop.logs.read.tables import Table
 
-_RATE = 100.0
-_STAMPS = "time stamps of a stream without"
+_RATE_HZ = 100.0
+_TIME_COLUMN = "time stamps of a stream without"
 
 
 class LogData:
@@ -48,7 +48,9 @@ class LogData:
         """Read the log at about 100 Hz."""
         stamped = {
             name: stream.model_copy(
-                update={"time": stream.time.model_copy(update={"column": _STAMPS, "rate": None})}
+                update={
+                    "time": stream.time.model_copy(update={"column": _TIME_COLUMN, "rate": None})
+                }
             )
             for name in ("wrench", "imu", "pose")
             if (stream := getattr(description, name)) and stream.time.column is None
@@ -75,7 +77,7 @@ class LogData:
                 return 1
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
         # A short record keeps enough samples.
-        most = min(rate / _RATE, self.tables[stream.source].rows / MINIMUM_SAMPLES)
+        most = min(rate / _RATE_HZ, self.tables[stream.source].rows / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _stamps(self, stream: Any) -> NDArray[np.float64]:
@@ -96,7 +98,7 @@ class LogData:
         if time is not None and time.column is not None:
             thin.columns[str(time.column)] = _means(self._stamps(stream)[:, None], k)
         elif time is not None and time.rate is not None:
-            thin.columns[_STAMPS] = _means(np.arange(table.rows)[:, None] / time.rate, k)
+            thin.columns[_TIME_COLUMN] = _means(np.arange(table.rows)[:, None] / time.rate, k)
 
 
 def _streams(description: Description) -> list[Any]:
