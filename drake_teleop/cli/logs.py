@@ -64,7 +64,7 @@ def identify_command(
             same format, is written too (see `drake_teleop.load.gripper`).
 
     Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+        the summary; docs/logs.md explains its names.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
@@ -131,7 +131,7 @@ def eliminate_command(
     `edge` which samples are not judged (see `EliminatedLog`).
 
     Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+        the summary; docs/logs.md explains its names.
     """
     load_file = Identification.load(load)
     found = eliminate_log(
@@ -217,7 +217,7 @@ def detect_command(
     `edge` for samples that are not judged.
 
     Returns:
-        the summary; its names are explained in `drake_teleop.logs.detection`.
+        the summary; docs/detection.md explains its names.
     """
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated

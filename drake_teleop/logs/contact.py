@@ -320,7 +320,7 @@ def _quiet(contact: NDArray[np.float64], floor: NDArray[np.float64]) -> NDArray[
 def contacts_of(
     t: NDArray[np.float64], contact: NDArray[np.float64], touched: NDArray[np.bool_]
 ) -> list[dict[str, Any]]:
-    """Return contacts with the fields of `logs.detection`, from (N,) times and (N, 6) F_c."""
+    """Return start, stop, peaks, direction and point of each contact, from (N, 6) F_c."""
     rows = []
     for start, stop in _spans(touched):
         wrench = contact[start:stop]

@@ -1,23 +1,6 @@
 """Contact detection in a log, above the noise floor of free motion.
 
-Names in the summary of `drake-teleop detect` beside those of `eliminate`; forces in N, torques in
-N m, frame S:
-
-====================== ==========================================================================
-load                   identification file; null if identified from the log itself
-free, free_s           log of free motion (null: calm parts of the log), its duration
-statistic, threshold   see `drake_teleop.load.contact.statistics`
-noise                  [f; tau], standard deviation at rest
-per_acceleration       (6, 2) its growth per m/s^2 and per rad/s^2
-above_threshold        share of the samples whose statistic reaches the threshold
-in_contact             share of the samples in contact, with hysteresis
-force_threshold        1.25 times the largest |F_c| in free motion
-above_force_threshold  share of samples above it: raw (tared at the first sample), gravity_only
-                       (null without orientation) and eliminated
-contacts               list of start_s, stop_s, peak_N, peak_Nm; at the peak push (3), direction
-                       of the force on the tool, and point_m (3) of its line nearest to the
-                       origin of S (null without force)
-====================== ==========================================================================
+docs/detection.md explains the names in the summary of `drake-teleop detect`.
 """
 
 from __future__ import annotations

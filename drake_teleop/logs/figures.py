@@ -1,61 +1,6 @@
 """Figures of `drake-teleop identify` and `drake-teleop eliminate`.
 
-Names in the summaries (and in summary.json); forces in N, torques in N m, frame S:
-
-====================== ==========================================================================
-both
-====================== ==========================================================================
-samples, duration_s    used samples and their time span
-rate_hz                on the common clock; 0 for static poses
-cutoff_hz              of the zero-phase low-pass; null without
-delay_s                removed delay of the motion behind the wrench
-delay_source           "given", "estimated" (from this record), "load" (of the load file),
-                       "undetermined" (0 was used) or "static" (poses at rest)
-notes                  assumptions and findings, in words
-findings               list of name and message: suspected errors of the description
-====================== ==========================================================================
-
-====================== ==========================================================================
-identify
-====================== ==========================================================================
-mass, mass_std         kg; a standard deviation is null for an undetermined parameter
-com, com_std           m
-inertia_com            kg m^2, about the centre of mass, axes of S
-offsets, phi           [f; tau]; Eq. (6); offsets_std, phi_std: standard deviations
-phi_interval           (10, 2) ends of the 95 % intervals
-verdicts               of each parameter: identified, weakly, not or prior
-identifiable           names of the determined parameters; others: not_identifiable
-physically_consistent  whether a rigid body can have phi
-determined             determined combinations of offsets and load, in words
-rejected               share of rejected samples
-residual_rms           [f; tau]; residual_rms_force, residual_rms_torque: of the magnitudes
-causes                 list of name, message, start_s, stop_s, values: effects beside a rigid
-                       load with constant offsets, included in the model
-loads                  list of start_s, stop_s, mass, com, phi, deviations: load of each part of
-                       the record, if it changes; phi above is that of the first
-gripper, object        with --gripper: its file; figures of phi_total - phi_gr, with
-                       consistency_margin and consistency_margin_std
-====================== ==========================================================================
-
-========================= =======================================================================
-eliminate
-========================= =======================================================================
-tare                      [f; tau], offsets of this record minus those of the load file
-tare_fraction             share of the samples that determined the offsets
-raw_rms                   rms of |F| without offsets
-gravity_only_rms          rms of |F| without offsets and m g; null without orientation
-residual_rms, ..._peak    rms and maximum of |F_c|, the contact force
-raw_torque_rms ...        the same four of the torque
-raw_rms_per_channel ...   the same four of each channel [f; tau]
-noise_floor               [f; tau], standard deviation of the contact wrench without contact
-edge_s                    unjudged time at ends and gaps, excluded from all figures
-free                      log of free motion for the threshold, or null
-threshold                 of contact [standard deviations]; null for static or short records,
-                          as contacts (see `drake_teleop.logs.detection`) and in_contact
-in_contact                share of the samples in contact
-causal                    null without --causal; mode, lag_s, offsets, tare_s (null: offsets of
-                          the load file), residual, noise_floor and difference from F_c
-========================= =======================================================================
+docs/logs.md explains their names, section "Fields of the summary".
 """
 
 from __future__ import annotations

@@ -1,20 +1,6 @@
 """`drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
 
-Names in the summary (and in summary.json):
-
-=============== =================================================================================
-kind            "description", "canonical", "unknown" (a table without known columns) or "bag"
-topics          of a bag: type, messages and rate_hz of each
-streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_jumps (time stamps
-                that repeat or decrease), repeated_rows, nan_rows, nan_longest (longest block), and
-                columns: of each min, max, mean, noise (white), saturated (samples at the limits)
-findings        list of name and message: suspicion and remedy
-fit             of a load to the given description: mass [kg], unexplained share of the variance
-mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s, drift of the
-                clock [s/s], unexplained; null without both
-delay_s         of the motion behind the wrench; null if undetermined
-draft           path of the draft description of an unknown table or a bag, or null
-=============== =================================================================================
+docs/logs.md explains the names in its summary, section "Fields of the summary".
 """
 
 from __future__ import annotations
@@ -64,7 +50,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
     Write summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
 
     Returns:
-        the summary, see the top of this module.
+        the summary.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.

@@ -24,8 +24,7 @@ from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     MOTION_ERRORS,
     Finding,
-    in_other_unit,
-    unit_findings,
+    correct_gravity_unit,
 )
 from drake_teleop.logs.check.imu_checks import against_itself, against_pose
 from drake_teleop.logs.check.load_fit import GOOD_SHARE, LoadFit, load_fit, unexplained_share
@@ -197,8 +196,7 @@ def _check(data: LogData, description: Description) -> Conventions:
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
     if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
-    findings = list(unit_findings(description, log))
-    description = in_other_unit(description, log)
+    findings, description = correct_gravity_unit(description, log)
     more, description = against_itself(description, data.thin(description))
     findings += more
     mounting = None
