@@ -24,7 +24,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
 from drake_teleop.logs.cause_lines import implausible_mass_message
-from drake_teleop.logs.causes.cause import Cause, Stretch
+from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
 from drake_teleop.logs.check.against_load import lag_finding
 from drake_teleop.logs.check.conventions import (
     Conventions,
@@ -180,16 +180,14 @@ def _identified(
     check: Callable[[], Conventions],
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
-    as_read = log
     posed, other = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
+    raw = log
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
-        raw = as_read
     else:
         delay_s, source = delay_of(log, cutoff_hz, delay)
-        raw = log
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
         fit = identify_batch(
@@ -474,7 +472,7 @@ def _eliminated(
         noise_floor=noise_floor(contact[~edge]),
         causal=causal_wrench,
         edge=edge,
-        findings=_suspected_errors(Path(path), log.wrench - offsets, contact),
+        findings=_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
     )
 
 
@@ -502,15 +500,19 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
 
 
 def _suspected_errors(
-    path: Path, wrench: NDArray[np.float64], contact: NDArray[np.float64]
+    path: Path,
+    wrench: NDArray[np.float64],
+    contact: NDArray[np.float64],
+    load: Identification,
 ) -> tuple[Finding, ...]:
-    causal_offsets, after = (
-        float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)
-    )
-    if after < 0.3 * causal_offsets:
+    """Return errors of the description if the load leaves 30 % of the median force."""
+    sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
+    if sizes[1] < 0.3 * sizes[0]:
         return ()
-    found = check_log(path).findings
-    return tuple(finding for finding in found if finding.name not in ("lag", "payload"))
+    ignored = {"lag", "payload", *EVENTS}
+    if load.weight_removed:
+        ignored |= {"weight removed", "payload configured"}
+    return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
 def _scales(

@@ -16,6 +16,8 @@ _HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGES = ("zero change", "load change")
 """Causes that divide a record into parts with different offsets or loads."""
+EVENTS = (*CHANGES, "drift", "contact", "cable", "no load")
+"""Causes that no line of a description corrects."""
 
 
 @dataclass(frozen=True)
