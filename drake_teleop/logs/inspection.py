@@ -192,7 +192,7 @@ def _stream(
         findings.append(
             Finding(
                 "nan",
-                f"{at}: {figures['nan_rows']} rows hold no finite number, the first is row {first},"
+                f"{at}: {figures['nan_rows']} rows contain no finite number, the first is row {first},"
                 f" the longest block {figures['nan_longest']} rows; cut or repair them",
             )
         )
@@ -219,7 +219,7 @@ def _stream(
             findings.append(
                 Finding(
                     "saturation",
-                    f"{at}: {column} stands at the end of its range ({finite.min():.4g} ..."
+                    f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
                     f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
                 )
             )
@@ -294,7 +294,7 @@ def _clock(
             Finding(
                 "gap",
                 f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-                " missing or the clock jumped; what lies there is not used",
+                " missing or the clock jumped; the motion there is not used",
             )
         )
     if back:
@@ -302,9 +302,9 @@ def _clock(
         findings.append(
             Finding(
                 "clock jump",
-                f"{at}: {back} time stamps stand still or go back, the first in row {row};"
-                " rows that share one are left out or spread evenly; a log that goes back is"
-                " refused: cut it there, or give time.rate",
+                f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
+                " rows with equal stamps are omitted or spread evenly; a log with decreasing"
+                " stamps is refused: cut it there, or give time.rate",
             )
         )
     return findings

@@ -358,7 +358,7 @@ def eliminate_log(
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
         source = (free_motion if free_motion.log.static else found).log.source
-        raise DrakeTeleopError("holds poses at rest, which have no contact", where=source)
+        raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
     detection = detect_contact(
@@ -523,7 +523,7 @@ def _scales(
             raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)
     if sigma_object is not None and not split:
         raise DrakeTeleopError(
-            "sigma_object needs to know what is gripper and what is object",
+            "sigma_object requires a gripper",
             where="sigma_object",
             remedy="give the gripper's identification.json as well, or use sigma",
         )
@@ -532,7 +532,7 @@ def _scales(
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma}
     if sigma != 0 or gamma != 1 or sigma_object is not None:
         raise DrakeTeleopError(
-            "eta goes with sigma = 0 and gamma = 1 only (Eq. 14)",
+            "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",
             remedy="leave sigma, sigma_object and gamma out",
         )

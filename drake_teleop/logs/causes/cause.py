@@ -163,10 +163,10 @@ def _factor(state: State) -> Cause:
     if factor == -1.0:
         what = "the torque has the opposite sign"
     else:
-        what = f"the torque is {factor:.6g} times that which belongs to the force"
+        what = f"the torque is {factor:.6g} times the value that fits the force"
     return Cause(
         "torque factor",
-        f"{what}: unit or sign is wrong",
+        f"{what}: its unit or sign is wrong",
         values={"factor": factor},
     )
 
@@ -222,8 +222,8 @@ def _cable(state: State) -> Cause:
     stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
     return Cause(
         "cable",
-        f"something pulls at the load with a force that depends on the position (about"
-        f" {stiffness:.2g} N/m): a cable or hose; guide it so that it is slack",
+        f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
+        " probably of a cable or hose; guide it so that it is slack",
         values={"stiffness": stiffness},
     )
 
@@ -236,7 +236,7 @@ def _change(state: State, i: int) -> Cause:
             "zero change",
             f"{when} the sensor has another zero: {_vector(values[:3], 'N')},"
             f" {_vector(values[3:], 'N m')} are added (a tare in the record); the stated offsets"
-            " are those before",
+            " are those before it",
             start_s=step.time,
             values={"change": values.tolist()},
         )
@@ -246,7 +246,7 @@ def _change(state: State, i: int) -> Cause:
     return Cause(
         "load change",
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each stretch",
+        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is stated for each part of the record",
         start_s=step.time,
         values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
     )
@@ -260,7 +260,7 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
 def _contact(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
-        f"from t = {start:.2f} to {stop:.2f} s something touches the load; the stretch is not used",
+        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part of the record is not used",
         start_s=start,
         stop_s=stop,
     )
