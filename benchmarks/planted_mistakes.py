@@ -1,4 +1,4 @@
-"""Which mistakes of a description are named, with the line that mends them? Are good logs let be?
+"""Which mistakes of a description are found, with the correcting line? How many false alarms?
 
 Records of 24 s of the arm and the load of `pose_noise`, F and P, as files with a description: a
 wrench at 500 Hz with noise and offsets, poses at 125 Hz, an IMU at 250 Hz; wrench and pose, wrench
@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.conventions import check_log
+from drake_teleop.logs.processing import check_log
 
 Array = NDArray[np.float64]
 SPAN = 24.0
@@ -231,27 +231,32 @@ KINDS: dict[str, Mistake] = {
         _declared("pose", "position", "mm"), POSED, ("units",), ("pose.position.unit: m",)
     ),
     "N mm as N m": Mistake(
-        _scaled("wrench", "torque", 1e3), ALL, ("units",), (_TORQUE + "N mm",)
+        _scaled("wrench", "torque", 1e3), ALL, ("torque factor",), (_TORQUE + "N mm",)
     ),
-    "N m as N mm": Mistake(_declared("wrench", "torque", "N mm"), ALL, ("units",), (_TORQUE,)),
+    "N m as N mm": Mistake(
+        _declared("wrench", "torque", "N mm"), ALL, ("torque factor",), (_TORQUE,)
+    ),
     "lbf in as N m": Mistake(
-        _scaled("wrench", "torque", 1 / 0.1129848), ALL, ("units",), (_TORQUE + "lbf in",)
+        _scaled("wrench", "torque", 1 / 0.1129848), ALL, ("torque factor",), (_TORQUE + "lbf in",)
     ),
     "lbf as N": Mistake(
-        _scaled("wrench", "force", 1 / 4.4482216), ALL, ("units",), ("wrench.force.unit: lbf",)
+        _scaled("wrench", "force", 1 / 4.4482216),
+        ALL,
+        ("torque factor",),
+        ("wrench.force.unit: lbf",),
     ),
     "x, y exchanged": Mistake(
         _turned(np.eye(3)[[1, 0, 2]]), ALL, ("swapped axes",), ("_1', 'force_0', 'force_2",)
     ),
     "y mirrored": Mistake(
-        _turned(np.diag([1.0, -1.0, 1.0])), ALL, ("swapped axes",), ("_1", "column")
+        _turned(np.diag([1.0, -1.0, 1.0])), ALL, ("axes",), ("sign: -1 and wrench.frame: [[-1",)
     ),
     "sign": Mistake(_turned(-np.eye(3)), ALL, ("sign",), ("wrench.sign: -1",)),
     "turned 45 deg": Mistake(
         _turned(_ABOUT_Z),
         ALL,
-        ("mounting", "pose frame"),
-        ("wrench.frame", "rotation_in_sensor", "imu.frame"),
+        ("sensor rotation", "pose frame"),
+        ("rotation_in_sensor", "imu.frame"),
     ),
     "turned 180 deg": Mistake(
         _turned(np.diag([1.0, -1.0, -1.0])),
@@ -262,7 +267,7 @@ KINDS: dict[str, Mistake] = {
     "TCP 150 mm": Mistake(_tcp, POSED, ("pose frame",), ("pose.position_in_sensor",)),
     "shift 20 mm": Mistake(_off, POSED, ("pose frame",), ("pose.position_in_sensor",)),
     "turn 10 deg": Mistake(
-        _tilted, POSED, ("mounting", "pose frame"), ("wrench.frame", "rotation_in_sensor")
+        _tilted, POSED, ("sensor rotation", "pose frame"), ("rotation_in_sensor",)
     ),
     "clock of the pose 1 %": Mistake(_slow_clock("pose"), POSED, ("clock",), (".time.scale",)),
     "clock of the IMU 1 %": Mistake(_slow_clock("imu"), SENSED, ("clock",), (".time.scale",)),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 
-from drake_teleop.logs.check.conventions import check_log
+from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.sample import sample_log_command
 
 folder = Path(tempfile.mkdtemp())

@@ -63,7 +63,7 @@ def identify_command(
             same format, is written too (see `drake_teleop.load.identification`).
 
     Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+        the summary; docs/logs.md explains its names.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
@@ -88,7 +88,7 @@ def identify_command(
         summary |= {"gripper": str(gripper), "object": object_figures(alone)}
         summary["notes"] += object_notes(alone)
     summary = plain(summary)
-    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, one_page
+    from drake_teleop.logs.pictures import draw_fit, draw_knowledge, stack_pictures
     from drake_teleop.logs.report import write_report
 
     with output_folder(out):
@@ -97,7 +97,7 @@ def identify_command(
             alone.save(out / "object.json")
         write_picture(out / "fit.png", draw_fit(found))
         write_picture(out / "knowledge.png", draw_knowledge(found))
-        one_page(out / "fit.png", out / "knowledge.png", out / "report.png")
+        stack_pictures(out / "fit.png", out / "knowledge.png", out / "report.png")
         write_report(out / "report.html", found, summary, alone)
         write_json(out / "summary.json", summary)
     if not quiet:
@@ -130,7 +130,7 @@ def eliminate_command(
     `edge` which samples are not judged (see `EliminatedLog`).
 
     Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+        the summary; docs/logs.md explains its names.
     """
     load_file = Identification.load(load)
     found = eliminate_log(
@@ -216,7 +216,7 @@ def detect_command(
     `edge` for samples that are not judged.
 
     Returns:
-        the summary; its names are explained in `drake_teleop.logs.detection`.
+        the summary; docs/detection.md explains its names.
     """
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated

@@ -1,1 +1,1 @@
-"""Recorded logs: foreign columns, units, frames and clocks into one canonical table. No Drake."""
+"""Recorded logs: identification, elimination and contact detection, without Drake."""

@@ -1,4 +1,4 @@
-"""A log with the motion that explains the wrench of an identified load best, without its delay."""
+"""Log with the motion that best explains the wrench of an identified load, without its delay."""
 
 from __future__ import annotations
 
@@ -16,21 +16,19 @@ from drake_teleop.logs.read.alignment import ends, low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, moved_by_splines
+from drake_teleop.logs.spline_motion import clock_note, motion_of_known_load, use_spline_motion
 
 
 @dataclass(frozen=True)
 class AlignedLog:
-    """A log whose motion is at the instants of its wrench.
+    """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: the log.
-        delay_s: of the motion that was recorded behind the wrench [s].
+        log: with removed weight, its specific force is the acceleration.
+        delay_s: of the recorded motion behind the wrench [s].
         source: of the delay: "estimated", "given", "load" or "static".
-        differentiated: the same with motion that is differentiated, if required.
-        edge: (N,) samples whose motion or low-pass has measurements on one side only.
-
-    Where the weight is removed from the wrench, the specific force is the acceleration alone.
+        differentiated: the same with differentiated motion, if required.
+        edge: (N,) samples with measurements on one side only.
     """
 
     log: Log
@@ -49,16 +47,14 @@ def aligned_log(
     differentiate: bool,
     weight_removed: bool = False,
 ) -> AlignedLog:
-    """The log with the motion of splines of its poses if they have positions.
-
-    With an IMU beside them the IMU's motion is used if the load explains the wrench better with it.
+    """Return the log with the motion of splines, or of an IMU if the load fits better with it.
 
     Args:
-        path, cutoff_hz, delay: as of `eliminate_log`.
+        path, cutoff_hz, delay: as in `eliminate_log`.
         phi: (10,) of the load.
-        usual_s: the delay of a record that does not determine it [s].
+        usual_s: delay for a record that does not determine it [s].
         differentiate: whether `AlignedLog.differentiated` is required.
-        weight_removed: whether the robot has removed the weight of the load from the wrench.
+        weight_removed: whether the wrench is without the weight of the load.
 
     Raises:
         DrakeTeleopError: if the weight is removed and the log has no orientation.
@@ -71,7 +67,7 @@ def aligned_log(
         found = motion_of_known_load(log, delay, coefficients, usual_s)
     if found is not None:
         motion, source = found
-        moved, one_sided = moved_by_splines(log, motion)
+        moved, one_sided = use_spline_motion(log, motion)
         moved = replace(moved, notes=(*moved.notes, *clock_note(motion)))
         plain = undelayed(log, motion.delay_s) if differentiate else None
         if weight_removed:
@@ -95,7 +91,7 @@ def aligned_log(
 
 
 def without_orientation(where: str) -> DrakeTeleopError:
-    """Return the error for a wrench without the load's weight and a motion without orientation."""
+    """Return the error for a removed weight and a motion without orientation."""
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",
@@ -105,7 +101,7 @@ def without_orientation(where: str) -> DrakeTeleopError:
 
 
 def accelerated(log: Log) -> Log:
-    """Return the log with the acceleration in the place of the specific force.
+    """Return the log with the acceleration instead of the specific force.
 
     Raises:
         DrakeTeleopError: if the log has no orientation.
@@ -116,7 +112,6 @@ def accelerated(log: Log) -> Log:
 
 
 def _spread(aligned: AlignedLog, phi: NDArray[np.float64], cutoff_hz: float | None) -> float:
-    """Logarithm of the widths that half of what the load leaves lies within, of all channels."""
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
     left = np.sort(left[~aligned.edge], axis=0)

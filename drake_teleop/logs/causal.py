@@ -1,16 +1,7 @@
-"""The contact wrench as a loop would have had it: from the past alone, late or predicted.
+"""Contact wrench from past samples alone, as in a control loop.
 
-The zero-phase low-pass of `alignment` looks ahead. A loop cannot: its low-pass is a Butterworth
-filter of second order that halves the amplitude at the same cut-off. It lags by sqrt(2) / w at low
-frequencies (9.8 ms at 30 Hz), w = 2 pi cut-off / 3^(1/4), and a motion that comes later than the
-wrench has to be waited for. Wrench and motion are aligned first and the result is filtered, so that
-the elimination itself does not suffer from the lag; all that is late is the contact wrench. The
-sensor's offsets are those that a loop knows beforehand: the load file's, or of a start of the
-record in which nothing is touched.
-
-Prediction extrapolates the filter's output by its slope over the whole lag L: the filter becomes
-(1 + L s) H(s), whose delay is zero at low frequencies. The price is noise and overshoot: with no
-motion to wait for the rms of white noise grows by sqrt(3).
+The low-pass is a Butterworth filter of second order, Eq. (T11) in docs/theory.md. Wrench and
+motion are aligned before it, so that elimination does not suffer from its lag.
 """
 
 from __future__ import annotations
@@ -28,14 +19,14 @@ MODES = ("delayed", "predicted")
 
 @dataclass(frozen=True)
 class CausalWrench:
-    """Wrenches from the past alone, at the instants of the log, N samples.
+    """Wrenches from past samples alone, N samples.
 
     Args:
         mode: one of `MODES`.
-        lag_s: L, by how much a slow contact comes late, or would without the prediction [s].
+        lag_s: delay of a slow contact without prediction [s].
         contact: (N, 6) Eq. (13).
         scaled: (N, 6) gamma F_c + sigma V phi.
-        offsets: (6,) of the sensor, known before: those of the load file or of the record's start.
+        offsets: (6,) of the load file or the start of the record.
     """
 
     mode: str
@@ -48,17 +39,16 @@ class CausalWrench:
 def causal_low_pass(
     x: NDArray[np.float64], dt: float, cutoff_hz: float | None, ahead_s: float = 0.0
 ) -> NDArray[np.float64]:
-    """Butterworth low-pass of second order along the first axis, settled at the first sample.
+    """Filter along the first axis, settled at the first sample.
 
     Args:
         x: (N, ...) samples.
-        dt: their spacing [s].
-        cutoff_hz: where the amplitude is halved, as by `alignment.low_pass`; None, or anything
-            above the Nyquist rate, leaves `x` as it is.
-        ahead_s: the output's slope times this is added [s].
+        dt: sample time [s].
+        cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
+        ahead_s: prediction by the output's slope [s].
 
     Raises:
-        DrakeTeleopError: for a prediction without a filter, whose slope would be all noise.
+        DrakeTeleopError: for a prediction without a filter.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -78,12 +68,8 @@ def causal_low_pass(
 def low_pass_coefficients(
     dt: float, cutoff_hz: float, ahead_s: float = 0.0
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Of `causal_low_pass`: b (3,), a (3,) and the memory (2,) that is settled at 1.
-
-    Args:
-        dt, cutoff_hz, ahead_s: see there; the cut-off is below the Nyquist rate.
-    """
-    # SciPy's filters take longer to import than all the rest of the command.
+    """Return b (3,), a (3,) and the state (2,) settled at 1 of `causal_low_pass`."""
+    # Imported here, because the import takes longer than the rest of the command.
     from scipy.signal import bilinear, lfilter_zi
 
     w = _prewarped(cutoff_hz, dt)
@@ -92,7 +78,7 @@ def low_pass_coefficients(
 
 
 def filter_lag(dt: float, cutoff_hz: float | None) -> float:
-    """The delay of `causal_low_pass` at low frequencies [s]."""
+    """Return the delay of `causal_low_pass` at low frequencies [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
     return math.sqrt(2.0) / _prewarped(cutoff_hz, dt)
@@ -107,15 +93,14 @@ def causal_wrenches(
     delay_s: float,
     mode: str,
 ) -> CausalWrench:
-    """What a loop would have put out at each instant.
+    """Return the output of a loop at each instant.
 
     Args:
-        contact, scaled: (N, 6) each from wrench and motion of the same instants, not filtered.
-        dt: their spacing [s].
+        contact, scaled: (N, 6), unfiltered, wrench and motion of the same instants.
+        dt: sample time [s].
         cutoff_hz: of the low-pass.
-        delay_s: how far the motion lags behind the wrench [s]; if positive it is waited for, to
-            the next full sample.
-        mode: "delayed" leaves the lag, "predicted" extrapolates over it.
+        delay_s: of the motion behind the wrench [s], rounded up to a full sample.
+        mode: "delayed" keeps the lag, "predicted" extrapolates over it.
 
     Raises:
         DrakeTeleopError: for another mode, or a prediction without a low-pass.
@@ -137,5 +122,4 @@ def causal_wrenches(
 
 
 def _prewarped(cutoff_hz: float, dt: float) -> float:
-    """The analogue rate w [rad/s]: 1 / (1 + (v / w)^4) is 1/4 for v that falls on `cutoff_hz`."""
     return 2.0 / dt * math.tan(math.pi * cutoff_hz * dt) / 3.0**0.25

@@ -1,6 +1,6 @@
-"""Lines of a log description that correct the causes named in its record.
+"""Lines of a log description that correct the causes of a record.
 
-A line states the resulting value: that of the description with all causes corrected.
+Each line contains the value after the correction of all causes.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.description import NO_YAML, UNITS, Description
 from drake_teleop.logs.read.tables import FORMATS
 
 Fields = dict[str, Any]
-"""Value of each field that a cause may correct, by its name in a description."""
-_HEAVIEST_KG = 1000.0
+"""Values of the correctable fields, by their names in a description."""
+_MAX_MASS_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
-_PLACES = ("pose.position_in_sensor", "imu.position")
-_TURNS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
-_DIGITS = {_GRAVITY: 4, _PLACES[0]: 5, _PLACES[1]: 5}
-_OTHERWISE = {
+_FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
+_FORCE_UNITS, _TORQUE_UNITS = ("N", "lbf"), ("N m", "N mm", "lbf in")
+_SAME_RATIO = 1e-3
+_POSITIONS = ("pose.position_in_sensor", "imu.position")
+_ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
+_DIGITS = {_GRAVITY: 4, _POSITIONS[0]: 5, _POSITIONS[1]: 5}
+_OTHER_REMEDIES = {
     "axes": "correct the columns of wrench.force and wrench.torque",
     "sensor rotation": "correct the mounting or the frame of the pose",
     "pose frame": "add the position to pose, or an accelerometer",
@@ -34,57 +37,52 @@ _OTHERWISE = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Add the lines that correct them to the messages of causes.
-
-    Args:
-        causes: of a log.
-        log: as it was read, with its description.
-        by_pose: whether the positions of poses determine the acceleration, not an IMU.
+    """Add the correcting lines to the messages; `by_pose`: the acceleration is from poses, not from
+    an IMU.
     """
-    texts = _corrected(causes, log, by_pose)[1]
+    texts = _correct_fields(causes, log, by_pose)[1]
     return tuple(
         replace(cause, message=f"{cause.message}; {text}") if text else cause
         for cause, text in zip(causes, texts, strict=True)
     )
 
 
-def doubted_force_unit(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Say which fields to set if a mass is beyond that of any load of a wrist sensor."""
-    if abs(mass) < _HEAVIEST_KG or log.described is None or log.described.wrench is None:
+def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
+    """Return the fields to set if a mass is too large for a wrist sensor."""
+    if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
-    fields = _corrected(causes, log, by_pose=True)[0]
+    fields = _correct_fields(causes, log, by_pose=True)[0]
     ratio = fields[_TORQUE] / fields[_FORCE]
-    text = _written(_TORQUE, ratio)
+    text = _yaml_value(_TORQUE, ratio)
     return (
         f"a mass of {mass:.3g} kg is implausible: the force is probably not in"
         f" {log.described.wrench.force.unit}; set {_FORCE} to the value of one unit of the file"
         f" (a power of ten that gives a load of a few kg: {10.0 ** -round(np.log10(abs(mass))):g})"
-        f" and {_TORQUE} to {text} times that{_where(log)}"
+        f" and {_TORQUE} to {text} times that{_no_yaml_note(log)}"
     )
 
 
-def _corrected(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
-    """Return all fields, and for each cause the lines that correct it."""
+def _correct_fields(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
     assert log.described is not None
     fields = _fields(log.described, by_pose)
     column = _columns(fields[_FRAME])
     touched: list[list[str]] = []
     for cause in causes:
-        before = {name: _written(name, value) for name, value in fields.items()}
+        before = {name: _yaml_value(name, value) for name, value in fields.items()}
         if cause.name == "gain":
             _gain(fields, cause.values, column)
         elif cause.name in _CORRECTIONS:
             _CORRECTIONS[cause.name](fields, cause.values)
-        touched.append([k for k, x in before.items() if _written(k, fields[k]) != x])
+        touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
     texts = []
     for cause, names in zip(causes, touched, strict=True):
-        lines = " and ".join(f"{name}: {_written(name, fields[name])}" for name in names)
-        otherwise = _OTHERWISE.get(cause.name, "")
-        texts.append(f"set {lines}{_where(log)}" if lines else otherwise)
+        lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
+        otherwise = _OTHER_REMEDIES.get(cause.name, "")
+        texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
     return fields, texts
 
 
-def _where(log: Log) -> str:
+def _no_yaml_note(log: Log) -> str:
     return f" ({NO_YAML})" if Path(log.source).suffix.lower() in FORMATS else ""
 
 
@@ -98,6 +96,8 @@ def _fields(description: Description, by_pose: bool) -> Fields:
         _FRAME: frame if isinstance(frame, str) else np.array(frame),
         _FORCE: np.array(wrench.force.scale),
         _TORQUE: np.array(wrench.torque.scale),
+        _FORCE_UNIT: wrench.force.unit,
+        _TORQUE_UNIT: wrench.torque.unit,
         _WEIGHT: weight if isinstance(weight, str) else np.array(weight),
         _GRAVITY: description.gravity_W,
     }
@@ -116,13 +116,12 @@ def _fields(description: Description, by_pose: bool) -> Fields:
 
 
 def _columns(frame: Any) -> list[int] | None:
-    """Column of the file behind each axis of S, if its axes are signed axes of the file."""
     if isinstance(frame, str) or (np.abs(frame).max(axis=1) < 1.0 - 1e-6).any():
         return None
     return [int(j) for j in np.abs(frame).argmax(axis=1)]
 
 
-def _written(name: str, value: Any) -> str:
+def _yaml_value(name: str, value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
     if name in (_FRAME, "imu.frame") and np.allclose(value, np.eye(3), atol=1e-6):
@@ -148,7 +147,7 @@ def _axes(fields: Fields, values: dict[str, Any]) -> None:
 def _rotation(fields: Fields, values: dict[str, Any]) -> None:
     """Rotate all motion to the axes of the wrench, which are those of S."""
     R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
-    for name in {*_TURNS, *_PLACES} & set(fields):
+    for name in {*_ROTATIONS, *_POSITIONS} & set(fields):
         fields[name] = R @ fields[name]
 
 
@@ -157,11 +156,19 @@ def _gravity(fields: Fields, values: dict[str, Any]) -> None:
     fields[_GRAVITY] = true * np.linalg.norm(fields[_GRAVITY]) / np.linalg.norm(true)
 
 
-def _removed(fields: Fields, values: dict[str, Any]) -> None:
+def _weight(fields: Fields, values: dict[str, Any]) -> None:
     fields[_WEIGHT] = "removed"
 
 
 def _factor(fields: Fields, values: dict[str, Any]) -> None:
+    """Exchange the unit of torque or force if that explains the factor, otherwise scale."""
+    force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
+    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
+    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]
+    for ratio, name, unit in ratios:
+        if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
+            fields[name] = unit
+            return
     fields[_TORQUE] = fields[_TORQUE] / values["factor"]
 
 
@@ -174,7 +181,7 @@ def _gain(fields: Fields, values: dict[str, Any], column: list[int] | None) -> N
 
 
 def _frame(fields: Fields, values: dict[str, Any]) -> None:
-    for name in _PLACES:
+    for name in _POSITIONS:
         if name in fields:
             fields[name] = fields[name] + values["position_in_sensor"]
 
@@ -183,8 +190,8 @@ _CORRECTIONS: dict[str, Callable[[Fields, dict[str, Any]], None]] = {
     "axes": _axes,
     "sensor rotation": _rotation,
     "gravity direction": _gravity,
-    "weight removed": _removed,
-    "payload configured": _removed,  # an estimate of it would count as exact
+    "weight removed": _weight,
+    "payload configured": _weight,  # an estimated payload would count as exact
     "torque factor": _factor,
     "pose frame": _frame,
 }

@@ -1,9 +1,5 @@
-"""Detection of contact in a log, above the noise floor of free motion.
+"""Contact detection in a log, above the noise floor of free motion.
 
-Names in the summary of `drake-teleop detect` beside those that it has in common with `eliminate`;
-forces in N, torques in N m, frame S:
-
-====================== ==========================================================================
 load                   the identification's file; null if it was identified from the log itself
 free                   the log of free motion that floor and threshold are of; null for the parts
                        of the log itself in which nothing stands out, see
@@ -22,6 +18,8 @@ contacts               list of start_s, stop_s, peak_N, peak_Nm; and at the peak
                        push (3), the direction in which the environment pushes, and point_m (3), of
                        its line the point nearest to the origin of S; null if there is no force
 ====================== ==========================================================================
+=======
+docs/detection.md explains the names in the summary of `drake-teleop detect`.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.contact import FEWEST, Detection
+from drake_teleop.logs.contact import MIN_SAMPLES, Detection
 from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_log
 
 if TYPE_CHECKING:
@@ -44,12 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """A log and where it is in contact, N samples.
-
-    Args:
-        eliminated: the log without its non-contact wrench.
-        others: as of `Detection`.
-    """
+    """Contacts of a log, with `eliminated`, the log without its non-contact wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 
@@ -63,24 +56,19 @@ def detect_log(
     cutoff_hz: float = 30.0,
     delay: str | float = "auto",
 ) -> DetectedLog:
-    """Finds contact in a log, after the zero-phase low-pass of `eliminate_log`.
-
-    The threshold is a quarter above what free motion reaches. It is worth as much as that motion:
-    it should be as fast, pass the same poses and be as long as what is judged by it.
+    """Find contact after the zero-phase low-pass of `eliminate_log`.
 
     Args:
         path: canonical table or log description.
-        load: identification.json, or what is in it; None identifies it from the log itself, which
-            contact disturbs.
-        free: log of free motion with the same load; None takes the parts of the log itself in
-            which nothing stands out.
+        load: identification.json or its content; None: identified from the log itself.
+        free: log of equally fast free motion with the same load; None: calm parts of the log
+            itself.
         statistic: one of `STATISTICS`.
         cutoff_hz: of the low-pass.
-        delay: as of `eliminate_log`.
+        delay: as in `eliminate_log`.
 
     Raises:
-        DrakeTeleopError: if a log or load file cannot be used or is of static poses, or for another
-            statistic.
+        DrakeTeleopError: for an unusable log or load file, static poses or an unknown statistic.
     """
     if load is None:
         load = identify_log(path, cutoff_hz=cutoff_hz, delay=delay).identification
@@ -90,17 +78,20 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise DrakeTeleopError("holds poses at rest, which have no contact", where=found.log.source)
+        raise DrakeTeleopError(
+            "contains poses at rest, which have no contact", where=found.log.source
+        )
     if found.detection is None:
         raise DrakeTeleopError(
-            f"{len(found.log)} samples are too few to tell contact from noise",
+            f"{len(found.log)} samples are too few to separate contact from noise",
             where=found.log.source,
-            remedy=f"give a record of more than {FEWEST} samples",
+            remedy=f"give a record of more than {MIN_SAMPLES} samples",
         )
     return DetectedLog(**vars(found.detection), eliminated=found)
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
+    """Return the share of samples above a force, for each kind of wrench."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,
@@ -115,7 +106,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
 
 
 def draw_detection(found: DetectedLog) -> Any:
-    """|F| without and with the load's own on top; below, the statistic and its threshold."""
+    """Draw |F| before and after elimination, and the statistic with its threshold."""
     from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
 
     eliminated = found.eliminated

@@ -1,4 +1,4 @@
-"""The block means of a log, with its splines or its own motion."""
+"""Search for causes in a log, and the load within the model that explains it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import numpy as np
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.cause_lines import with_lines
-from drake_teleop.logs.causes.candidates import part
 from drake_teleop.logs.causes.cause import Cause
 from drake_teleop.logs.causes.explain import Explanation, explain
 from drake_teleop.logs.causes.instants import Instants, instants
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.pose_motion.splines import PoseSplines, passed
 from drake_teleop.logs.read.alignment import undelayed
@@ -21,38 +20,32 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.gravity import log_instants
 from drake_teleop.logs.read.rotations import rotation_matrices
 
-_MARGIN = 2.0  # knots, at either end
-_FEWEST = 100
-_SPREAD = 1.5  # of block deviations over stated ones, from which intervals are widened
-_HIGHEST = 25.0  # Hz, of block means
+_MARGIN_KNOTS = 2.0  # knots, at either end
+_MIN_ROWS = 100
+_MAX_DEVIATION_RATIO = 1.5  # ratio of block to stated deviations that widens the intervals
+_BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Explain the wrench of a log; None if it is too short.
+    """Explain the wrench of a log; None if it is too short. `found`: motion by splines."""
 
-    Args:
-        log: as it was read.
-        delay_s: of the motion behind the wrench [s].
-        found: the motion of its poses, if that is by splines.
-    """
-
-    def of(more: float) -> Instants:
+    def with_delay(more: float) -> Instants:
         late = delay_s + more
         if found is not None:
-            return _of_splines(log, found, late)
+            return _spline_instants(log, found, late)
         return log_instants(undelayed(log, late))
 
-    data = of(0.0)
-    if data.used.sum() < _FEWEST:
+    data = with_delay(0.0)
+    if data.used.sum() < _MIN_ROWS:
         return None
-    why = explain(data, of, log.free)
+    why = explain(data, with_delay, log.free)
     if log.described is None:
         return why
     causes = with_lines(why.causes, log, by_pose=found is not None)
     return replace(why, causes=causes)
 
 
-def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
+def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
     assert log.posed is not None
     splines, gravity = found.splines, log.posed.gravity_W
     middle = np.mean(log.posed.poses.position, axis=0)
@@ -63,18 +56,18 @@ def _of_splines(log: Log, found: PoseEstimate, late: float) -> Instants:
         p = splines.position(t + late) - middle
         return *splines.motion(t + late, gravity), rotation_matrices(q, "quaternion_wxyz"), p
 
-    stamps, margin = splines.poses.t, _MARGIN * splines.spacing
+    stamps, margin = splines.poses.t, _MARGIN_KNOTS * splines.spacing
     at = log.t + late
     lost = (at < stamps[0] + margin) | (at > stamps[-1] - margin)
     lost |= (log.t < log.t[0] + margin) | (log.t > log.t[-1] - margin)
     if log.bridged is not None:
         lost |= log.bridged
-    return instants(log.t, log.wrench, motion, gravity, lost, _shake(splines))
+    return instants(log.t, log.wrench, motion, gravity, lost, _acceleration_noise(splines))
 
 
-def _shake(splines: PoseSplines) -> float:
-    """Standard deviation of the splines' acceleration by noise of the positions [m/s^2]."""
-    f = np.linspace(0.0, _HIGHEST, 500)
+def _acceleration_noise(splines: PoseSplines) -> float:
+    """Return the noise of the acceleration caused by the positions [m/s^2]."""
+    f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed(f, splines.spacing)
     if splines.imu_rows is not None:
         share = share * splines.imu_rows.share(f)[0]
@@ -85,8 +78,8 @@ def _shake(splines: PoseSplines) -> float:
 def explained_load(load: Identification, why: Explanation) -> Identification:
     """Return the load within the model that explains the wrench, or its intervals widened.
 
-    Noise of an IMU's angular acceleration makes the inertia too small by its share of the variance;
-    that share of the inertia is in its deviations.
+    Noise of an IMU's angular acceleration reduces the inertia; its share is added to the
+    deviations.
     """
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
@@ -105,7 +98,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))
         ratio = np.where(load.identifiable, ratio, 1.0)
-        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _SPREAD:
+        if np.sqrt(np.mean(ratio[load.identifiable] ** 2)) < _MAX_DEVIATION_RATIO:
             return load
         wide = load.covariance * np.where(np.eye(16) > 0, ratio**2, np.outer(ratio, ratio))
         known = load.identifiable & worth_stating(np.sqrt(np.diag(wide)), load.phi)
@@ -132,7 +125,7 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """The causes, with the finding for a displaced and rotated frame of the poses."""
+    """Return the causes, with the finding for a displaced and rotated pose frame."""
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)
@@ -140,11 +133,11 @@ def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
 
 
 def removed_note(why: Explanation) -> str:
-    """Say which weight `wrench.weight: removed` stands for; nothing without it."""
+    """Return a note about the weight behind `wrench.weight: removed`."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]
-    deviation = float(np.sqrt(part(why.state, "weight")[1][0, 0]))
+    deviation = float(np.sqrt(why.state.extension("weight")[1][0, 0]))
     com = ", ".join(f"{1e3 * x / mass:.3g}" for x in moment) if mass else "0, 0, 0"
     return (
         f"the weight that is removed from the wrench is that of {mass:.4g} kg"

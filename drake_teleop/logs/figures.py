@@ -1,8 +1,5 @@
-"""The figures of `drake-teleop identify` and `drake-teleop eliminate`.
+"""Figures of `drake-teleop identify` and `drake-teleop eliminate`.
 
-Names in the summaries (and in summary.json); forces in N, torques in N m, frame S:
-
-====================== ==========================================================================
 both
 ====================== ==========================================================================
 log                    the file that was read
@@ -79,6 +76,8 @@ causal                    null, or, if --causal was given: mode, lag_s (by how m
                           and residual_torque_rms, noise_floor as above, and difference_rms and
                           difference_torque_rms, of |F_causal - F_c| and |tau_causal - tau_c|
 ========================= =======================================================================
+=======
+docs/logs.md explains their names, section "Fields of the summary".
 """
 
 from __future__ import annotations
@@ -107,7 +106,7 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """What both summaries begin with."""
+    """Return the first fields of both summaries."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
@@ -124,7 +123,7 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """The load of a part of a record."""
+    """Return the load of a part of a record."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -140,7 +139,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """A load: values, uncertainties, and which of them mean something."""
+    """Return values and uncertainties of a load."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -160,7 +159,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """The same of an object without its gripper."""
+    """Return the figures of an object without its gripper."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -169,7 +168,7 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """What to know about the object; the mass is not significantly negative here."""
+    """Return warnings for an object without significantly negative mass."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
@@ -192,7 +191,7 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 
 
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
-    """What is left of the wrench, root mean square and peak."""
+    """Return rms and peak values of the wrenches."""
 
     def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.sqrt(np.mean(x**2, axis=0))
@@ -210,7 +209,7 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Noise floor and contacts, and what `--causal` adds."""
+    """Return noise floor, contacts and causal figures."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
@@ -256,7 +255,7 @@ def _reduced(
 
 
 def plain(value: Any) -> Any:
-    """The same with lists and numbers of Python instead of numpy's, and null for infinity."""
+    """Convert NumPy values to plain Python, and infinity to None."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

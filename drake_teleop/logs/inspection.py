@@ -1,23 +1,6 @@
-"""What `drake-teleop inspect` does: a log's quality, suspected errors, or a draft description.
+"""`drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
 
-Names in the summary (and in summary.json):
-
-=============== =================================================================================
-log             the file that was read
-kind            "description", "canonical", "unknown" (a table without known columns) or "bag"
-topics          of a bag: type, messages and rate_hz of each; otherwise empty
-streams         of each: rows, rate_hz, duration_s, longest_gap_s, gaps, clock_jumps (time stamps
-                that stand still or go back), repeated_rows, nan_rows, nan_longest (rows of the
-                longest block), and columns: of each min, max, mean, noise (standard deviation of
-                white noise, from third differences), saturated (samples at the end of the range)
-findings        list of name and message: what is suspicious and what to change
-fit             of a load to the description as given: mass [kg] and unexplained, the share of the
-                wrench's variance; null if the log cannot be read
-mounting        of the IMU against the pose: R_SI, angle_deg, right_angled, lag_s (the best
-                constant), drift of the clock [s/s], unexplained; null without both
-delay_s         of the motion behind the wrench; null if the log does not determine it
-draft           the file with a draft description of an unknown table or a bag, or null
-=============== =================================================================================
+docs/logs.md explains the names in its summary, section "Fields of the summary".
 """
 
 from __future__ import annotations
@@ -33,25 +16,22 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.writing import make_folder, output_folder, write_json, write_text
-from drake_teleop.logs.check.against_load import lag_finding
-from drake_teleop.logs.check.conventions import Conventions, check_conventions
+from drake_teleop.logs.check.conventions import check_conventions
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import draft_description
-from drake_teleop.logs.check.finding import EFFECTS, Finding
 from drake_teleop.logs.check.load_fit import white_noise
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
 
-BANDWIDTH = 30.0
-"""Gaps are those that matter below this frequency [Hz]."""
-REPEATED = 0.05
-"""Repeated rows are mentioned from this share of all rows, or from a block of `BLOCK` rows."""
-BLOCK = 5
-_SIGNIFICANT = 5.0
-"""Standard deviations above which a delay is a finding."""
+BANDWIDTH_HZ = 30.0
+"""Bandwidth of interest, which determines the length of a gap [Hz]."""
+MIN_REPEATED_SHARE = 0.05
+"""Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
+MIN_REPEATED_BLOCK = 5
 _QUANTITIES = (
     "force",
     "torque",
@@ -65,15 +45,12 @@ _QUANTITIES = (
 
 
 def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
-    """Inspects a log and writes summary.json, and draft.yaml for an unknown table, into `out`.
+    """Inspect a canonical log, a description, any table or a bag.
 
-    Args:
-        log: a canonical log, a description, any table, or a bag.
-        out: folder for the results.
-        quiet: print nothing.
+    Write summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
 
     Returns:
-        the summary, see the top of this module.
+        the summary.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -111,7 +88,7 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         except DrakeTeleopError:
             known = "f_x" in table.columns and "tau_x" in table.columns
             if known:
-                # A canonical log with NaN or a missing column: its own message is the best one.
+                # A canonical log with NaN or a missing column gets the specific message.
                 description = describe_canonical(log, _finite(table, list(table.columns)))
                 summary["kind"] = "canonical"
         tables = {log: table}
@@ -132,16 +109,14 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
 
 
 def _are_numbers(names: Sequence[str]) -> bool:
-    """Whether what stands where names are expected is the first row of the numbers."""
     with suppress(ValueError):
-        for name in names:  # those that occur twice are told apart by what polars adds to them
+        for name in names:  # polars adds a suffix to repeated names
             float(name.partition("_duplicated_")[0])
         return True
     return False
 
 
 def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
-    """Writes a draft, and says at its end and in the summary what it lacks."""
     write_text(path, draft)
     summary["draft"] = str(path)
     lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft else []
@@ -176,12 +151,12 @@ def _inspect(
         if stream is not None and stream.time.column is not None:
             clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
     try:
-        found = check_conventions(description, source, clean)
+        found = check_log(Path(source), check_conventions(description, source, clean))
     except DrakeTeleopError as error:
         findings.append(Finding("unusable", str(error)))
     else:
-        more, summary["delay_s"] = _explained(description, source, found)
-        findings += more
+        findings += found.findings
+        summary["delay_s"] = found.delay_s
         summary["fit"] = {"mass": found.fit.mass, "unexplained": found.fit.unexplained}
         if found.mounting is not None:
             summary["mounting"] = {
@@ -195,37 +170,9 @@ def _inspect(
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
 
 
-def _explained(
-    description: Description, source: str, found: Conventions
-) -> tuple[list[Finding], float | None]:
-    """Return findings and delay: those of identification where it names causes, or is surer.
-
-    Errors of the motion, and axes, are found in the conventions; what else they name may be the
-    effect of a cause.
-    """
-    findings, delay = list(found.findings), found.delay_s
-    try:
-        identified = identify_log(source)
-    except DrakeTeleopError:  # which the findings explain, or `identify` reports
-        return findings, delay
-    deviation = identified.delay_deviation_s
-    if identified.causes and all(finding.name in EFFECTS for finding in findings):
-        found_delay = identified.identification.delay_s if np.isfinite(deviation) else delay
-        return [Finding(cause.name, cause.message) for cause in identified.causes], found_delay
-    if identified.delay_source != "estimated" or not np.isfinite(deviation):
-        return findings, delay
-    findings = [finding for finding in findings if finding.name != "lag"]
-    if not findings:
-        delay = identified.identification.delay_s
-        if abs(delay) > _SIGNIFICANT * deviation:
-            findings += lag_finding(description, delay)
-    return findings, delay
-
-
 def _stream(
     name: str, stream: Any, table: Table, description: Description, source: str
 ) -> tuple[dict[str, Any], list[Finding], list[str]]:
-    """Figures and findings of one stream, and the columns that it uses."""
     columns = [
         str(column)
         for field in _QUANTITIES
@@ -245,7 +192,7 @@ def _stream(
         findings.append(
             Finding(
                 "nan",
-                f"{at}: {figures['nan_rows']} rows hold no finite number, the first is row {first},"
+                f"{at}: {figures['nan_rows']} rows contain no finite number, the first is row {first},"
                 f" the longest block {figures['nan_longest']} rows; cut or repair them",
             )
         )
@@ -272,7 +219,7 @@ def _stream(
             findings.append(
                 Finding(
                     "saturation",
-                    f"{at}: {column} stands at the end of its range ({finite.min():.4g} ..."
+                    f"{at}: {column} stays at the end of its range ({finite.min():.4g} ..."
                     f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
                 )
             )
@@ -287,16 +234,15 @@ def _repeated(
     rate: float | None,
     time: Any,
 ) -> list[Finding]:
-    """Whether rows were held by the recorder, and at what rate new ones came.
+    """Return a finding if the recorder repeated rows, with the rate of new rows.
 
-    A coarse sensor at rest repeats rows by itself; but then the row after a repeated one differs in
-    a channel or two, whereas after a row that was held most channels are new at once.
+    A coarse sensor at rest also repeats rows, but then few channels change in the next row.
     """
     held = int(same.sum())
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
     differ = (changing[news_after] != changing[news_after - 1]).mean(axis=1)
-    enough = same.mean() > REPEATED or _longest(same) >= BLOCK
+    enough = same.mean() > MIN_REPEATED_SHARE or _longest(same) >= MIN_REPEATED_BLOCK
     if not enough or (len(differ) and np.median(differ) <= 0.5):
         return []
     longest = _longest(same)
@@ -333,7 +279,7 @@ def _clock(
             "the time stamps never increase", where=at, remedy="name another column, or time.rate"
         )
     median = float(np.median(forward))
-    gaps, back = int((steps > shortest_gap(median, BANDWIDTH)).sum()), int((steps <= 0).sum())
+    gaps, back = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()), int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
         "duration_s": float(t[-1] - t[0]),
@@ -348,7 +294,7 @@ def _clock(
             Finding(
                 "gap",
                 f"{at}: {gaps} gaps, the longest {forward.max():.3g} s at {where:.3g} s: rows are"
-                " missing or the clock jumped; what lies there is not used",
+                " missing or the clock jumped; the motion there is not used",
             )
         )
     if back:
@@ -356,16 +302,15 @@ def _clock(
         findings.append(
             Finding(
                 "clock jump",
-                f"{at}: {back} time stamps stand still or go back, the first in row {row};"
-                " rows that share one are left out or spread evenly; a log that goes back is"
-                " refused: cut it there, or give time.rate",
+                f"{at}: {back} time stamps repeat or decrease, the first in row {row};"
+                " rows with equal stamps are omitted or spread evenly; a log with decreasing"
+                " stamps is refused: cut it there, or give time.rate",
             )
         )
     return findings
 
 
 def _labels(columns: Sequence[str], table: Table) -> list[str]:
-    """One label for each number in a row; an array of an NPZ file has several."""
     labels: list[str] = []
     for column in columns:
         width = table.raw(column, column).shape[1]
@@ -374,22 +319,20 @@ def _labels(columns: Sequence[str], table: Table) -> list[str]:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    """Length of the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
-    """Samples at the largest or smallest value, if they stand there as nowhere else."""
+    """Count samples at the ends of the range, if only these repeat."""
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))
     inside, outside = _longest(held & ends), _longest(held & ~ends)
-    return int(ends.sum()) if inside >= BLOCK and inside > 2 * outside else 0
+    return int(ends.sum()) if inside >= MIN_REPEATED_BLOCK and inside > 2 * outside else 0
 
 
 def _finite(table: Table, names: Sequence[str]) -> Table:
-    """The table's rows in which all these columns are finite."""
     if len({len(table.raw(name, name)) for name in names}) != 1:
         return table
     good = np.all([np.isfinite(table.raw(n, n)).all(axis=1) for n in names], axis=0)
@@ -401,7 +344,6 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
 
 
 def _increasing(table: Table, column: str) -> Table:
-    """The table's rows whose time stamps are later than all before."""
     t = table.single(column, column)
     later = np.ones(len(t), bool)
     later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]

@@ -1,4 +1,4 @@
-"""Pictures of a log: what was measured, what the load explains of it, and what is left."""
+"""Pictures of a log: measured wrench, explained part and residual."""
 
 from __future__ import annotations
 
@@ -45,16 +45,13 @@ VERDICT_WORDS = dict(
         strict=True,
     )
 )
-_POINTS, _LONGEST_WINDOW = 4000, 2**14
-# Lighter than the house's grey: it lies under all the other curves.
+_MAX_POINTS, _MAX_WINDOW = 4000, 2**14
+# Lighter than the grey of the style, because it is under all other curves.
 _MEASURED = "#A3AAB5"
 
 
 def draw_fit(found: IdentifiedLog) -> Figure:
-    """Six channels: measured, offsets + V phi, and the residual, from which the offsets are gone.
-
-    The three forces share one scale, and so do the three torques. Rejected samples are shaded.
-    """
+    """Draw measured wrench, V phi and residual, without offsets; rejected samples are shaded."""
     with house_style():
         figure = Picture(figsize=(10, 7))
         _fit_into(figure, found)
@@ -62,15 +59,15 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
 
 def draw_knowledge(found: IdentifiedLog) -> Figure:
-    """What the record says beyond the values: residual spectrum, intervals, identifiability."""
+    """Draw residual spectrum, intervals and identifiability."""
     with house_style():
         figure = Picture(figsize=(10, 7.4))
         _knowledge_into(figure, found)
     return figure
 
 
-def one_page(upper: Path, lower: Path, page: Path) -> None:
-    """Writes two PNG files of the same width as one, the first above the second."""
+def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
+    """Write two PNG files of equal width as one, the first above the second."""
     from matplotlib.image import imread, imsave
 
     with whole_file(page) as unfinished:
@@ -78,19 +75,16 @@ def one_page(upper: Path, lower: Path, page: Path) -> None:
 
 
 def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Amplitude spectral density, one-sided, by Welch's averaged periodograms.
-
-    Hann windows of an eighth of the record, but of no more samples than a picture has room for,
-    overlapping by half, each without its mean.
+    """Return the one-sided amplitude spectral density by Welch's method.
 
     Args:
         x: (N, k) samples.
-        dt: their spacing [s].
+        dt: sample time [s].
 
     Returns:
         frequencies (m,) without zero [Hz], densities (m, k) [unit of x / sqrt(Hz)].
     """
-    length = min(len(x), max(16, len(x) // 8), _LONGEST_WINDOW)
+    length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
     window = np.hanning(length + 1)[:-1, None]
     starts = range(0, len(x) - length + 1, max(1, length // 2))
     power = np.mean(
@@ -145,7 +139,7 @@ def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
             axis.set(xlabel="pose", ylabel=f"residual [{unit}]", title="Residual of each pose")
         else:
             axis.set(xlabel="frequency [Hz]", ylabel=f"[{unit}/√Hz]", title="Residual spectrum")
-            # What a low-pass has taken away is no noise of the sensor's.
+            # Frequencies above the cut-off do not show sensor noise.
             top = axis.get_ylim()[1]
             axis.set_ylim(bottom=max(axis.get_ylim()[0], 1e-6 * top), top=top)
         axis.legend(ncols=3)
@@ -153,8 +147,6 @@ def _knowledge_into(figure: Any, found: IdentifiedLog) -> None:
 
 
 def _draw_parameters(figure: Any, result: Identification) -> None:
-    """Intervals on the left and standard deviations on the right, both in shares of the natural
-    scale of a load of this mass and size, in the colour of the verdict."""
     natural = natural_scale(result.phi)
     theta = np.concatenate([result.offsets, result.phi]) / natural
     low, high = (end / natural for end in intervals(result))
@@ -192,12 +184,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
 
 
 def draw_elimination(found: EliminatedLog) -> Figure:
-    """|F| on top, then six channels: measured, static weight removed, contact wrench.
-
-    The three forces share one scale, and so do the three torques. The scaled wrench is drawn if it
-    differs from the contact wrench, the causal contact wrench if there is one; contacts are shaded,
-    samples that are not judged are left out.
-    """
+    """Draw |F| and six channels of each wrench; contacts are shaded."""
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
         curves.append(("static weight removed", found.gravity_only, ORANGE))
@@ -237,7 +224,6 @@ def _rms_words(norms: Sequence[tuple[str, NDArray[np.float64], str]]) -> str:
 
 
 def _channel_axes(figure: Any) -> list[Axes]:
-    """Forces left, torques right, x y z downwards; a scale for each column."""
     grid = figure.subplots(3, 2, sharex=True, sharey="col")
     grid[1, 0].set_ylabel("force [N]")
     grid[1, 1].set_ylabel("torque [N m]")
@@ -250,8 +236,8 @@ def _draw(
     curves: Sequence[tuple[str, NDArray[np.float64], str]],
     static: bool,
 ) -> None:
-    # More points than pixels only make the file and the drawing slow.
-    every = max(1, len(t) // _POINTS)
+    # More points than pixels only make the drawing slow.
+    every = max(1, len(t) // _MAX_POINTS)
     for order, (name, values, colour) in enumerate(curves):
         if static:
             size = 7.0 if order == 0 else 3.0

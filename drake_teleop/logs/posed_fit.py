@@ -1,4 +1,4 @@
-"""The load of a log whose motion is known by poses: `pose_motion` for `identify_log`."""
+"""Load of a log with poses: `pose_motion` for `identify_log`."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.against_frame import frame_finding, usable
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.check.pose_checks import pose_finding, usable
 from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, widened
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML
 from drake_teleop.logs.read.tables import FORMATS
-from drake_teleop.logs.spline_motion import clock_note, motion_and_load, moved_by_splines
+from drake_teleop.logs.spline_motion import clock_note, motion_and_load, use_spline_motion
 
 ROBUST = ("robust", "consistent")
-"""Methods that take this way; the others have the motion differentiated and believe it."""
-_LEAST = 1e-9
-# Samples that a log keeps, at least, and their rate over the cut-off of the low-pass.
-_SHOWN, _RATE_OF_CUTOFF = 400_000, 0.25
-_CHUNK, _BESIDE = 2**14, 2**8  # of those, at a time, and beside them to smooth with
+"""Methods that use splines; the others differentiate the motion and take it as exact."""
+_SMALLEST_NOISE = 1e-9
+# Fewest kept samples, and their rate over the cut-off of the low-pass.
+_MIN_KEPT_SAMPLES, _RATE_OVER_CUTOFF = 400_000, 0.25
+_CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for smoothing
 
 
 @dataclass(frozen=True)
 class PosedFit:
-    """What `fit_posed` found.
+    """Result of `fit_posed`.
 
     Attributes:
-        log: the samples that were used, with the motion of the splines, low-passed.
+        log: used samples with the motion of the splines, low-passed.
         fit: the load.
-        delay_s: that was taken out [s].
-        source: "given", "estimated", or "undetermined" (0 was taken).
+        delay_s: removed delay [s].
+        source: "given", "estimated", or "undetermined" (0 was used).
         motion: of the poses.
     """
 
@@ -52,29 +52,30 @@ class PosedFit:
 def fit_posed(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
-    """The load from wrench and poses, and whether the poses are of another frame.
+    """Return the load from wrench and poses, and a finding if the pose frame is not S.
 
-    No load where the method or the log is not of that kind. An IMU beside the poses is heard too:
-    if it tells another motion, or the poses are of another frame, its word is the better one.
+    The load is None for other methods or logs, or if an IMU contradicts the poses.
 
     Args:
-        log: as it was read.
+        log: as read.
         method: one of `METHODS`.
-        cutoff_hz: of the low-pass on what is shown, and on the residual that is stated.
+        cutoff_hz: of the low-pass on samples and residual.
         delay: of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()
     found, source = motion_and_load(log, delay)
-    finding = None if log.free else frame_finding(found, log.posed)
-    if log.posed.imu is not None and not (found.imu_agrees and finding is None):
-        return None, () if finding is None else (finding,)
-    moved, one_sided = moved_by_splines(_fewer(log, cutoff_hz), found)
+    finding = None if log.free else pose_finding(found, log)
+    if log.posed.imu is not None:
+        if not found.imu_agrees or (finding is not None and not _is_sensor_rotated(found)):
+            return None, () if finding is None else (finding,)
+        finding = None  # the search of causes names the rotation
+    moved, one_sided = use_spline_motion(_reduce_rate(log, cutoff_hz), found)
     shown = low_passed(moved, cutoff_hz).only(measured(moved, cutoff_hz) & ~one_sided)
     at = np.clip(np.searchsorted(found.t, shown.t, side="right") - 1, 0, None)
     fit = _fit(shown, found, found.rejected[at], method, log.gain_std)
-    # Gains that are wrong are no rigid load's; what stated ones explain is in the deviations.
-    if finding is not None or not found.fit.explained:  # then nothing of the load is what it seems
+    # Errors of gains beyond the stated ones make the load uncertain.
+    if finding is not None or not found.fit.explained:
         flags = fit.identification.identifiable & np.repeat([True, False], [6, 10])
         fit = replace(fit, identification=replace(fit.identification, identifiable=flags))
     if finding is not None:
@@ -85,17 +86,21 @@ def fit_posed(
     return PosedFit(shown, fit, found.delay_s, source, found), findings
 
 
-def _fewer(log: Log, cutoff_hz: float | None) -> Log:
-    """A very long log at a lower rate: enough for residuals, pictures and changes of the load."""
-    stride = len(log) // _SHOWN
+def _is_sensor_rotated(found: PoseEstimate) -> bool:
+    """Return whether the sensor is rotated against both the poses and the IMU."""
+    return found.frame.turned and not found.frame.shifted
+
+
+def _reduce_rate(log: Log, cutoff_hz: float | None) -> Log:
+    stride = len(log) // _MIN_KEPT_SAMPLES
     if cutoff_hz is not None:
-        stride = min(stride, int(_RATE_OF_CUTOFF / (cutoff_hz * log.dt)))
+        stride = min(stride, int(_RATE_OVER_CUTOFF / (cutoff_hz * log.dt)))
     if stride < 2:
         return log
     few = log.only(slice(None, None, stride))
     wrench = np.empty((len(few), 6))
-    for start in range(0, len(few), _CHUNK):  # the whole would take as much memory again
-        before, stop = max(0, start - _BESIDE), start + _CHUNK + _BESIDE
+    for start in range(0, len(few), _CHUNK):  # in chunks, to save memory
+        before, stop = max(0, start - _NEIGHBOURS), start + _CHUNK + _NEIGHBOURS
         smooth = low_pass(log.wrench[before * stride : stop * stride], log.dt, 0.4 / few.dt)
         wrench[start : start + _CHUNK] = smooth[::stride][start - before :][:_CHUNK]
     bridged = None if log.bridged is None else widened(log.bridged, stride)[::stride]
@@ -105,13 +110,12 @@ def _fewer(log: Log, cutoff_hz: float | None) -> Log:
 def _fit(
     log: Log, found: PoseEstimate, rejected: NDArray[np.bool_], method: str, gain_std: float
 ) -> BatchResult:
-    """As of `identify_batch`, with the estimate and covariance of the spectra."""
     kept = ~rejected
     theta = _consistent(found) if method == "consistent" else found.theta
     residual = log.wrench - theta[:6] - non_contact_wrench(*log.motion, theta[6:])
     noise = np.sqrt(np.mean(residual[kept] ** 2, axis=0))
     size = np.sqrt(np.mean(log.wrench**2, axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    equations = NormalEquations(np.maximum(noise, _LEAST * size + 1e-30))
+    equations = NormalEquations(np.maximum(noise, _SMALLEST_NOISE * size + 1e-30))
     equations.add(*(table[kept] for table in (log.wrench, *log.motion)))
     plain = equations.solve(found.delay_s)
     covariance = found.covariance.copy()
@@ -131,7 +135,7 @@ def _fit(
 
 
 def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
-    """(16,) the nearest load that a body can have; one of negative mass stays as it is."""
+    """(16,) nearest physically consistent load; a negative mass remains."""
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta

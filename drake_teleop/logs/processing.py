@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,17 +22,23 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.aligned_log import aligned_log
 from drake_teleop.logs.causal import CausalWrench, causal_wrenches
-from drake_teleop.logs.cause_lines import doubted_force_unit
-from drake_teleop.logs.causes.cause import Cause, Stretch
-from drake_teleop.logs.check.conventions import check_log, errors_of_motion, question_fit
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.cause_lines import implausible_mass_message
+from drake_teleop.logs.causes.cause import EVENTS, Cause, Stretch
+from drake_teleop.logs.check.against_load import lag_finding
+from drake_teleop.logs.check.conventions import (
+    Conventions,
+    check_file,
+    errors_of_motion,
+    question_fit,
+)
+from drake_teleop.logs.check.corrections import EFFECTS, Finding
 from drake_teleop.logs.contact import (
     Detection,
     detect_contact,
     noise_floor,
+    offset_shift_note,
     robust_offsets,
     samples_of,
-    shifted,
 )
 from drake_teleop.logs.explained_log import (
     explain_log,
@@ -45,29 +52,29 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
-_BY_GAINS = {"gain", "sensor rotation", "torque factor"}
-"""Causes that stated errors of the gains explain."""
-_CONSTANT = 1e-6  # change of a channel over its largest value
-_FEWEST_TO_TARE = 10
-_LARGEST_SCALE = 100.0  # as of `ForceScalingConfig`
+_GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
+"""Causes that are explained by stated errors of gains."""
+_CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
+_MIN_TARE_SAMPLES = 10
+_SIGNIFICANT_DELAY = 5.0  # standard deviations
+_LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 
 
 @dataclass(frozen=True, repr=False)
 class IdentifiedLog:
-    """A log and what was identified from it.
+    """Log with its identified load.
 
     Args:
-        log: the samples that were used: delay taken out, low-passed, none from gaps.
+        log: used samples: without delay and gaps, low-passed.
         identification: the result.
         predicted: (N, 6) offsets + V phi at the same instants.
-        delay_source: as in the summary: "estimated", "given" ...
-        rejected: (N,) samples that "robust" and "consistent" fits took for disturbed.
-        base: which combinations of offsets and load the samples that were used determine.
-        findings: suspected errors of the log's description; only looked for if the fit is poor.
-        causes: what acts beside a rigid load with constant offsets, with times and values; the load
-            is then that within the model that has them, at the start of the record.
-        loads: the load of each stretch, if it changes within the record.
-        delay_deviation_s: standard deviation of an estimated delay [s]; nan if it is unknown.
+        delay_source: as in the summary.
+        rejected: (N,) samples rejected by robust fits.
+        base: combinations of offsets and load that the samples determine.
+        findings: suspected errors of the description.
+        causes: effects beside a rigid load with constant offsets, included in the model.
+        loads: load of each part of the record, if it changes.
+        delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
 
     log: Log
@@ -87,30 +94,26 @@ class IdentifiedLog:
 
 @dataclass(frozen=True)
 class EliminatedLog:
-    """A log without its non-contact wrench. All arrays are low-passed and in S, sign of Eq. (1).
+    """Log without its non-contact wrench. Arrays are low-passed and in S, sign of Eq. (1).
 
     Args:
-        log: the log with its delay taken out, without what lay in gaps; not low-passed.
-        phi: (10,) the load that was used, see `usable_phi`; gripper and object together.
-        point_mass: names of the inertias that are not of the load file but of a point mass.
+        log: without delay and gaps; not low-passed.
+        phi: (10,) of gripper and object, see `usable_phi`.
+        point_mass: names of the inertias replaced by those of a point mass.
         offsets: (6,) of this record.
-        tare_fraction: share of the samples that `offsets` were taken from; 1 if not tared.
-        delay_s: how far the motion lagged behind the wrench [s].
-        delay_source: as in the summary: "estimated", "given" ...
+        tare_fraction: share of the samples that determined `offsets`; 1 if not tared.
+        delay_s: of the motion behind the wrench [s].
+        delay_source: as in the summary.
         measured: (N, 6) wrench without offsets.
         non_contact: (N, 6) V phi.
         contact: (N, 6) Eq. (13).
         scaled: (N, 6) gamma F_c + sigma V phi.
-        gravity_only: (N, 6) wrench without offsets and static weight, or None if the orientation
-            is not known.
-        noise_floor: (6,) of `contact`, one for all motions.
-        detection: where something is touched, see `drake_teleop.logs.contact`; None for static
-            poses and for records too short to tell.
-        causal: the same wrenches as a loop would have had them, or None if not asked for.
-        findings: suspected errors of the log's description; only looked for if the load hardly
-            explains the wrench in half of the record.
-        edge: (N,) samples at the ends of the record, and beside gaps of the poses, whose motion or
-            low-pass has measurements on one side only. They are neither judged nor in any figure.
+        gravity_only: (N, 6) wrench without offsets and weight; None without orientation.
+        noise_floor: (6,) of `contact`, independent of the motion.
+        causal: wrenches as in a control loop, if requested.
+        edge: (N,) unjudged samples at ends and gaps, excluded from all figures.
+        detection: contacts; None for static poses and very short records.
+        findings: suspected errors of the description, after a poor fit.
     """
 
     log: Log
@@ -133,7 +136,7 @@ class EliminatedLog:
 
     @property
     def touched(self) -> NDArray[np.bool_]:
-        """(N,) where something is touched; nowhere without a `detection`."""
+        """(N,) contact; False everywhere without a `detection`."""
         none = np.zeros(len(self.contact), bool)
         return none if self.detection is None else self.detection.touched
 
@@ -144,43 +147,46 @@ def identify_log(
     method: str = DEFAULT_METHOD,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
+    checks: Conventions | None = None,
 ) -> IdentifiedLog:
-    """Identifies the load and the sensor's offsets from a log.
+    """Identify the load and the sensor's offsets from a log.
 
-    Where poses have positions the motion is of splines, of them and of an IMU beside them, and the
-    noise of both is taken out: `drake_teleop.logs.pose_motion`. Otherwise wrench and motion pass
-    the same zero-phase low-pass, and the motion is taken as exact. Static poses are used as they
-    are.
+    With positions, motion is from splines (`drake_teleop.logs.pose_motion`). Otherwise wrench and
+    motion pass one zero-phase low-pass, and motion counts as exact. Static poses are unfiltered.
 
     Args:
         path: canonical table or log description.
         method: one of `drake_teleop.load.batch.methods.METHODS`.
         cutoff_hz: of the low-pass; None for none.
-        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
+        delay: of the motion behind the wrench [s], or "auto".
+        checks: of this log, if already known.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, the method is unknown, or the result would be
-            worthless, see `drake_teleop.logs.check.conventions.question_fit`.
+        DrakeTeleopError: for an unusable log, an unknown method or a worthless result
+            (`question_fit`).
     """
     check_method(method)
     with one_blas_thread():
-        return _identified(path, method, cutoff_hz, delay)
+        check = partial(check_file, Path(path)) if checks is None else lambda: checks
+        return _identified(path, method, cutoff_hz, delay, check)
 
 
 def _identified(
-    path: str | Path, method: str, cutoff_hz: float | None, delay: str | float
+    path: str | Path,
+    method: str,
+    cutoff_hz: float | None,
+    delay: str | float,
+    check: Callable[[], Conventions],
 ) -> IdentifiedLog:
     log = read_log(path, bandwidth_hz=cutoff_hz, differentiate=method not in ROBUST)
-    as_read = log
     posed, other = fit_posed(log, method, cutoff_hz, delay)
     if posed is None and log.posed is not None and log.posed.imu is None:  # too short for splines
         log = read_log(path, bandwidth_hz=cutoff_hz)
+    raw = log
     if posed is not None:
         log, fit, delay_s, source = posed.log, posed.fit, posed.delay_s, posed.source
-        raw = as_read
     else:
         delay_s, source = delay_of(log, cutoff_hz, delay)
-        raw = log
         log = undelayed(log, delay_s)
         log = low_passed(log, cutoff_hz).only(measured(log, cutoff_hz))
         fit = identify_batch(
@@ -195,12 +201,12 @@ def _identified(
     result = fit.identification
     motion = None if posed is None else posed.motion
     why = explain_log(raw, delay_s, motion) if _can_be_explained(raw, posed is not None) else None
-    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _BY_GAINS:
+    if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _GAIN_CAUSES:
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
     errors: tuple[Finding, ...] = ()
     if why is not None and why.causes and why.misfit:
-        errors = errors_of_motion(Path(path))
+        errors = errors_of_motion(check)
     if errors:
         why = None
         known = result.identifiable & np.repeat([True, False], [6, 10])
@@ -218,10 +224,10 @@ def _identified(
     if errors:
         findings = errors
     elif not causes and not raw.free:
-        findings = question_fit(Path(path), log, result, predicted, known_delay) or other
-    doubt = doubted_force_unit(result.mass, causes, raw)
-    if doubt is not None:
-        findings = (*findings, Finding("units", doubt))
+        findings = question_fit(log, result, predicted, known_delay, check) or other
+    mass_message = implausible_mass_message(result.mass, causes, raw)
+    if mass_message is not None:
+        findings = (*findings, Finding("units", mass_message))
     if any(finding.name == "payload" for finding in findings):
         result = replace(
             result, identifiable=np.repeat([True, False], [6, 10]) & result.identifiable
@@ -243,15 +249,50 @@ def _identified(
 
 
 def _can_be_explained(log: Log, by_splines: bool) -> bool:
-    """Whether units and clocks of the motion are right and every channel of the wrench lives."""
     largest = np.abs(log.wrench).max(axis=0)
-    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT * largest).any():
+    if log.static or (np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * largest).any():
         return False
     if log.posed is not None and log.posed.imu is not None and not by_splines:
         return False  # poses and IMU disagree
     still = by_splines and not log.specific_force.any()
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
     return still or 5.0 < weight < 20.0
+
+
+def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
+    """Check a log and its description, with the causes that identification finds.
+
+    Causes replace findings that may be their effects.
+
+    Args:
+        path: canonical table or log description.
+        checks: of the description without causes, if already known.
+
+    Raises:
+        DrakeTeleopError: if the log cannot be read.
+    """
+    checks = check_file(path) if checks is None else checks
+    try:
+        identified = identify_log(path, checks=checks)
+    except DrakeTeleopError:  # the findings explain the error, or `identify` reports it
+        return checks
+    findings, delay = checks.findings, checks.delay_s
+    deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
+    if identified.causes and all(finding.name in EFFECTS for finding in findings):
+        causes = tuple(Finding(cause.name, cause.message) for cause in identified.causes)
+        return replace(
+            checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
+        )
+    if all(finding.name == "lag" for finding in findings):
+        findings = (*findings, *identified.findings)
+    description = identified.log.described
+    if identified.delay_source == "estimated" and np.isfinite(deviation) and description:
+        findings = tuple(finding for finding in findings if finding.name != "lag")
+        if not findings:
+            delay = own_delay
+            if abs(delay) > _SIGNIFICANT_DELAY * deviation:
+                findings = tuple(lag_finding(description, delay))
+    return replace(checks, findings=findings, delay_s=delay)
 
 
 def eliminate_log(
@@ -271,51 +312,37 @@ def eliminate_log(
     free: str | Path | None = None,
     statistic: str = "level",
 ) -> EliminatedLog:
-    """Removes (or scales) the non-contact wrench of a known load in a log.
-
-    Where poses have positions the motion is of splines that the wrench chooses, as in
-    `identify_log`.
+    """Remove (or scale) the non-contact wrench of a known load in a log.
 
     Args:
-        path: canonical table or log description.
-        load: identification.json, or what is in it.
-        gripper: identification.json of the gripper without the object, or what is in it; `load`
-            is then gripper with object. Both about the same origin in the same frame S, which the
-            files cannot tell. None: one load.
-        sigma: share of the non-contact wrench that is kept; of the gripper's, if there is one.
-        sigma_object: share of the object's that is kept; None: sigma. Goes with a gripper only.
+        path, delay: as in `identify_log`.
+        load: identification.json, or its content.
+        gripper: the same of the gripper alone, in the same frame S; `load` is then gripper with
+            object.
+        sigma: kept share of the non-contact wrench, of the gripper if there is one.
+        sigma_object: kept share of the object's, with a gripper only; None: sigma.
         gamma: scale of the contact wrench.
-        eta: Eq. (14), the share that is kept of the object, and nothing of the gripper; without
-            `gripper` the whole load counts as the object. Goes with sigma = 0, gamma = 1 and no
-            sigma_object.
-        cutoff_hz: zero-phase low-pass on everything that comes out; None for none.
-        delay: seconds by which the motion lags behind the wrench, or "auto" to estimate it.
-        tare: take the sensor's offsets from this record (they drift between records), not from
-            `load`: the constant that most of the record agrees on, see `robust_offsets`.
-        causal: "delayed" or "predicted" gives `EliminatedLog.causal` as well. Its motion is
-            differentiated, not of splines. Accelerations that were differentiated from poses have
-            seen half a smoother's window ahead, which a loop would have to wait for in addition.
-        causal_tare_s: length of the start of the record, with nothing touched, that the offsets of
-            the causal wrench are taken from [s]; None takes those of `load`. Either way they come
-            from the past alone.
-        free: log of free motion with the same load, which says what is no contact; None: what is
-            quiet in the record itself.
-        statistic: that contact is told by, one of
-            `drake_teleop.load.contact.noise_floor.STATISTICS`.
+        eta: kept share of the object, Eq. (14), instead of the other scales; the gripper is
+            removed.
+        cutoff_hz: zero-phase low-pass on all outputs; None for none.
+        tare: estimate the offsets from this record (`robust_offsets`), not from `load`.
+        causal: "delayed" or "predicted": also return `EliminatedLog.causal`.
+        causal_tare_s: contact-free start that determines its offsets [s]; None: those of `load`.
+        free: log of free motion with the same load; None: calm parts of the record itself.
+        statistic: of contact, one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
 
     Raises:
-        DrakeTeleopError: if a log or a load file cannot be used, eta is given together with
-            another scale, sigma_object without a gripper, causal or free for static poses, or
-            another statistic.
+        DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
+            with static poses, or an unknown statistic.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
     scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
-    statistic_index(statistic)  # refused here, if it is none
-    # One load without a gripper is all object.
+    statistic_index(statistic)  # raises an error for an unknown name before the long computation
+    # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
     if gripper is not None:
         alone = gripper if isinstance(gripper, Identification) else Identification.load(gripper)
-        identified_object(identification, alone)  # An error for exchanged files.
+        identified_object(identification, alone)  # raises an error for exchanged files
         phi_gripper = usable_phi(alone)[0]
     eliminated = partial(
         _eliminated,
@@ -327,10 +354,10 @@ def eliminate_log(
         tare=tare,
     )
     found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s)
-    calm = None if free is None else eliminated(free)
-    if calm is not None and (found.log.static or calm.log.static):
-        source = (calm if calm.log.static else found).log.source
-        raise DrakeTeleopError("holds poses at rest, which have no contact", where=source)
+    free_motion = None if free is None else eliminated(free)
+    if free_motion is not None and (found.log.static or free_motion.log.static):
+        source = (free_motion if free_motion.log.static else found).log.source
+        raise DrakeTeleopError("contains poses at rest, which have no contact", where=source)
     if found.log.static:
         return found
     detection = detect_contact(
@@ -341,12 +368,15 @@ def eliminate_log(
         identification.residual_rms,
         edge=found.edge,
         free=None
-        if calm is None
-        else (samples_of(calm.log, calm.contact, cutoff_hz).at(~calm.edge), calm.log.dt),
+        if free_motion is None
+        else (
+            samples_of(free_motion.log, free_motion.contact, cutoff_hz).at(~free_motion.edge),
+            free_motion.log.dt,
+        ),
         statistic=statistic,
     )
-    if calm is not None and tare and detection is not None:
-        notes = shifted(found.offsets - calm.offsets, detection)
+    if free_motion is not None and tare and detection is not None:
+        notes = offset_shift_note(found.offsets - free_motion.offsets, detection)
         detection = replace(detection, notes=detection.notes + notes)
     return replace(found, detection=detection)
 
@@ -363,7 +393,6 @@ def _eliminated(
     causal: str | None = None,
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
-    """`eliminate_log` without its detection of contact."""
     if causal is None and causal_tare_s is not None:
         raise DrakeTeleopError(
             "is for the causal wrench only", where="causal_tare_s", remedy="give causal as well"
@@ -405,21 +434,26 @@ def _eliminated(
         gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
-    late = None
+    causal_wrench = None
     if causal is not None and aligned.differentiated is not None:
-        before, motion = identification.offsets, aligned.differentiated.motion
+        causal_offsets, motion = identification.offsets, aligned.differentiated.motion
         if causal_tare_s is not None:
             untouched = contact_wrench(log.wrench, np.zeros(6), *motion, phi)
-            before = _start(log, causal_tare_s, untouched).mean(axis=0)
-        late = causal_wrenches(
-            contact_wrench(log.wrench, before, *motion, phi),
-            scaled_wrench(log.wrench, before, *motion, phi_gripper, phi_object, **scales),
+            causal_offsets = _start_samples(log, causal_tare_s, untouched).mean(axis=0)
+        causal_wrench = causal_wrenches(
+            contact_wrench(log.wrench, causal_offsets, *motion, phi),
+            scaled_wrench(log.wrench, causal_offsets, *motion, phi_gripper, phi_object, **scales),
             log.dt,
             cutoff_hz=cutoff_hz,
             delay_s=delay_s,
             mode=causal,
         )
-        late = replace(late, offsets=before, contact=late.contact[known], scaled=late.scaled[known])
+        causal_wrench = replace(
+            causal_wrench,
+            offsets=causal_offsets,
+            contact=causal_wrench.contact[known],
+            scaled=causal_wrench.scaled[known],
+        )
     contact = smooth(contact)
     return EliminatedLog(
         log=log.only(known),
@@ -435,32 +469,27 @@ def _eliminated(
         scaled=smooth(scaled),
         gravity_only=gravity_only,
         noise_floor=noise_floor(contact[~edge]),
-        causal=late,
+        causal=causal_wrench,
         edge=edge,
-        findings=_suspected(Path(path), log.wrench - offsets, contact),
+        findings=_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
     )
 
 
-def _start(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The samples of `wrench` within `length_s` of the start."""
+def _start_samples(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
     rows = log.t - log.t[0] < length_s
-    if rows.all() or rows.sum() < _FEWEST_TO_TARE:
+    if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
             f"the first {length_s:g} s are {rows.sum()} of {len(log)} samples",
             where="causal_tare_s",
-            remedy=f"give a start of {_FEWEST_TO_TARE} samples or more, less than the record",
+            remedy=f"give a start of {_MIN_TARE_SAMPLES} samples or more, less than the record",
         )
     return wrench[rows]
 
 
 def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """phi with the inertias that were not identifiable replaced by those of a point mass.
+    """Replace unidentified inertias by those of a point mass; return phi (10,) and their names.
 
-    Their fitted values are arbitrary, and may be huge. What mass and centre of mass imply,
-    m (c'c E - c c'), is the smallest inertia that such a load can have about the origin of S.
-
-    Returns:
-        phi (10,), and the names of the inertias that were replaced.
+    m (c'c E - c c') is the smallest inertia about So for this mass and centre of mass.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(~identification.identifiable[10:])
@@ -469,27 +498,31 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
     return phi, tuple(PARAMETERS[10 + i] for i in replaced)
 
 
-def _suspected(
-    path: Path, wrench: NDArray[np.float64], contact: NDArray[np.float64]
+def _suspected_errors(
+    path: Path,
+    wrench: NDArray[np.float64],
+    contact: NDArray[np.float64],
+    load: Identification,
 ) -> tuple[Finding, ...]:
-    """Findings about a log whose load leaves most of the wrench, not only in a contact."""
-    before, after = (float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact))
-    if after < 0.3 * before:
+    """Return errors of the description if the load leaves 30 % of the median force."""
+    sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
+    if sizes[1] < 0.3 * sizes[0]:
         return ()
-    found = check_log(path).findings
-    return tuple(finding for finding in found if finding.name not in ("lag", "payload"))
+    ignored = {"lag", "payload", *EVENTS}
+    if load.weight_removed:
+        ignored |= {"weight removed", "payload configured"}
+    return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
 def _scales(
     sigma: float, sigma_object: float | None, gamma: float, eta: float | None, split: bool
 ) -> dict[str, float]:
-    """The three scales of `scaled_wrench`; without a gripper (`split`) the load is all object."""
     for name, value in (("sigma", sigma), ("sigma_object", sigma_object), ("gamma", gamma)):
         if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
             raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)
     if sigma_object is not None and not split:
         raise DrakeTeleopError(
-            "sigma_object needs to know what is gripper and what is object",
+            "sigma_object requires a gripper",
             where="sigma_object",
             remedy="give the gripper's identification.json as well, or use sigma",
         )
@@ -498,7 +531,7 @@ def _scales(
         return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma}
     if sigma != 0 or gamma != 1 or sigma_object is not None:
         raise DrakeTeleopError(
-            "eta goes with sigma = 0 and gamma = 1 only (Eq. 14)",
+            "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",
             remedy="leave sigma, sigma_object and gamma out",
         )

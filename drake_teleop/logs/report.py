@@ -1,4 +1,4 @@
-"""The report of `identify`: one self-contained HTML page."""
+"""HTML report of `identify`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS
 from drake_teleop.logs.processing import IdentifiedLog
 
-# Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
+# Eq. (7): symbol, index, printed unit, and its factor from SI.
 _PARAMETERS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
@@ -29,7 +29,7 @@ _PILLS = {"identified": "agrees", "not": "differs"}
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter as printed, all in `unit`; empty where there is nothing to say."""
+    """Printed row of one parameter, in `unit`."""
 
     symbol: str
     index: str
@@ -42,10 +42,7 @@ class ParameterRow:
 
 
 def parameter_rows(load: Identification) -> list[ParameterRow]:
-    """(16) the table of [offsets; phi], Eq. (7).
-
-    Values that are not identified are not printed: somebody would use them.
-    """
+    """Return the 16 rows of [offsets; phi], Eq. (7), without unidentified values."""
     theta = np.concatenate([load.offsets, load.phi])
     columns = np.stack([theta, load.standard_deviations, *intervals(load)], axis=1)
     rows = []
@@ -56,7 +53,7 @@ def parameter_rows(load: Identification) -> list[ParameterRow]:
         texts = ("–", "", "")
         if verdict != "not" and np.isfinite(values).all():
             value, deviation, low, high = scale * values
-            # Two digits of the uncertainty say how many digits of the value mean something.
+            # Two digits of the uncertainty determine the decimals of the value.
             exponent = np.floor(np.log10(deviation)) if deviation > 0 else -3
             decimals = int(np.clip(1 - exponent, 0, 9))
             value, deviation, low, high = (
@@ -73,13 +70,13 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Writes the page; pictures are inside it, so that it can be moved and mailed.
+    """Write a self-contained page with embedded pictures.
 
     Args:
-        path: of the HTML file; fit.png and knowledge.png are next to it already.
-        found: what was identified.
-        summary: the figures of `identify_command`.
-        alone: the object, if the gripper was known.
+        path: HTML file; fit.png and knowledge.png are beside it.
+        found: identified log.
+        summary: of `identify_command`.
+        alone: the object, if the gripper is known.
     """
     log, result = found.log, found.identification
     tables = [
@@ -138,7 +135,6 @@ def write_report(
 
 
 def _tiles(load: Identification) -> list[tuple[str, str, str]]:
-    """(number, unit, what it is) of what a reader wants to know first."""
     deviation = load.standard_deviations[6]
     mass = f"{load.mass:.4g}" if load.identifiable[6] else "–"
     com = ", ".join(

@@ -1,9 +1,7 @@
-"""What `drake-teleop sample-log` writes: a log to try the commands on, simulated.
+"""Simulated log of `drake-teleop sample-log`: a gripper on an arm with the lengths of a UR5e.
 
-An arm with the lengths of a UR5e carries a gripper on a wrist sensor. It moves without touching
-anything (free.yaml), and then while somebody touches its fingertips (touched.yaml). Wrench and pose
-come from two recorders: other rates, clocks and units, noise, offsets, and a pose that is late. The
-commands read these files and nothing else; truth.json is for whoever wants to compare.
+It moves freely (free.yaml) and is touched (touched.yaml). Wrench and pose have different rates,
+clocks and units, noise, offsets and a delay. truth.json contains the true values.
 """
 
 from __future__ import annotations
@@ -30,17 +28,17 @@ INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5,
 """The gripper: kg, m, kg m^2, in S; about a Robotiq 2F-85."""
 TIP_S = np.array([0.0, 0.0, 0.17])
 OFFSETS = np.array([[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]])
-"""[f; tau] of the sensor in either record, N and N m: they drift between the two."""
+"""(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
 NOISE = np.repeat([0.08, 0.003], 3)
 POSE_DELAY_S = 0.013
 CLOCK_S = 48213.4
-"""What the controller's clock shows when that of the sensor shows 0."""
+"""Time of the controller's clock at the sensor's time 0 [s]."""
 
 WRENCH_HZ, POSE_HZ = 500.0, 125.0
 PERIOD_S, REST_S = 8.0, 0.5
 _JITTER_S = 5e-5
 
-# UR5e, from the table of its maker: d, a [m] and alpha [rad] after Denavit and Hartenberg.
+# UR5e, Denavit-Hartenberg parameters of the manufacturer: d, a [m], alpha [rad].
 _DH = np.array(
     [
         [0.1625, 0.0, np.pi / 2],
@@ -52,16 +50,16 @@ _DH = np.array(
     ]
 )
 _HOME = np.array([0.3, -1.7, 1.9, -1.8, -1.5, 0.4])  # gripper down, in front of the arm
-_SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # of the joints' motion [rad]
+_SIZE = np.array([0.8, 0.4, 0.45, 1.0, 1.0, 1.3])  # amplitudes of the joints [rad]
 _HARMONICS = 6
 
 
 @dataclass(frozen=True)
 class Touch:
-    """A push at the fingertips that rises and falls as a half sine.
+    """Half-sine push at the fingertips.
 
     Args:
-        start_s, stop_s: of the sensor's clock.
+        start_s, stop_s: on the sensor's clock.
         push_W: (3,) largest force on the gripper, in the world [N].
     """
 
@@ -70,7 +68,7 @@ class Touch:
     push_W: tuple[float, float, float]
 
     def force(self, t: Array) -> Array:
-        """(N, 3) in the world, at times t (N,)."""
+        """(N, 3) force in the world, at times t (N,)."""
         share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
         return np.outer(np.sin(np.pi * share), self.push_W)
 
@@ -80,7 +78,7 @@ TOUCHES = (
     Touch(4.4, 4.9, (-3.0, 0.0, 6.0)),
     Touch(6.9, 6.98, (4.0, -2.0, 0.0)),
 )
-"""A tap, a push, a light tap; less than what the gripper's weight and inertia make."""
+"""A tap, a push and a light tap, smaller than the wrench of weight and inertia."""
 
 _COMMENTS = {
     "wrench.file": "500 Hz",
@@ -109,13 +107,9 @@ def _description(name: str) -> dict[str, Any]:
 
 
 def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
-    """Writes both records, their descriptions, truth.json and summary.json into `out`.
+    """Write records, descriptions, truth.json and summary.json into `out`; return the summary.
 
-    Args:
-        seed: of the noise; the same seed gives the same bytes.
-
-    Returns:
-        the summary: seed, files, duration_s, wrench_hz, pose_hz.
+    The same seed of the noise gives the same bytes.
     """
     random = np.random.default_rng(seed)
     records = {"free": ((), "in free motion"), "touched": (TOUCHES, "touched three times")}
@@ -143,7 +137,6 @@ def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict
 
 
 def _truth() -> dict[str, Any]:
-    """Names, units and signs of identification.json, and of the contacts of `detect`."""
     return {
         "mass": MASS,
         "com": COM,
@@ -157,7 +150,6 @@ def _truth() -> dict[str, Any]:
 
 
 def _contact(touch: Touch) -> dict[str, Any]:
-    """As `detect` has it: times, largest force, and where it pushes then, in S."""
     middle = np.array([(touch.start_s + touch.stop_s) / 2])
     R_WS = _motion(1).at(middle)[3][0]
     peak = np.linalg.norm(touch.push_W)
@@ -183,8 +175,6 @@ def _print(out: Path) -> None:
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the arm does, from `REST_S` before to `REST_S` after its trajectory."""
-
     trajectory: FourierTrajectory
 
     def at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -194,21 +184,16 @@ class _Motion:
 
 
 def _motion(number: int) -> _Motion:
-    """One of the motions: harmonics of random size, always the same."""
     random = np.random.default_rng([2009, number])
     sine, cosine = random.normal(size=(2, 6, _HARMONICS - 1)) * _SIZE[:, np.newaxis] / 2
     return _Motion(FourierTrajectory.at_rest(_HOME, sine, cosine, 1 / PERIOD_S))
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """The motion of the last link's frame, S, of the arm of the sample log.
+    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link.
 
     Args:
-        q, qd, qdd: (N, 6) angles of the joints and their derivatives [rad, s].
-
-    Returns:
-        specific force [m/s^2], angular velocity and acceleration, (N, 3) in S; R_WS (N, 3, 3); p_WS
-        (N, 3) [m].
+        q, qd, qdd: (N, 6) joint angles and their derivatives [rad, s].
     """
     R = np.broadcast_to(np.eye(3), (len(q), 3, 3))
     p, omega, alpha = np.zeros((3, len(q), 3))
@@ -226,7 +211,6 @@ def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array,
 
 
 def _turns(angle: Array, axis: int) -> Array:
-    """(N, 3, 3) rotations by angles (N,) about x (0) or z (2)."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     R = np.tile(np.eye(3), (len(angle), 1, 1))
     R[:, first, first] = R[:, second, second] = np.cos(angle)
@@ -236,7 +220,6 @@ def _turns(angle: Array, axis: int) -> Array:
 
 
 def _clock(rate_hz: float, random: np.random.Generator) -> Array:
-    """Times of the rows on the sensor's clock, not quite regular."""
     t = np.arange(round((PERIOD_S + 2 * REST_S) * rate_hz)) / rate_hz
     return t + _JITTER_S * random.uniform(0, 1, len(t))
 
@@ -254,7 +237,7 @@ def _write_wrench(
     wrench = non_contact_wrench(s, omega, alpha, phi) + offsets
     for touch in touches:
         push_S = np.einsum("nji,nj->ni", R_WS, touch.force(t))
-        # Whoever pushes takes that much off the sensor.
+        # The push reduces the wrench of the sensor on the load.
         wrench -= np.hstack([push_S, np.cross(TIP_S, push_S)])
     wrench += NOISE * random.normal(size=wrench.shape)
     reading = -wrench / np.repeat([UNITS["lbf"], UNITS["lbf in"]], 3)

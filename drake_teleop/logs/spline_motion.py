@@ -1,9 +1,4 @@
-"""The motion of S at the times of a log's wrench, by splines of its poses: one for all commands.
-
-`pose_motion` chooses the splines by the wrench. Near the first and the last pose, and beside gaps,
-a spline has poses on one side only. Its acceleration is up to 60 times as noisy there; from two
-knots on it is at most twice as noisy as elsewhere.
-"""
+"""Motion of S at the sample times of a wrench, from splines of the poses."""
 
 from __future__ import annotations
 
@@ -26,20 +21,20 @@ from drake_teleop.logs.read.alignment import undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import delay_of
 
-_DELAY_KNOWN = 0.005  # s, standard deviation
-_KNOTS = 2.0
+_MAX_DELAY_DEVIATION_S = 0.005  # s, standard deviation
+_EDGE_KNOTS = 2.0
 _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Motion and load of a log with poses, and the source of the delay.
+    """Return motion and load of a log with poses, and the source of the delay.
 
     Args:
-        log: as it was read.
+        log: as read.
         delay: of the motion behind the wrench [s], or "auto".
 
     Raises:
-        DrakeTeleopError: if too little of the record can be used, or for another delay.
+        DrakeTeleopError: for too few usable samples, or an invalid delay.
     """
     return _with_delay(log, delay, lambda late: _estimate(log, late), 0.0, "undetermined")
 
@@ -47,15 +42,14 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
 def motion_of_known_load(
     log: Log, delay: str | float, load: NDArray[np.float64], usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """The motion with which an identified load explains a log best, and the source of the delay.
+    """Return the motion that suits an identified load best, and the source of the delay.
 
-    None without poses that have positions, for a record that is too short, and if an IMU beside the
-    poses measures another motion.
+    None without positions, for a short record, and if an IMU disagrees with the poses.
 
     Args:
-        log, delay: as of `motion_and_load`.
-        load: (6, 16) as of `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
-        usual_s: the delay of a record that does not determine it [s].
+        log, delay: as in `motion_and_load`.
+        load: (6, 16) from `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
+        usual_s: delay for a record that does not determine it [s].
     """
     posed = log.posed
     if posed is None or log.static:
@@ -78,10 +72,9 @@ def _with_delay(
     usual_s: float,
     usual: str,
 ) -> tuple[_Motion, str]:
-    """The motion with the delay that is given, or that the record determines, or the usual one."""
     known, source = (None, "estimated") if delay == "auto" else delay_of(log, None, delay)
     found = motion(known)
-    if known is None and not found.delay_deviation < _DELAY_KNOWN:
+    if known is None and not found.delay_deviation < _MAX_DELAY_DEVIATION_S:
         return motion(usual_s), usual
     return found, source
 
@@ -100,12 +93,10 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
     )
 
 
-def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """The log with motion and gravity of the splines at the times of its wrench.
+def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
+    """Return the log with spline motion and without delay, and its edge samples (N,).
 
-    Returns:
-        the log without the delay, and (N,) its samples within two knots of an end or a gap of the
-        poses.
+    Within two knots of an end or a gap of the poses the acceleration is noisy.
     """
     assert log.posed is not None
     moved, splines = undelayed(log, found.delay_s), found.splines
@@ -118,7 +109,7 @@ def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_
         angular_acceleration=alpha,
         gravity=splines.gravity(t, gravity_W),
     )
-    stamps, margin = splines.poses.t, _KNOTS * splines.spacing
+    stamps, margin = splines.poses.t, _EDGE_KNOTS * splines.spacing
     gaps = np.flatnonzero(np.diff(stamps) > splines.spacing)
     ends = stamps[np.concatenate([[0], gaps, gaps + 1, [len(stamps) - 1]])]
     change = np.zeros(len(t) + 1)
@@ -128,7 +119,7 @@ def moved_by_splines(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_
 
 
 def clock_note(found: PoseMotion) -> list[str]:
-    """That the clock of the poses runs at another rate than that of the wrench, if it does."""
+    """Return a note on a clock rate of the poses that differs from the wrench's."""
     if not found.clock_rate:
         return []
     side = "faster" if found.clock_rate > 0.0 else "slower"

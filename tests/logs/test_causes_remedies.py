@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.cause_lines import with_lines
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
-from drake_teleop.logs.check.conventions import check_log
-from drake_teleop.logs.processing import IdentifiedLog, identify_log
+from drake_teleop.logs.processing import IdentifiedLog, check_log, identify_log
 from drake_teleop.logs.read.reading import read_log
 
 MASS, COM = 1.37, np.array([0.012, -0.021, 0.064])

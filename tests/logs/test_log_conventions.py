@@ -19,7 +19,7 @@ from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.logs.check import conventions
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
@@ -327,19 +327,22 @@ def test_for_comparisons_a_log_is_thinned_to_means_whatever_tells_its_time(
     ],
 )
 def test_a_load_that_explains_less_than_half_is_refused_if_there_is_a_reason(
-    monkeypatch: pytest.MonkeyPatch, left: float, moves: float, refused: str
+    left: float, moves: float, refused: str
 ) -> None:
     rng = np.random.default_rng(0)
     wrench, still = rng.normal(size=(200, 6)), np.tile([0.0, 0.0, 9.8], (200, 1))
     moving = still + moves * rng.normal(size=(200, 3))
     log = Log(np.arange(200) * 0.01, wrench, moving, 0 * still, 0 * still)
     reason = Finding("axes", "two axes of the wrench are exchanged")
-    monkeypatch.setattr(conventions, "check_log", lambda path: SimpleNamespace(findings=(reason,)))
+
+    def check() -> Any:
+        return SimpleNamespace(findings=(reason,))
+
     load: Any = SimpleNamespace(mass=1.0, identifiable=np.ones(16, bool))
     # Of a residual that is this share of the wrench's standard deviation everywhere.
     predicted = (1 - np.sqrt(left)) * wrench
     if refused:
         with pytest.raises(DrakeTeleopError, match=refused):
-            conventions.question_fit(Path("log"), log, load, predicted, 0.0)
+            conventions.question_fit(log, load, predicted, 0.0, check)
     else:
-        assert conventions.question_fit(Path("log"), log, load, predicted, 0.0) == (reason,)
+        assert conventions.question_fit(log, load, predicted, 0.0, check) == (reason,)

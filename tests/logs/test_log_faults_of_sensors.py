@@ -7,6 +7,7 @@ import polars as pl
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs import processing
 from drake_teleop.logs.check import conventions
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
@@ -47,8 +48,8 @@ def test_a_check_that_fails_is_no_error_of_the_log(tables, error, monkeypatch):
     def fail(*_):
         raise error("of our own")
 
-    monkeypatch.setattr(conventions, "check_log", fail)
-    monkeypatch.setattr(conventions, "_doubted", lambda *_: True)
+    monkeypatch.setattr(processing, "check_file", fail)
+    monkeypatch.setattr(conventions, "_is_suspicious", lambda _: True)
     assert identify_log(folder / "free.yaml").identification.mass == pytest.approx(0.95, abs=2e-3)
 
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs import inspection
+from drake_teleop.logs import processing
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
@@ -123,7 +123,7 @@ def test_a_lag_counts_from_five_standard_deviations(
         identify_log(path), delay_source="estimated", delay_deviation_s=deviation, causes=()
     )
     found = replace(found, identification=replace(found.identification, delay_s=0.003))
-    monkeypatch.setattr(inspection, "identify_log", lambda _: found)
+    monkeypatch.setattr(processing, "identify_log", lambda *_, **__: found)
     summary = inspect_command(path, tmp_path / "out", quiet=True)
     assert {finding["name"] for finding in summary["findings"]} == names
 

@@ -14,8 +14,7 @@ from posed_record import GRAVITY_W, OFFSETS, PHI, motion_at
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.logs.check.conventions import check_log
-from drake_teleop.logs.processing import identify_log
+from drake_teleop.logs.processing import check_log, identify_log
 from drake_teleop.logs.read.canonical import SPECIFIC_FORCE, WRENCH
 from drake_teleop.logs.read.rotations import quaternions
 
@@ -114,21 +113,45 @@ def _copied(c: Columns) -> None:
 ABOUT_Z = Rotation.from_euler("z", 45, degrees=True).as_matrix()
 TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
 MISTAKES: list[tuple[str, Callable[[Columns], None], tuple[str, ...], str, str]] = [
-    ("N mm", _times("torque", 1e3), IMU, "units", "wrench.torque.unit: N mm"),
-    ("lbf in", _times("torque", 8.851), POSE, "units", "wrench.torque.unit: lbf in"),
+    ("N mm", _times("torque", 1e3), IMU, "torque factor", "wrench.torque.unit: N mm"),
+    ("lbf in", _times("torque", 8.851), POSE, "torque factor", "wrench.torque.unit: lbf in"),
     ("alpha", _alpha_axes, IMU, "swapped axes", "the gyroscope's y, x, -z"),
-    ("lbf", _times("force", 1 / 4.448), IMU, "units", "wrench.force.unit: lbf"),
-    ("mirrored", _wrench_in(np.diag([1, -1, 1])), IMU, "swapped axes", "'force_1'"),
-    ("mirrored pose", _wrench_in(np.diag([1, -1, 1])), POSE, "swapped axes", "'torque_1'"),
-    ("turned", _wrench_in(TURNED), IMU, "mounting", "wrench.frame: [[0.8"),
+    ("lbf", _times("force", 1 / 4.448), IMU, "torque factor", "wrench.force.unit: lbf"),
+    (
+        "mirrored",
+        _wrench_in(np.diag([1, -1, 1])),
+        IMU,
+        "axes",
+        "sign: -1 and wrench.frame: [[-1",
+    ),
+    (
+        "mirrored pose",
+        _wrench_in(np.diag([1, -1, 1])),
+        POSE,
+        "axes",
+        "sign: -1 and wrench.frame: [[-1",
+    ),
+    ("turned", _wrench_in(TURNED), IMU, "sensor rotation", "imu.frame: [[0."),
     ("alpha", _times("angular_acceleration", 57.3), IMU, "degrees", "acceleration.unit: deg/s^2"),
     ("gyro", _times("angular_velocity", 57.3), IMU, "degrees", "velocity.unit: deg/s"),
     ("axes", _gyro_axes, IMU, "swapped axes", "['angular_velocity_1', 'angular_velocity_0', 'ang"),
     ("mm/s^2", _times("specific_force", 1e3), IMU, "units", "specific_force.unit: mm/s^2"),
     ("mm", _times("position", 1e3), BOTH, "units", "pose.position.unit: mm"),
-    ("km", _times("position", 1e-3), BOTH, "units", "mm or m, the units that a description knows"),
-    ("km pose", _times("position", 1e-3), POSE, "units", "mm or m, the units that a description"),
-    ("kN m", _times("torque", 1e-3), IMU, "units", "in N mm or lbf in; write the columns"),
+    (
+        "km",
+        _times("position", 1e-3),
+        BOTH,
+        "units",
+        "multiply pose.position.scale",
+    ),
+    (
+        "km pose",
+        _times("position", 1e-3),
+        POSE,
+        "units",
+        "multiply pose.position.scale",
+    ),
+    ("kN m", _times("torque", 1e-3), IMU, "torque factor", "wrench.torque.scale: 1000"),
     ("turned 45", _wrench_in(ABOUT_Z), POSE, "pose frame", "pose.rotation_in_sensor: [[0.7"),
     ("TCP", _tcp, BOTH, "pose frame", "pose.position_in_sensor: [0.0"),
     ("clock", lambda c: c.update(pose_t=1.01 * c["t"]), POSE, "clock", "pose.time.scale: 0.990"),

@@ -13,7 +13,7 @@ import yaml
 from posed_record import GRAVITY_W, LATE, PHI, SHIFT, TURN, Kind, record
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.check.against_frame import frame_finding
+from drake_teleop.logs.check.pose_checks import frame_finding
 from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 from drake_teleop.logs.pose_motion.poses import Posed

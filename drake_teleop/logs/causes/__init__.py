@@ -1,1 +1,1 @@
-"""Causes of a misfit: why a rigid load does not explain a wrench, with times and values."""
+"""Search for causes of a misfit: why a rigid load does not explain a wrench."""

@@ -1,4 +1,4 @@
-"""Extensions of a model, in the order of plausibility, and what makes each of them a finding."""
+"""Extensions of a model in the order of plausibility, and their minimum effects."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import natural_scale
-from drake_teleop.logs.causes.changes import change
+from drake_teleop.logs.causes.changes import add_step
 from drake_teleop.logs.causes.contacts import contact_spans
 from drake_teleop.logs.causes.instants import FORCES, ONE, G, R, S
 from drake_teleop.logs.causes.model import Model
@@ -30,7 +30,7 @@ ORDER = (
     "cable",
     "drift",
 )
-"""Of candidates with nearly the same likelihood the first is taken."""
+"""Order of plausibility: of nearly equal candidates the first is chosen."""
 _FACTORS = (10.0, 100.0, 1000.0, 8.850746, 4.448222, 9.80665, 98.0665, 1.355818, 12.0, 39.37008)
 FACTORS = tuple(
     sign * ratio
@@ -38,30 +38,24 @@ FACTORS = tuple(
     for ratio in (1.0, *_FACTORS, *(1.0 / x for x in _FACTORS))
     if sign * ratio != 1.0
 )
-"""Known ratios of units and signs between torque and force."""
-_HALF, _IMPOSSIBLE = 0.5, 1000.0
-_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
-_MASS_SHARE, _MOMENT = 0.02, 0.004
-_GAIN, _MOST_GAIN, _SHIFT, _ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
-_SURE, _FARTHEST, _STIFFEST = 10.0, 1.5, 1000.0  # 1, m, N/m
+"""Ratios of known units and signs between torque and force."""
+_HALVED, _IMPOSSIBLE_SCORE = 0.5, 1000.0
+_SMALLEST_TILT_DEG, _GRAVITY_SHARE, _KNOWN_SHARE = 0.25, 0.05, 0.02
+_MASS_SHARE, _SMALLEST_ARM_M = 0.02, 0.004
+_SMALLEST_GAIN, _LARGEST_GAIN, _SMALLEST_SHIFT_M, _SMALLEST_ROTATION_DEG = 0.003, 0.25, 0.010, 1.0
+_SIGNIFICANT, _LARGEST_SHIFT_M, _LARGEST_STIFFNESS = 10.0, 1.5, 1000.0  # 1, m, N/m
 _DRIFT_LEVELS = 3.0
 _NEGATIVE_DEVIATIONS, _NEGATIVE_SHARE = 8.0, 0.1
-_FACTOR_SHARE, _FACTOR_MOST, _FACTOR_MOST_FAR = 0.02, 0.06, 0.2
-_SIMILAR, _AS_LIKELY, _FACTOR_STEPS = 0.2, 1.0, 4
-_QUIETER = 0.2
-_INDISTINCT = 8.0  # difference of the log likelihood, four standard deviations
-_DOUBTFUL = 30.0  # a score that widens intervals and names nothing
+_FACTOR_SHARE, _FACTOR_LIMIT, _FACTOR_LIMIT_FAR = 0.02, 0.06, 0.2
+_MODERATE_FACTOR, _SAME_LIKELIHOOD, _FACTOR_ITERATIONS = 0.2, 1.0, 4
+_LOW_RESIDUAL_SHARE = 0.2
+_MAX_LIKELIHOOD_LOSS = 8.0  # of the logarithm; four standard deviations
+_DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An extension that was fitted.
-
-    Attributes:
-        name: one of `ORDER`.
-        state: the larger model.
-        score: twice the gain of the log likelihood, less what its parameters cost.
-    """
+    """Fitted extension with twice the gain of the log likelihood minus its cost."""
 
     name: str
     state: State
@@ -69,46 +63,43 @@ class Candidate:
 
 
 def candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit the extensions that a state allows and keep those of sufficient effect.
-
-    Args:
-        state: the model so far.
-        first: whether it is the rigid load alone.
+    """Fit the possible extensions and keep those of sufficient effect; `first`: of the rigid load
+    alone.
     """
     model, data = state.model, state.data
     if first:
         yield from _axes(state)
     if data.gravity_W is not None:
         if "gravity" not in model.parts:
-            yield from _best(state, "gravity", [tilted(state), None], _tilted_enough)
-        if "weight" not in model.parts and data.lively:
-            yield from _best(state, "weight", [None], _weight_enough)
-    if "torque factor" not in model.parts and data.lively:
+            yield from _fit_part(state, "gravity", [tilt_start(state), None], _is_tilt_significant)
+        if "weight" not in model.parts and data.accelerates_enough:
+            yield from _fit_part(state, "weight", [None], _is_weight_significant)
+    if "torque factor" not in model.parts and data.accelerates_enough:
         yield from _factor(state)
     for kind in ("offsets", "load"):
-        found = change(state, kind)
+        found = add_step(state, kind)
         if found is not None:
             yield _candidate(kind, state, found, times=1)
     if not {"linear drift", "drift"} & set(model.parts):
-        yield from _best(state, "linear drift", [None], _drift_enough)
+        yield from _fit_part(state, "linear drift", [None], _is_drift_significant)
     for c in range(6):
         if c not in model.gains:
             larger = state.extended(replace(model, gains=(*model.gains, c)))
-            if _GAIN < abs(part(larger, f"gain {c}")[0][0]) < _MOST_GAIN:
+            if _SMALLEST_GAIN < abs(larger.extension(f"gain {c}")[0][0]) < _LARGEST_GAIN:
                 yield _candidate("gain", state, larger)
-    if "frame" not in model.parts and data.lively:
-        yield from _best(state, "frame", [None], _shifted_enough)
+    if "frame" not in model.parts and data.accelerates_enough:
+        yield from _fit_part(state, "frame", [None], _is_shift_significant)
     if first and not model.parts:
-        yield from _best(state, "rotation", [None], _rotated_enough)
+        yield from _fit_part(state, "rotation", [None], _is_rotation_significant)
     spans = contact_spans(state)
     if spans and spans != state.spans:
         larger = State.of(data, model, state.x, spans)
         ends = sum(2 - (a <= data.t[1]) - (b >= data.t[-2]) for a, b in spans)
         yield _candidate("contact", state, larger, more=6 + 2 * ends)
-    if data.positions and "cable" not in model.parts and data.lively:
-        yield from _best(state, "cable", [None], lambda _: True)
+    if data.positions and "cable" not in model.parts and data.accelerates_enough:
+        yield from _fit_part(state, "cable", [None], lambda _: True)
     if "drift" not in model.parts and "linear drift" not in model.parts:
-        yield from _best(state, "drift", [None], _drift_enough)
+        yield from _fit_part(state, "drift", [None], _is_drift_significant)
 
 
 def _candidate(
@@ -122,20 +113,20 @@ def _candidate(
     return Candidate(name, larger, float(score))
 
 
-def _best(
-    state: State, part: str, starts: list[Array | None], enough: Callable[[State], bool]
+def _fit_part(
+    state: State, name: str, starts: list[Array | None], is_significant: Callable[[State], bool]
 ) -> Iterator[Candidate]:
-    model = state.model.extended(part)
+    model = state.model.extended(name)
     fits = [state.extended(model, start) for start in starts]
     best = max(fits, key=lambda x: x.likelihood)
-    if enough(best):
-        yield _candidate(part, state, best)
+    if is_significant(best):
+        yield _candidate(name, state, best)
 
 
-def negative(state: State) -> bool:
-    """Whether the mass, or the inertia about an axis through So, is clearly below zero."""
+def has_negative_inertia(state: State) -> bool:
+    """Return whether the mass, or the inertia about an axis, is significantly negative."""
     mass, deviation = float(state.x[6]), float(np.sqrt(state.fit.covariance[6, 6]))
-    if mass < _SURE * deviation:
+    if mass < _SIGNIFICANT * deviation:
         return mass < -4.0 * deviation
     i, j = np.triu_indices(3)
     inertia = np.zeros((3, 3))
@@ -144,51 +135,45 @@ def negative(state: State) -> bool:
     # The derivative of n^T I n by the six entries.
     slope = axes[i, 0] * axes[j, 0] * np.where(i == j, 1.0, 2.0)
     deviation = float(np.sqrt(slope @ state.fit.covariance[10:16, 10:16] @ slope))
-    enough = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10]
-    return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, enough))
+    smallest = _NEGATIVE_SHARE * natural_scale(state.x[6:16])[10]
+    return bool(least[0] < -max(_NEGATIVE_DEVIATIONS * deviation, smallest))
 
 
-def plausible(state: State) -> bool:
-    """Whether the parts of a model are what they can be in a laboratory."""
-    if negative(state):
+def is_plausible(state: State) -> bool:
+    """Return whether the parameters are possible in a laboratory."""
+    if has_negative_inertia(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
     if "weight" in parts:
-        removed = part(state, "weight")[0][0]
-        # A robot adds no weight, and without inertia there is nothing to compare it with.
-        if removed < -0.01 * state.x[6] or state.x[6] < _SURE * deviation:
+        removed = state.extension("weight")[0][0]
+        # A robot adds no weight, and a removed weight requires an inertia to compare with.
+        if removed < -0.01 * state.x[6] or state.x[6] < _SIGNIFICANT * deviation:
             return False
-    if "frame" in parts and np.linalg.norm(part(state, "frame")[0]) > _FARTHEST:
+    if "frame" in parts and np.linalg.norm(state.extension("frame")[0]) > _LARGEST_SHIFT_M:
         return False
     if "cable" in parts:
-        if state.x[6] < _SURE * deviation:
+        if state.x[6] < _SIGNIFICANT * deviation:
             return False
-        K = part(state, "cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _STIFFEST)
+        K = state.extension("cable")[0][3:9][[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        return bool(np.abs(np.linalg.eigvalsh(K)).max() < _LARGEST_STIFFNESS)
     return True
 
 
-def part(state: State, name: str) -> tuple[Array, Array]:
-    """Values of an extension and their covariance."""
-    where = state.model.slices[name]
-    return state.x[where], state.fit.covariance[where, where]
-
-
-def _tilted_enough(state: State) -> bool:
+def _is_tilt_significant(state: State) -> bool:
     assert state.data.gravity_W is not None
     given = state.data.gravity_W
-    true = given - part(state, "gravity")[0]
+    true = given - state.extension("gravity")[0]
     size, right = float(np.linalg.norm(true)), float(np.linalg.norm(given))
     cosine = float(true @ given) / (size * right)
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    # Noise of the accelerations changes the size alone.
+    # Noise of the accelerations changes only the magnitude.
     turned = np.radians(angle) > abs(size / right - 1.0)
     share = _GRAVITY_SHARE if turned else _KNOWN_SHARE
-    return bool(angle > _TILT_DEG and abs(size / right - 1.0) < share)
+    return bool(angle > _SMALLEST_TILT_DEG and abs(size / right - 1.0) < share)
 
 
-def tilted(state: State) -> Array | None:
-    """Start of a large tilt, from the force alone: f = o + m a + R u with u = -m g."""
+def tilt_start(state: State) -> Array | None:
+    """Return start values for a large tilt, from the force alone: f = o + m a + R u, u = -m g."""
     y = state.data.only(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -215,54 +200,57 @@ def tilted(state: State) -> Array | None:
     return x
 
 
-def _weight_enough(state: State) -> bool:
-    removed, _ = part(state, "weight")
+def _is_weight_significant(state: State) -> bool:
+    removed, _ = state.extension("weight")
     mass = abs(state.x[6])
     moment = np.linalg.norm(removed[1:]) / max(mass, 1e-9)
-    return bool(removed[0] > _MASS_SHARE * mass or moment > _MOMENT)
+    return bool(removed[0] > _MASS_SHARE * mass or moment > _SMALLEST_ARM_M)
 
 
-def _shifted_enough(state: State) -> bool:
-    return bool(np.linalg.norm(part(state, "frame")[0]) > _SHIFT)
+def _is_shift_significant(state: State) -> bool:
+    return bool(np.linalg.norm(state.extension("frame")[0]) > _SMALLEST_SHIFT_M)
 
 
-def _rotated_enough(state: State) -> bool:
-    return bool(np.degrees(np.linalg.norm(part(state, "rotation")[0])) > _ROTATION_DEG)
+def _is_rotation_significant(state: State) -> bool:
+    return bool(np.degrees(np.linalg.norm(state.extension("rotation")[0])) > _SMALLEST_ROTATION_DEG)
 
 
-def _drift_enough(state: State) -> bool:
+def _is_drift_significant(state: State) -> bool:
     name = "drift" if "drift" in state.model.parts else "linear drift"
-    rows = part(state, name)[0].reshape(6, -1)
+    rows = state.extension(name)[0].reshape(6, -1)
     return bool((np.abs(rows).sum(axis=1) > _DRIFT_LEVELS * state.data.white).any())
 
 
 def _factor(state: State) -> Iterator[Candidate]:
-    """The most usual known ratio of nearly the greatest likelihood, then refined."""
     fits = []
     for factor in (1.0, *FACTORS):
         model = replace(state.model, factor=factor)
-        fits.append(state.extended(model, state.x, steps=_FACTOR_STEPS))
+        fits.append(state.extended(model, state.x, steps=_FACTOR_ITERATIONS))
     most = max(x.likelihood for x in fits)
-    best = next(x for x in fits if x.likelihood > most - _AS_LIKELY)
-    # Coloured noise predicts a large and smooth misfit as well: the residual decides there.
-    least = min(x.loudness for x in fits)
-    quiet = least < _QUIETER * min(best.loudness, state.loudness)
-    if quiet:
-        best = max((x for x in fits if x.loudness < 2.0 * least), key=lambda x: x.likelihood)
+    best = next(x for x in fits if x.likelihood > most - _SAME_LIKELIHOOD)
+    # Coloured noise predicts a large and smooth misfit as well: there the residual decides.
+    least = min(x.residual_ratio for x in fits)
+    by_residual = least < _LOW_RESIDUAL_SHARE * min(best.residual_ratio, state.residual_ratio)
+    if by_residual:
+        low = (x for x in fits if x.residual_ratio < 2.0 * least)
+        best = max(low, key=lambda x: x.likelihood)
     if best is fits[0]:
         return
-    best = state.extended(best.model, best.x, **({"steps": _FACTOR_STEPS} if quiet else {}))
-    if not quiet and 2.0 * (best.likelihood - state.likelihood) < 20.0:
+    best = state.extended(
+        best.model, best.x, **({"steps": _FACTOR_ITERATIONS} if by_residual else {})
+    )
+    if not by_residual and 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
     free = best.extended(best.model.extended("torque factor"))
-    value, covariance = part(free, "torque factor")
-    # A displaced pose frame resembles any factor, but has to be far away to resemble a large one.
-    far = not _SIMILAR < best.model.factor < 1.0 / _SIMILAR
-    most = _FACTOR_MOST_FAR if far else _FACTOR_MOST
+    value, covariance = free.extension("torque factor")
+    # A displaced pose frame resembles any factor, but only a distant frame resembles a large one.
+    far = not _MODERATE_FACTOR < best.model.factor < 1.0 / _MODERATE_FACTOR
+    most = _FACTOR_LIMIT_FAR if far else _FACTOR_LIMIT
     limit = min(_FACTOR_SHARE + 4.0 * np.sqrt(covariance[0, 0]), most)
     found = _candidate("torque factor", state, best, more=1)
-    # A factor that is not quite a known one is no cause, but makes the load doubtful.
-    yield found if abs(value[0]) < limit else replace(found, score=min(found.score, _DOUBTFUL))
+    # A factor beside the known ratios is not a cause, but widens the intervals.
+    score = found.score if abs(value[0]) < limit else min(found.score, _DOUBTFUL_SCORE)
+    yield replace(found, score=score)
 
 
 def similar_factors(state: State) -> list[State]:
@@ -274,19 +262,19 @@ def similar_factors(state: State) -> list[State]:
     for other in FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:
             fitted = state.extended(replace(state.model, factor=other), state.x)
-            if fitted.likelihood > state.likelihood - _INDISTINCT:
+            if fitted.likelihood > state.likelihood - _MAX_LIKELIHOOD_LOSS:
                 found.append(fitted)
     return found
 
 
 def _axes(state: State) -> Iterator[Candidate]:
-    """The signed permutation that explains the force best, by mass and first moment alone."""
+    """Yield the signed permutation that explains the force best."""
     from itertools import permutations, product
 
     y = state.data.only(state.rows.used).y[:, state.model.columns]
     sums = y.T @ y
     sums = sums - np.outer(sums[:, ONE], sums[ONE]) / sums[0, 0]
-    # m s + alpha x h + omega x (omega x h) of the three axes of S, and a weight that was removed
+    # m s + alpha x h + omega x (omega x h) for the three axes of S, and a removed weight
     model = Model(parts=state.model.parts)
     used = [6, 7, 8, 9]
     if "weight" in model.parts:
@@ -310,9 +298,10 @@ def _axes(state: State) -> Iterator[Candidate]:
                 plain = left
             elif left < best[0]:
                 best = (left, Q)
-    if best[0] < _HALF * plain:
+    if best[0] < _HALVED * plain:
         larger = state.extended(replace(state.model, axes=best[1]), np.zeros(state.model.size))
         if larger.x[6] > 0.0:
             found = _candidate("axes", state, larger, more=3)
-            # A negative mass is impossible, however well it explains the wrench.
-            yield replace(found, score=found.score + (_IMPOSSIBLE if negative(state) else 0.0))
+            # The given axes imply a negative mass, which is impossible.
+            more = _IMPOSSIBLE_SCORE if has_negative_inertia(state) else 0.0
+            yield replace(found, score=found.score + more)

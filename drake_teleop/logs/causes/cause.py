@@ -1,4 +1,4 @@
-"""Causes of a misfit in words: name, time, value with interval, and the line that corrects it."""
+"""Causes of a misfit in words: name, time, value with interval."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import worth_stating
 from drake_teleop.load.inertia import mass_com_inertia
-from drake_teleop.logs.causes.candidates import part, similar_factors
+from drake_teleop.logs.causes.candidates import similar_factors
 from drake_teleop.logs.causes.state import State
 
-_NEAR_S, _SHORT_S = 0.8, 1.2
+_HAND_DISTANCE_S, _HAND_CONTACT_S = 0.8, 1.2
 CHANNELS = ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z")
 CHANGES = ("zero change", "load change")
-"""Causes after which a record has no single load with constant offsets."""
+"""Causes that divide a record into parts with different offsets or loads."""
+EVENTS = (*CHANGES, "drift", "contact", "cable", "no load")
+"""Causes that no line of a description corrects."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """One reason why a rigid load with constant offsets does not explain a wrench.
+    """Reason why a rigid load with constant offsets does not explain a wrench.
 
     Attributes:
-        name: "axes", "gravity direction", "weight removed", "payload configured",
-            "torque factor", "zero change", "load change", "drift", "gain", "pose frame",
-            "sensor rotation", "contact", "cable" or "no load".
-        message: cause, value with its interval, and what to change beside the description.
-        start_s: time from which it acts, since the start of the record [s]; None: throughout.
-        stop_s: time until which it acts [s]; None: to the end.
+        name: "axes", "gravity direction", "weight removed", "payload configured", "torque factor",
+            "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
+            "contact", "cable" or "no load".
+        message: cause, value with its interval, and remedy.
+        start_s, stop_s: time interval since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
     """
 
@@ -42,7 +43,7 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A part of a record with one load.
+    """Part of a record with one load.
 
     Attributes:
         start_s, stop_s: since the start of the record [s].
@@ -57,12 +58,12 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """(16,) whether the stretch determines a parameter of [offsets; phi] well enough."""
+        """(16,) whether the part determines a parameter of [offsets; phi]."""
         return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """The causes in the model of a state but for the given parts, in the order of their times."""
+    """Return the causes in a fitted model in the order of time, except the given parts."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -80,17 +81,12 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
         out.append(_factor(state))
     out += [_gain(state, c) for c in model.gains]
     changes = [_change(state, i) for i in range(len(model.steps))]
-    changes += [_contact(*span) for span in state.spans if not _beside(span, model.times)]
+    changes += [_contact(*span) for span in state.spans if not _is_hand_contact(span, model.times)]
     return out + sorted(changes, key=lambda x: x.start_s or 0.0)
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """The loads of a record whose load changes; of another, none.
-
-    Args:
-        state: the model.
-        covariance: (16, 16) of [offsets; phi] of the first stretch.
-    """
+    """Return the loads of a changing load; covariance (16, 16): of the first part."""
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []
@@ -123,7 +119,7 @@ def _axes(Q: Array) -> Cause:
 
 def _gravity(state: State) -> Cause:
     assert state.data.gravity_W is not None
-    change, covariance = part(state, "gravity")
+    change, covariance = state.extension("gravity")
     given = state.data.gravity_W
     true = given - change
     cosine = true @ given / np.linalg.norm(true) / np.linalg.norm(given)
@@ -141,7 +137,7 @@ def _gravity(state: State) -> Cause:
 
 
 def _weight(state: State) -> Cause:
-    removed, covariance = part(state, "weight")
+    removed, covariance = state.extension("weight")
     deviation = float(np.sqrt(covariance[0, 0]))
     mass = float(state.x[6])
     own = float(np.sqrt(state.fit.covariance[6, 6]))
@@ -168,19 +164,19 @@ def _factor(state: State) -> Cause:
     if factor == -1.0:
         what = "the torque has the opposite sign"
     else:
-        what = f"the torque is {factor:.6g} times that which belongs to the force"
+        what = f"the torque is {factor:.6g} times the value that fits the force"
         if others := [other.model.factor for other in similar_factors(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
     return Cause(
         "torque factor",
-        f"{what}: unit or sign is wrong",
+        f"{what}: its unit or sign is wrong",
         values={"factor": factor},
     )
 
 
 def _gain(state: State, c: int) -> Cause:
-    value, covariance = part(state, f"gain {c}")
+    value, covariance = state.extension(f"gain {c}")
     wide = 1.96 * float(np.sqrt(covariance[0, 0]))
     return Cause(
         "gain",
@@ -191,7 +187,7 @@ def _gain(state: State, c: int) -> Cause:
 
 
 def _frame(state: State) -> Cause:
-    r, covariance = part(state, "frame")
+    r, covariance = state.extension("frame")
     wide = 1e3 * 1.96 * np.sqrt(np.diag(covariance))
     return Cause(
         "pose frame",
@@ -202,7 +198,7 @@ def _frame(state: State) -> Cause:
 
 
 def _rotation(state: State) -> Cause:
-    rho, covariance = part(state, "rotation")
+    rho, covariance = state.extension("rotation")
     angle = float(np.degrees(np.linalg.norm(rho)))
     wide = float(np.degrees(np.sqrt(np.diag(covariance).max())))
     return Cause(
@@ -215,7 +211,7 @@ def _rotation(state: State) -> Cause:
 
 def _drift(state: State) -> Cause:
     name = "drift" if "drift" in state.model.parts else "linear drift"
-    rows = part(state, name)[0].reshape(6, -1)
+    rows = state.extension(name)[0].reshape(6, -1)
     size = 2.0 * np.abs(rows).sum(axis=1)
     return Cause(
         "drift",
@@ -226,25 +222,25 @@ def _drift(state: State) -> Cause:
 
 
 def _cable(state: State) -> Cause:
-    K = part(state, "cable")[0][3:9]
+    K = state.extension("cable")[0][3:9]
     stiffness = float(np.abs(np.linalg.eigvalsh(K[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]])).max())
     return Cause(
         "cable",
-        f"something pulls at the load with a force that depends on the position (about"
-        f" {stiffness:.2g} N/m): a cable or hose; guide it so that it is slack",
+        f"a force that depends on the position acts on the load (about {stiffness:.2g} N/m),"
+        " probably of a cable or hose; guide it so that it is slack",
         values={"stiffness": stiffness},
     )
 
 
 def _change(state: State, i: int) -> Cause:
-    step, (values, covariance) = state.model.steps[i], part(state, f"step {i}")
+    step, (values, covariance) = state.model.steps[i], state.extension(f"step {i}")
     when = f"from t = {step.time:.2f} s on"
     if step.kind == "offsets":
         return Cause(
             "zero change",
             f"{when} the sensor has another zero: {_vector(values[:3], 'N')},"
             f" {_vector(values[3:], 'N m')} are added (a tare in the record); the stated offsets"
-            " are those before",
+            " are those before it",
             start_s=step.time,
             values={"change": values.tolist()},
         )
@@ -254,22 +250,21 @@ def _change(state: State, i: int) -> Cause:
     return Cause(
         "load change",
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each stretch",
+        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is stated for each part of the record",
         start_s=step.time,
         values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
     )
 
 
-def _beside(span: tuple[float, float], times: tuple[float, ...]) -> bool:
-    """Whether a short contact is that of the hand which changes the load."""
-    near = any(span[0] - _NEAR_S < time < span[1] + _NEAR_S for time in times)
-    return near and span[1] - span[0] < _SHORT_S
+def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> bool:
+    near = any(span[0] - _HAND_DISTANCE_S < time < span[1] + _HAND_DISTANCE_S for time in times)
+    return near and span[1] - span[0] < _HAND_CONTACT_S
 
 
 def _contact(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
-        f"from t = {start:.2f} to {stop:.2f} s something touches the load; the stretch is not used",
+        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part of the record is not used",
         start_s=start,
         stop_s=stop,
     )

@@ -8,57 +8,57 @@ from dataclasses import replace
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.logs.causes.fit import inverted
+from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.model import DELAY, Step
 from drake_teleop.logs.causes.rows import Spans, in_spans
 from drake_teleop.logs.causes.state import State, gain_of
 
-_WORTH = 60.0
-_REFINED, _MOVES = (1.0, 0.25), 2  # instants
-_APART_S, _RAMP_COST = 0.4, 80.0
+_MIN_GAIN = 60.0
+_REFINEMENTS, _REFINEMENT_STEPS = (1.0, 0.25), 2  # instants
+_MIN_DISTANCE_S, _RAMP_COST = 0.4, 80.0
 RAMP_S = 0.5
-"""Length around a step that is left out where it takes its time [s]."""
-_TRIED = 2
-_DEVIATIONS, _LEVELS, _MASS_SHARE, _MOMENT = 5.0, 2.0, 0.01, 0.002
+"""Shortest omitted time around a gradual step [s]."""
+_TRIED_TIMES = 2
+_SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.002
 
 
-def change(state: State, kind: str) -> State | None:
-    """The state with one more step of "offsets" or "load" at the most likely time, or None."""
+def add_step(state: State, kind: str) -> State | None:
+    """Return the state with one more step of "offsets" or "load" at the most likely time."""
     best: State | None = None
-    for time in _times(state, kind):
-        found = _refined(state, kind, time)
+    for time in _likely_times(state, kind):
+        found = _refine_time(state, kind, time)
         ramp = with_ramps(state, [[kind]], [time], state.spans)
         if 2.0 * (ramp.likelihood - found.likelihood) > _RAMP_COST:
             found = ramp
         if best is None or found.likelihood > best.likelihood:
             best = found
     last = len(state.model.steps)
-    return best if best is not None and _large_enough(best, last) else None
+    return best if best is not None and _is_step_significant(best, last) else None
 
 
-def _times(state: State, kind: str) -> list[float]:
-    """Times of the largest gain of white least squares, to one instant."""
+def _likely_times(state: State, kind: str) -> list[float]:
     data, rows = state.data, state.data.block
-    scan = _Scan(state, kind)
+    scan = _StepScan(state, kind)
     starts = np.arange(rows, len(data.t), rows)
     gains = np.array([scan.gain(int(n)) for n in starts])
     for time in state.model.times:
-        gains[np.abs(data.t[starts] - time) < _APART_S] = 0.0
+        gains[np.abs(data.t[starts] - time) < _MIN_DISTANCE_S] = 0.0
     out: list[float] = []
-    for _ in range(_TRIED):
+    for _ in range(_TRIED_TIMES):
         j = int(np.argmax(gains))
-        if gains[j] < _WORTH:
+        if gains[j] < _MIN_GAIN:
             break
         near = range(max(1, starts[j] - 2 * rows), min(len(data.t), starts[j] + 2 * rows))
         time = float(data.t[max(near, key=scan.gain)]) - 0.5 * data.dt
-        if all(abs(time - x) > _APART_S for x in state.model.times):
+        if all(abs(time - x) > _MIN_DISTANCE_S for x in state.model.times):
             out.append(time)
-        gains[np.abs(data.t[starts] - time) < max(2.0 * _APART_S, 3.0 * rows * data.dt)] = 0.0
+        distance = max(2.0 * _MIN_DISTANCE_S, 3.0 * rows * data.dt)
+        gains[np.abs(data.t[starts] - time) < distance] = 0.0
     return out
 
 
-class _Scan:
-    """Gain by a step of offsets or load at any instant, with white noise of the state's size."""
+class _StepScan:
+    """Gain by a step at any instant, with white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
@@ -81,7 +81,6 @@ class _Scan:
         return flat.T @ flat, flat.T @ e.ravel()
 
     def gain(self, n: int) -> float:
-        """Of a step before instant n."""
         j = -(-n // self._rows)
         gram, right = self._sums(n, j * self._rows)
         if j < len(self._gram):
@@ -100,14 +99,9 @@ def with_ramps(
     spans: Spans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit steps that take their time: the rows around each are left out.
+    """Fit gradual steps of `kinds` at `times` [s]; rows within `widths` (>= `RAMP_S`) are omitted.
 
-    Args:
-        state: has the parameters to begin with.
-        kinds: "offsets", "load" or both, at each time.
-        times: nearly the middles of the ramps [s].
-        spans: other rows that are left out.
-        widths: of the rows around each time [s]; at least `RAMP_S`.
+    `spans` are other omitted rows; `state` has the initial parameters.
     """
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
@@ -116,16 +110,16 @@ def with_ramps(
     model = replace(state.model, steps=(*state.model.steps, *steps))
     found = State.of(state.data, model, model.start(state.x, state.model), (*spans, *around))
     owners = [k for k, both in enumerate(kinds) for _ in both]
-    middles = [_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
+    middles = [_ramp_middle(found, kinds, first, k, span) for k, span in enumerate(around)]
     steps = [replace(step, time=middles[k]) for step, k in zip(steps, owners, strict=True)]
     model = replace(model, steps=(*state.model.steps, *steps))
     return State.of(state.data, model, found.x, found.spans)
 
 
 def without_small_steps(state: State) -> State:
-    """Remove steps without an effect, one after the other, the least first."""
+    """Remove insignificant steps one by one, the least significant first."""
     while True:
-        small = [i for i in range(len(state.model.steps)) if not _large_enough(state, i)]
+        small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
             return state
         least = min(small, key=lambda i: _significance(state, i))
@@ -136,16 +130,15 @@ def without_small_steps(state: State) -> State:
 
 
 def _significance(state: State, i: int) -> float:
-    """Wald statistic of a step per parameter."""
     where = state.model.slices[f"step {i}"]
     x, covariance = state.x[where], state.fit.covariance[where, where]
-    return float(x @ inverted(covariance) @ x) / len(x)
+    return float(x @ regularized_inverse(covariance) @ x) / len(x)
 
 
-def _middle(
+def _ramp_middle(
     state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
 ) -> float:
-    """Time at which half of the k-th change is done, from the residual within a span."""
+    """Return the time of half of the k-th change."""
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
     rows = np.flatnonzero(data.used & in_spans(data, (span,)))
@@ -165,16 +158,14 @@ def _middle(
     return span[1] - done * (span[1] - span[0])
 
 
-def _refined(state: State, kind: str, time: float) -> State:
-    """Fit a step at the times around the given one, with noise of their own."""
-
+def _refine_time(state: State, kind: str, time: float) -> State:
     def at(time: float, start: Array | None = None) -> State:
         model = replace(state.model, steps=(*state.model.steps, Step(kind, time)))
         return state.extended(model, start)
 
     best = at(time)
-    for share in _REFINED:
-        for _ in range(_MOVES):
+    for share in _REFINEMENTS:
+        for _ in range(_REFINEMENT_STEPS):
             now = best.model.steps[-1].time
             tried = [at(now + sign * share * state.data.dt, best.x) for sign in (-1.0, 1.0)]
             better = max(tried, key=lambda x: x.likelihood)
@@ -184,16 +175,15 @@ def _refined(state: State, kind: str, time: float) -> State:
     return best
 
 
-def _large_enough(state: State, i: int) -> bool:
-    """Whether a step is a change of mass, moment or offsets that matters."""
+def _is_step_significant(state: State, i: int) -> bool:
     where = state.model.slices[f"step {i}"]
     values = state.x[where]
     deviations = np.sqrt(np.diag(state.fit.covariance[where, where]))
     if state.model.steps[i].kind == "offsets":
-        clear = np.abs(values) > _DEVIATIONS * deviations
-        return bool((clear & (np.abs(values) > _LEVELS * state.data.white)).any())
+        clear = np.abs(values) > _SIGNIFICANT * deviations
+        return bool((clear & (np.abs(values) > _NOISE_LEVELS * state.data.white)).any())
     mass = max(abs(state.x[6]), 1e-3)
-    heavier = abs(values[0]) > max(_DEVIATIONS * deviations[0], _MASS_SHARE * mass)
+    heavier = abs(values[0]) > max(_SIGNIFICANT * deviations[0], _MASS_SHARE * mass)
     size, moment = np.linalg.norm(values[1:4]), np.linalg.norm(deviations[1:4])
-    moved = size > max(2.0 * _DEVIATIONS * moment, _MOMENT * mass)
+    moved = size > max(2.0 * _SIGNIFICANT * moment, _SMALLEST_ARM_M * mass)
     return bool(heavier or moved)

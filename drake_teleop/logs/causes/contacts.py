@@ -1,4 +1,4 @@
-"""Stretches of a record in which something touches the load, by trimmed least squares."""
+"""Contacts of the load within a record, by trimmed least squares."""
 
 from __future__ import annotations
 
@@ -10,56 +10,49 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.logs.causes.changes import with_ramps, without_small_steps
-from drake_teleop.logs.causes.fit import inverted
+from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import DELAY
 from drake_teleop.logs.causes.rows import Spans, in_spans
 from drake_teleop.logs.causes.state import State
 
-_KEPT, _ROUNDS, _FEWEST_BLOCKS, _GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
-_LENGTHS = (8, 16, 32)
-_LEVELS, _CALM, _SPREAD = 8.0, 5.0, 1.3
-_MOST_PHASES, _MOST_STEPS, _SHORTEST, _UNCOVERED = 4, 4, 4, 0.12
-_LOUDER, _QUIET = 1.3, 1.25
+_KEPT_SHARES, _ITERATIONS, _FEWEST_BLOCKS, _GROWTH = (0.12, 0.3, 0.55), 15, 8, 1.3
+_START_LENGTHS = (8, 16, 32)
+_CONTACT_LEVEL, _CALM_RATIO, _SPREAD = 8.0, 5.0, 1.3
+_MAX_LOADS, _MAX_STEPS, _SHORTEST_RUN, _MAX_UNCOVERED = 4, 4, 4, 0.12
+_LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
 def contact_spans(state: State) -> Spans:
-    """(start, stop) of the stretches whose residual is far above the noise and the calm rest."""
+    """Return (start, stop) of blocks whose residual far exceeds noise and calm blocks."""
     blocks = _Blocks(state)
-    loud = blocks.loud(blocks.usable)
-    if loud is None or not loud.any():
+    contact_blocks = blocks.contact_blocks(blocks.usable)
+    if contact_blocks is None or not contact_blocks.any():
         return ()
-    wide = loud.copy()
-    wide[:-1] |= loud[1:]
-    wide[1:] |= loud[:-1]
+    wide = contact_blocks.copy()
+    wide[:-1] |= contact_blocks[1:]
+    wide[1:] |= contact_blocks[:-1]
     return _spans(wide, state.data.t, state.data.block)
 
 
-def phases(larger: State) -> State | None:
-    """Explain long contacts by other loads and other offsets, each with a time of its own.
+def replace_contacts_by_steps(larger: State) -> State | None:
+    """Explain long contacts by other loads and offsets; None if these do not explain the wrench.
 
-    The blocks of the contacts are fitted by themselves, again and again, with a load and offsets of
-    their own. If few runs of blocks with one load each cover the record, their borders are steps.
-
-    Args:
-        larger: the model with the contacts.
-
-    Returns:
-        the model with steps in the place of contacts; None if these do not explain the wrench.
+    The blocks are fitted repeatedly. If few runs cover the record, their borders become steps.
     """
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
-    for phase in range(_MOST_PHASES):
-        loud = blocks.loud(left)
-        if loud is None:
+    for load in range(_MAX_LOADS):
+        contact_blocks = blocks.contact_blocks(left)
+        if contact_blocks is None:
             break
-        calm = _runs(left & ~loud, _SHORTEST)
-        number[calm], left = phase, left & ~calm
+        calm = _runs(left & ~contact_blocks, _SHORTEST_RUN)
+        number[calm], left = load, left & ~calm
     inner = np.flatnonzero(number >= 0)
-    if not len(inner) or left.sum() > _UNCOVERED * blocks.usable.sum():
+    if not len(inner) or left.sum() > _MAX_UNCOVERED * blocks.usable.sum():
         return None
     borders = [(a, b) for a, b in pairwise(inner) if number[a] != number[b]]
-    if not 0 < len(borders) <= _MOST_STEPS:
+    if not 0 < len(borders) <= _MAX_STEPS:
         return None
     dt, rows = larger.data.dt, larger.data.block
     t = larger.data.t[0] + dt * rows * np.arange(len(number))
@@ -67,11 +60,11 @@ def phases(larger: State) -> State | None:
     widths = [float(t[b] - t[a] - dt * rows) for a, b in borders]
     found = with_ramps(larger, [("offsets", "load")] * len(times), times, (), widths)
     found = without_small_steps(found)
-    return found if found.loudness < max(_LOUDER * larger.loudness, _QUIET) else None
+    limit = max(_LARGEST_INCREASE * larger.residual_ratio, _SMALL_RESIDUAL)
+    return found if found.residual_ratio < limit else None
 
 
 def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
-    """The flags in runs of at least so many, single gaps being closed."""
     closed = flags.copy()
     closed[1:-1] |= flags[:-2] & flags[2:]
     edges = np.flatnonzero(np.diff(np.concatenate([[0], closed.astype(np.int8), [0]])))
@@ -82,7 +75,7 @@ def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
 
 
 class _Blocks:
-    """Normal equations of a state's model by blocks of rows, with white noise."""
+    """Normal equations of a model for blocks of rows."""
 
     def __init__(self, state: State) -> None:
         data = state.data
@@ -105,46 +98,42 @@ class _Blocks:
             left = state.fit.residual[c] / scale[c]
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
-    def loud(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Blocks among some whose residual is far above that of the calmest; None for too few."""
-        found = self._calmest(np.flatnonzero(among))
+    def contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+        """Return the blocks with a residual far above the calmest; None for too few blocks."""
+        found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
         level, calm, move = found
         excess = np.sqrt(np.maximum(level**2 - (_SPREAD * calm) ** 2, 0.0))
-        usual = np.hypot(calm, _by_motion(self._state, self._state.x + move, excess, among))
-        return np.asarray((level > _LEVELS) & (level > _CALM * usual) & among)
+        by_motion = _motion_error_level(self._state, self._state.x + move, excess, among)
+        usual = np.hypot(calm, by_motion)
+        return np.asarray((level > _CONTACT_LEVEL) & (level > _CALM_RATIO * usual) & among)
 
-    def _calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        """Residual of each block by the fit to the calmest ones, their level, the fit's step.
-
-        Trimmed least squares from many starts, the whole and stretches of 2, 4 and 8 s that grow.
-        Of the results that one counts which leaves least in all blocks, each up to a limit.
-        """
+    def _fit_calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
+        """Return residuals of the blocks, level of the calmest, and the fit's change."""
         if len(blocks) < 2 * _FEWEST_BLOCKS:
             return None
         starts = [blocks]
-        for length in _LENGTHS:
+        for length in _START_LENGTHS:
             begins = range(0, len(blocks) - length // 2, length // 2)
             starts += [blocks[k : k + length] for k in begins]
         found, usual = [], np.inf
-        for kept, share in product(starts, _KEPT):
-            level, move, last = self._trimmed(blocks, kept, share)
+        for kept, share in product(starts, _KEPT_SHARES):
+            level, move, last = self._trimmed_fit(blocks, kept, share)
             found.append((level, move))
-            if share == _KEPT[1]:
+            if share == _KEPT_SHARES[1]:
                 usual = min(usual, float(np.median(level[last])))
-        limit = max(_LEVELS**2, (_CALM**2) * usual)
+        limit = max(_CONTACT_LEVEL**2, (_CALM_RATIO**2) * usual)
         level, move = min(found, key=lambda x: float(np.minimum(x[0][blocks], limit).sum()))
         calm = np.median(level[blocks][level[blocks] < limit])
         return np.sqrt(np.maximum(level, 0.0)), float(np.sqrt(max(calm, 0.0))), move
 
-    def _trimmed(
+    def _trimmed_fit(
         self, blocks: NDArray[np.intp], kept: NDArray[np.intp], share: float
     ) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Mean squares of all blocks, the step, and the calmest share, from a start."""
         keep = max(_FEWEST_BLOCKS, int(share * len(blocks)))
-        for _ in range(_ROUNDS):
-            move = inverted(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
+        for _ in range(_ITERATIONS):
+            move = regularized_inverse(self._gram[kept].sum(axis=0)) @ self._right[kept].sum(axis=0)
             left = self._square - 2.0 * self._right @ move + (self._gram @ move) @ move
             level = left / (6.0 * np.maximum(self._counts, 1.0))
             size = min(keep, 1 + int(_GROWTH * len(kept))) if len(kept) < keep else keep
@@ -155,13 +144,8 @@ class _Blocks:
         return level, move, kept
 
 
-def _by_motion(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
-    """(blocks,) usual level of a motion that changes as fast: motion is known up to a frequency.
-
-    The level beyond that at rest is in proportion to the second difference of the wrench that the
-    model expects with parameters x; the factor is twice that of the calmest quarter of the blocks
-    with a fast motion.
-    """
+def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
+    """(blocks,) residual level that errors of fast motion cause, by the calmest fast blocks."""
     data, rows = state.data, state.data.block
     y = data.with_steps(state.model.times)
     wrench = y @ state.model.wrench(x[None])[0].T
@@ -171,19 +155,17 @@ def _by_motion(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) 
     bend[1:-1] = np.where(both, (second * second).sum(axis=1), 0.0)
     blocks = np.add.reduceat(bend, np.arange(0, len(y), rows)) / rows
     fast = np.sqrt(blocks[: len(level)])
-    lively = usable & (fast > np.median(fast[usable]))
-    if lively.sum() < 8:
+    accelerates_enough = usable & (fast > np.median(fast[usable]))
+    if accelerates_enough.sum() < 8:
         return np.zeros(len(level))
-    ratio = level[lively] / np.maximum(fast[lively], 1e-12)
+    ratio = level[accelerates_enough] / np.maximum(fast[accelerates_enough], 1e-12)
     return np.asarray(2.0 * np.quantile(ratio, 0.25) * fast)
 
 
-def contact_of_steps(state: State) -> State:
-    """Replace changes of the offsets by a contact between them, where the residual says so.
+def replace_steps_by_contact(state: State) -> State:
+    """Replace two changes of offsets by a contact between them if the residual requires it.
 
-    Two changes explain the level of a contact and leave a wrong load, with a good likelihood. They
-    are a contact if they cancel, or if the residual between them is mostly large and that of the
-    rest is not once the rows between them are left out.
+    Two changes explain the level of a contact, but with a wrong load.
     """
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
@@ -197,37 +179,35 @@ def contact_of_steps(state: State) -> State:
         x = np.concatenate([state.x[: DELAY + 1], np.zeros(model.size - DELAY - 1)])
         dt = state.data.dt
         span = (start - dt, stop + dt)
-        if len(ends) == 2 and _cancel(state, i, j):
+        if len(ends) == 2 and _cancels(state, i, j):
             return State.of(state.data, model, x, (*state.spans, span))
-        if _usual(state, span) > _LEVELS:
+        if _median_residual_ratio(state, span) > _CONTACT_LEVEL:
             calm = State.of(state.data, model, x, (*state.spans, span))
-            if calm.loudness < min(_CALM, state.loudness / _CALM):
-                return shrunk(calm)
+            if calm.residual_ratio < min(_CALM_RATIO, state.residual_ratio / _CALM_RATIO):
+                return shrink_contacts(calm)
     return state
 
 
-def shrunk(state: State) -> State:
-    """Give rows at the ends of the contacts back to the rest, if their residual is small."""
+def shrink_contacts(state: State) -> State:
+    """Return rows at the ends of contacts to the fit, if their residual is small."""
     dt = state.data.dt
-    spans = [_loud(state, span) for span in state.spans]
+    spans = [_contact_span(state, span) for span in state.spans]
     return State.of(state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans))
 
 
-def _loud(state: State, span: tuple[float, float]) -> tuple[float, float]:
-    """First and last time within a span at which the residual is large."""
+def _contact_span(state: State, span: tuple[float, float]) -> tuple[float, float]:
     data = state.data
     inside = np.flatnonzero(data.used & in_spans(data, (span,)))
     y = data.with_steps(state.model.times)[:, state.model.columns]
     usual = np.maximum(np.maximum(data.white, state.rows.rms(state.fit.residual)), 1e-12)
-    loud = np.abs(y[inside] @ state.fit.residual.T) > _CALM * usual
-    at = inside[loud.any(axis=1)]
+    contact_blocks = np.abs(y[inside] @ state.fit.residual.T) > _CALM_RATIO * usual
+    at = inside[contact_blocks.any(axis=1)]
     if not len(at):
         return span
     return float(data.t[at[0]]) - 0.5 * data.dt, float(data.t[at[-1]]) + 0.5 * data.dt
 
 
-def _usual(state: State, span: tuple[float, float]) -> float:
-    """Largest usual residual of a channel over its white noise within a span."""
+def _median_residual_ratio(state: State, span: tuple[float, float]) -> float:
     chosen = state.rows.used & in_spans(state.data, (span,))
     if not chosen.any():
         return 0.0
@@ -235,8 +215,7 @@ def _usual(state: State, span: tuple[float, float]) -> float:
     return float((np.median(e, axis=0) / 0.6745 / np.maximum(state.data.white, 1e-12)).max())
 
 
-def _cancel(state: State, i: int, j: int) -> bool:
-    """Whether the second of two changes of offsets undoes the first."""
+def _cancels(state: State, i: int, j: int) -> bool:
     steps = state.model.steps
     if (steps[i].kind, steps[j].kind) != ("offsets", "offsets"):
         return False
@@ -247,8 +226,8 @@ def _cancel(state: State, i: int, j: int) -> bool:
     return bool((np.abs(both) < 4.0 * np.sqrt(np.maximum(variance, 0.0))).all())
 
 
-def _spans(loud: NDArray[np.bool_], t: Array, rows: int) -> Spans:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], loud.astype(np.int8), [0]])))
+def _spans(contact_blocks: NDArray[np.bool_], t: Array, rows: int) -> Spans:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], contact_blocks.astype(np.int8), [0]])))
     half = 0.5 * float(t[1] - t[0])
     last = len(t) - 1
     return tuple(

@@ -1,4 +1,4 @@
-"""Why a wrench is not that of a rigid load: test, search, and the load within the result."""
+"""Explanation of a wrench: test, search, and the load within the result."""
 
 from __future__ import annotations
 
@@ -18,26 +18,32 @@ from drake_teleop.logs.causes.intervals import (
     misfit_deviations,
 )
 from drake_teleop.logs.causes.model import DELAY, LOAD
-from drake_teleop.logs.causes.search import Later, clearly_wrong, explained, search, settled
+from drake_teleop.logs.causes.search import (
+    WithDelay,
+    is_clear_misfit,
+    is_noise,
+    may_be_coloured_noise,
+    search,
+)
 from drake_teleop.logs.causes.state import State
 
-_NO_MASS, _NO_MASS_DEVIATIONS, _SURE = 0.010, 4.0, 20.0
+_NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What acts on a sensor, as far as a record shows it.
+    """Causes of a record and the load within their model.
 
     Attributes:
-        causes: what acts beside a rigid load with constant offsets; empty if nothing does.
-        explained: whether the residual is the sensor's noise.
-        theta: (16,) [offsets; phi] within the model; of the first stretch if the load changes.
+        causes: effects beside a rigid load with constant offsets.
+        explained: whether the residual is sensor noise.
+        theta: (16,) [offsets; phi] of the first part of the record.
         covariance: (16, 16) of theta.
-        deviations: (16,) of theta by what remains unexplained (`misfit_deviations`).
-        delay_s: of the motion behind the wrench, in addition to what `instants` had [s].
-        loads: the loads of a record whose load changes.
-        removed_weight: (4,) [m, m c] whose weight is already removed, or None.
-        given: parts of the model that are known to act, and are no causes.
+        deviations: (16,) of theta by the unexplained rest (`misfit_deviations`).
+        delay_s: additional delay of the motion behind the wrench [s].
+        loads: of a record whose load changes.
+        removed_weight: (4,) [m, m c] removed from the wrench, or None.
+        given: active parts of the model that are no causes.
         state: model and residual.
     """
 
@@ -54,44 +60,48 @@ class Explanation:
 
     @property
     def misfit(self) -> bool:
-        """Whether the residual is clearly not the sensor's noise, even if that is coloured."""
-        return not self.explained and clearly_wrong(self.state)
+        """Whether the residual is clearly not noise, even if coloured."""
+        return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gains stand for errors of the whole matrix of gains."""
+        """Whether gains represent errors of the whole matrix of gains."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
 
 
-def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Explanation:
-    """Test whether a rigid load explains a record, and find what else acts if it does not.
+def explain(
+    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
+) -> Explanation:
+    """Test whether a rigid load explains a record, and search for causes if not.
 
-    Args:
-        data: the record.
-        later: returns the record with the motion of a delay [s] more.
-        given: parts of `Model` that are known to act, such as "weight".
+    `with_delay` returns the record with an additional delay [s]; `given` are active parts, such as
+    "weight".
     """
     with one_blas_thread():
-        state, late, rejected = search(data, later, given)
+        state, delay_s, rejected = search(data, with_delay, given)
         blocks = block_deviations(state)
         gains = gain_covariance(state) + factor_covariance(state)
         covariance = covariance_of(state, rejected, blocks, gains)
         causes = causes_of(state, given)
-        noise = explained(state)
-        if not causes and (noise or settled(state)) and _no_load(state, covariance):
-            causes = [_nothing_mounted(state, covariance)]
+        only_noise = is_noise(state)
+        if (
+            not causes
+            and (only_noise or may_be_coloured_noise(state))
+            and _no_load(state, covariance)
+        ):
+            causes = [_no_load_cause(state, covariance)]
         removed = None
         if "weight" in state.model.parts:
             removed = state.x[state.model.slices["weight"]]
         return Explanation(
             causes=tuple(causes),
-            explained=noise,
+            explained=only_noise,
             theta=state.x[LOAD],
             covariance=covariance,
             deviations=misfit_deviations(state, rejected, blocks, gains),
-            delay_s=late + float(state.x[DELAY]),
+            delay_s=delay_s + float(state.x[DELAY]),
             loads=tuple(stretches(state, covariance)),
             removed_weight=removed,
             state=state,
@@ -101,11 +111,11 @@ def explain(data: Instants, later: Later | None = None, given: tuple[str, ...] =
 
 def _no_load(state: State, covariance: Array) -> bool:
     mass, deviation = abs(float(state.x[6])), float(np.sqrt(covariance[6, 6]))
-    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SURE * deviation))
+    least = max(_NO_MASS_DEVIATIONS * deviation, min(_NO_MASS, _SIGNIFICANT * deviation))
     return bool(mass < least and deviation < 0.1)
 
 
-def _nothing_mounted(state: State, covariance: Array) -> Cause:
+def _no_load_cause(state: State, covariance: Array) -> Cause:
     most = abs(float(state.x[6])) + 1.96 * float(np.sqrt(covariance[6, 6]))
     return Cause(
         "no load",

@@ -1,8 +1,7 @@
-"""Gauss-Newton for a model, with autoregressive noise of order 4 in each channel.
+"""Gauss-Newton fit with autoregressive noise of order 4 in each channel.
 
-Noise and parameters are estimated in turn, for every model anew. The first two steps are
-unweighted: noise that is fitted to the residual of a smaller model takes the misfit for slow noise,
-and the larger model then has nothing to explain.
+Noise and parameters are estimated in turn. The first two iterations are unweighted: noise of a
+smaller model would absorb its misfit and hide the effect of an extension.
 """
 
 from __future__ import annotations
@@ -16,21 +15,21 @@ from drake_teleop.logs.causes.instants import FORCES, ORDER
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.rows import Rows
 
-_STEPS, _CONVERGED, _PLAIN_STEPS = 12, 0.02, 2
+_MAX_ITERATIONS, _CONVERGENCE, _UNWEIGHTED_ITERATIONS = 12, 0.02, 2
 _RIDGE, _FLOOR = 1e-11, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A model fitted to rows.
+    """Model fitted to rows.
 
     Attributes:
         model: the model.
-        rows: what it was fitted to.
-        x: (size,) its parameters.
-        covariance: (size, size) by the noise; huge where nothing determines a parameter.
+        rows: fitted rows.
+        x: (size,) parameters.
+        covariance: (size, size); huge for undetermined parameters.
         residual: (6, W) coefficients of the residual in y.
-        filters: (6, 5) of the noise: white = sum over d of filters[c, d] noise[n - d].
+        filters: (6, 5) white noise = sum over d of filters[c, d] noise[n - d].
         power: (6,) variance of that white noise.
     """
 
@@ -44,11 +43,11 @@ class Fit:
 
     @property
     def likelihood(self) -> float:
-        """Logarithm of the likelihood, but for a constant."""
+        """Logarithm of the likelihood up to a constant."""
         return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
 
     def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
-        """Gram and right-hand side of a step of a model from x, whose residual is this fit's."""
+        """Return Gram matrix and right-hand side of an iteration of a model from x."""
         whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
         J = model.derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
@@ -57,15 +56,10 @@ class Fit:
         return 0.5 * (gram + gram.T), right
 
 
-def fit(model: Model, rows: Rows, start: Array | None = None, *, steps: int = _STEPS) -> Fit:
-    """Fit a model.
-
-    Args:
-        model: the model.
-        rows: with columns for its steps.
-        start: (size,) parameters to begin with.
-        steps: at most; the first two take the noise for white.
-    """
+def fit(
+    model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
+) -> Fit:
+    """Fit a model to rows from `start` (size,) in at most `steps` iterations."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count
@@ -76,22 +70,22 @@ def fit(model: Model, rows: Rows, start: Array | None = None, *, steps: int = _S
     found = Fit(model, rows, x, np.zeros(0), model.residual(x), filters, np.maximum(both, floor))
     for step in range(steps):
         gram, right = found.normal(model, x)
-        inverse = inverted(gram)
+        inverse = regularized_inverse(gram)
         move = inverse @ right
         move /= max(1.0, float(np.max(np.abs(move) / model.limits)))
         x = x + move
         residual = model.residual(x)
-        order = 0 if step + 1 < _PLAIN_STEPS else ORDER
+        order = 0 if step + 1 < _UNWEIGHTED_ITERATIONS else ORDER
         filters, power = rows.noise(residual, floor, order)
         found = Fit(model, rows, x, inverse, residual, filters, power)
-        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGED
-        if still and step > _PLAIN_STEPS:
+        still = np.max(np.abs(move) / np.sqrt(np.diag(inverse))) < _CONVERGENCE
+        if still and step > _UNWEIGHTED_ITERATIONS:
             break
     return found
 
 
-def inverted(gram: Array) -> Array:
-    """Inverse of a Gram matrix with a small ridge on its scaled diagonal."""
+def regularized_inverse(gram: Array) -> Array:
+    """Invert a Gram matrix with a small ridge on its scaled diagonal."""
     diagonal = np.diag(gram)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-14 * diagonal.max() + 1e-300))
     scaled = gram * np.outer(scale, scale)

@@ -1,15 +1,12 @@
 """Wrench and motion as block means at about 50 Hz, and their sums of products by block and lag.
 
-All columns of all models in this package are linear in the signals of one instant,
+All models of this package are linear in the signals of one instant,
 
-    y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
+y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
-with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. The means
-over a block are exact, because the models are linear in y and white noise stays white. The sums
-
-    G_d = sum of (y_n y_{n-d}^T + y_{n-d} y_n^T),   d = 0 ... 4 (G_0 once),
-
-contain everything that a fit with autoregressive noise of order 4 needs.
+with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. Means
+are exact because of this linearity. The sums of y_n y_{n-d}^T + y_{n-d} y_n^T, d = 0 ... 4,
+suffice for a fit with autoregressive noise of order 4.
 """
 
 from __future__ import annotations
@@ -20,12 +17,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 from drake_teleop.common.arrays import Array
 
 ORDER = 4
-"""Of the autoregressive noise."""
+"""Order of the autoregressive noise."""
 ONE, S, G, ALPHA, PRODUCTS = 0, slice(1, 4), slice(4, 7), slice(7, 10), slice(10, 16)
 FORCES, RATES, R, RP, TIME = (
     slice(16, 22),
@@ -36,16 +34,18 @@ FORCES, RATES, R, RP, TIME = (
 )
 WIDTH = 67
 MOTION = np.r_[0:16, 28:37]
-"""Columns that a load's wrench depends on; a step has these again, multiplied by u(t - t1)."""
-_RATE, _MOST = 50.0, 20_000
-_BLOCK_S, _BLOCKS, _FEWEST_ROWS = 0.25, 320, 5
-_EXACT, _LIVELY, _NOISY_SHARE = 5, 4.0, 1.0 / 64.0
-_WIDTHS = (5, 9, 15, 25)  # of smoothers of a noisy angular acceleration
-_FINEST = 1e-4  # of the wrench: no sensor has less noise
+"""Columns of the load's wrench; a step at t1 repeats them, multiplied by u(t - t1)."""
+_RATE_HZ, _MAX_ROWS = 50.0, 20_000
+_BLOCK_S, _MAX_BLOCKS, _MIN_BLOCK_ROWS = 0.25, 320, 5
+_MAX_EXACT_SIZE, _MIN_ACCELERATION_RATIO, _MAX_NOISE_SHARE = 5, 4.0, 1.0 / 64.0
+_SMOOTHING_WIDTHS = (5, 9, 15, 25)  # smoothing windows of a noisy angular acceleration [rows]
+_SMALLEST_NOISE = 1e-4  # smallest noise of a sensor, as a share of the wrench
+_DELAY_RANGE_S, _DELAY_STEP_S = 0.25, 0.01
+_MOTION_SIGNALS = slice(0, 16)
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 Motion = Callable[[Array], tuple[Array, ...]]
-"""Of times (K,): s, omega, alpha (K, 3), and, if known, R_WS (K, 3, 3) and p (K, 3)."""
+"""Function of times (K,): s, omega, alpha (K, 3); if known R_WS (K, 3, 3) and p (K, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +54,13 @@ class Instants:
 
     Attributes:
         t: (M,) middle of each block [s].
-        y: (M, WIDTH) signals; 0 in rows that are not used.
+        y: (M, WIDTH) signals; 0 in unused rows.
         used: (M,) rows without gaps and edges.
-        white: (6,) standard deviation of the wrench's white noise in a block mean.
-        gravity_W: (3,) [m/s^2], or None if the orientation is unknown.
+        white: (6,) standard deviation of white wrench noise in a block mean.
+        gravity_W: (3,) [m/s^2], or None without orientation.
         positions: whether p is known.
-        shake: standard deviation of the acceleration in a block mean, of noise alone [m/s^2].
-        alpha_noise_share: of the variance of an IMU's angular acceleration, about the liveliest
-            axis, before it was smoothed.
+        shake: noise of the acceleration in a block mean [m/s^2].
+        alpha_noise_share: noise share of the variance of an IMU's angular acceleration.
     """
 
     t: Array
@@ -70,30 +69,32 @@ class Instants:
     white: Array
     gravity_W: Array | None
     positions: bool
-    shake: float = 0.0
+    acceleration_noise: float = 0.0
     alpha_noise_share: float = 0.0
 
     @cached_property
-    def lively(self) -> bool:
-        """Whether the record accelerates enough to tell inertia from weight."""
+    def accelerates_enough(self) -> bool:
+        """Whether accelerations suffice to separate inertia from weight."""
         if self.gravity_W is None:
-            return self.alpha_noise_share < _NOISY_SHARE
+            return self.alpha_noise_share < _MAX_NOISE_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
-        return bool(np.sqrt(a.var(axis=0).max()) > _LIVELY * self.shake)
+        return bool(
+            np.sqrt(a.var(axis=0).max()) > _MIN_ACCELERATION_RATIO * self.acceleration_noise
+        )
 
     @property
     def dt(self) -> float:
-        """Time from one instant to the next [s]."""
+        """Time between instants [s]."""
         return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
 
     @cached_property
     def block(self) -> int:
         """Rows of a block."""
-        least = -(-len(self.t) // _BLOCKS)
-        return max(least, _FEWEST_ROWS, round(_BLOCK_S / self.dt))
+        least = -(-len(self.t) // _MAX_BLOCKS)
+        return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
     def only(self, used: NDArray[np.bool_]) -> Instants:
-        """The same with the rows `used` (M,) alone."""
+        """Return the record with other used rows (M,)."""
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def with_steps(self, times: tuple[float, ...]) -> Array:
@@ -126,20 +127,20 @@ def instants(
     motion: Motion | tuple[Array, ...],
     gravity_W: Array | None,
     lost: NDArray[np.bool_] | None = None,
-    shake: float = 0.0,
+    acceleration_noise: float = 0.0,
 ) -> Instants:
-    """Block means of a record.
+    """Return block means of a record.
 
     Args:
         t: (N,) evenly spaced [s].
         wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        motion: a function of time, or what it returns at `t`.
-        gravity_W: (3,) [m/s^2]; None if `motion` has no orientation.
-        lost: (N,) samples that do not count.
-        shake: as in `Instants`.
+        motion: a function of time, or its values at `t`.
+        gravity_W: (3,) [m/s^2]; None without orientation.
+        lost: (N,) ignored samples.
+        shake: noise of the acceleration [m/s^2].
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
-    size = max(1, round(1.0 / (_RATE * dt)), -(-len(t) // _MOST))
+    size = max(1, round(1.0 / (_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
     rows = len(t) // size
     t, wrench = t[: rows * size], wrench[: rows * size]
     middle = t.reshape(rows, size).mean(axis=1)
@@ -147,57 +148,62 @@ def instants(
     y[:, ONE] = 1.0
     y[:, FORCES] = wrench.reshape(rows, size, 6).mean(axis=1)
     y[1:-1, RATES] = (y[2:, FORCES] - y[:-2, FORCES]) / (2.0 * size * dt)
-    positions = _put_motion(y, t, size, motion, gravity_W)
+    positions = _write_motion(y, t, size, motion, gravity_W)
     y[:, TIME] = _legendre(np.linspace(-1.0, 1.0, rows))
     used = np.ones(rows, bool)
     used[[0, -1]] = False
     if lost is not None:
         used &= ~lost[: rows * size].reshape(rows, size).any(axis=1)
-    white = np.median(np.abs(np.diff(wrench, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+    white = _white_noise(wrench)
     spread = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1)).repeat(3)
-    white = np.maximum(white, _FINEST * spread)
+    white = np.maximum(white, _SMALLEST_NOISE * spread)
     share = _smooth_alpha(y, used) if gravity_W is None else 0.0
-    out = Instants(middle, y, used, white / np.sqrt(size), gravity_W, positions, shake, share)
+    out = Instants(
+        middle, y, used, white / np.sqrt(size), gravity_W, positions, acceleration_noise, share
+    )
     return out.only(used)
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
-    """Smooth an angular acceleration that is noisy, as far as it needs; return its noise share."""
+    """Smooth a noisy angular acceleration in place; return its noise share."""
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
-    for width in _WIDTHS:
-        if _noise_share(alpha) < _NOISY_SHARE or width >= len(alpha):
+    for width in _SMOOTHING_WIDTHS:
+        if _noise_share(alpha) < _MAX_NOISE_SHARE or width >= len(alpha):
             break
         alpha = savgol_filter(y[used][:, ALPHA], width, 2, axis=0)
     y[np.flatnonzero(used)[:, None], np.arange(ALPHA.start, ALPHA.stop)] = alpha
     return share
 
 
+def _white_noise(x: Array) -> Array:
+    """Return the standard deviation of white noise in each column, from third differences."""
+    return np.asarray(np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0))
+
+
 def _noise_share(x: Array) -> float:
-    """Least share of white noise in the variance of the columns of x, by third differences."""
-    noise = np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0)
+    noise = _white_noise(x)
     return float((noise**2 / np.maximum(x.var(axis=0), 1e-12)).min())
 
 
-def _put_motion(
+def _write_motion(
     y: Array,
     t: Array,
     size: int,
     motion: Motion | tuple[Array, ...],
     gravity_W: Array | None,
 ) -> bool:
-    """Write the columns of the motion into y; return whether positions are known."""
     rows = len(y)
     if not callable(motion):
         columns = _columns([x[: rows * size] for x in motion], gravity_W)
-        _put(y, columns.reshape(rows, size, -1).mean(axis=1))
+        _write_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(motion) == 5
-    if size <= _EXACT:
+    if size <= _MAX_EXACT_SIZE:
         found = motion(t)
         columns = _columns(found, gravity_W)
-        _put(y, columns.reshape(rows, size, -1).mean(axis=1))
+        _write_columns(y, columns.reshape(rows, size, -1).mean(axis=1))
         return len(found) == 5
-    # Simpson's rule over a width that has the variance of `size` samples.
+    # Simpson's rule over an interval with the variance of `size` samples.
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     middle = t.reshape(rows, size).mean(axis=1)
     half = 0.5 * dt * np.sqrt(size**2 - 1.0)
@@ -205,11 +211,11 @@ def _put_motion(
     for shift, weight in ((-half, 1.0), (0.0, 4.0), (half, 1.0)):
         found = motion(middle + shift)
         total = total + weight / 6.0 * _columns(found, gravity_W)
-    _put(y, total)
+    _write_columns(y, total)
     return len(found) == 5
 
 
-def _put(y: Array, columns: Array) -> None:
+def _write_columns(y: Array, columns: Array) -> None:
     y[:, 1:16] = columns[:, :15]
     y[:, R.start : R.start + columns.shape[1] - 15] = columns[:, 15:]
 
@@ -229,3 +235,37 @@ def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
 
 def _legendre(x: Array) -> Array:
     return np.stack([x, 1.5 * x**2 - 0.5, 2.5 * x**3 - 1.5 * x], axis=1)
+
+
+def free_delay(data: Instants) -> float:
+    """Return the delay [s] of the smallest residual, within 0.25 s or a tenth of the record.
+
+    Each channel is fitted with the 16 signals of the motion, because a wrong load model would bias
+    it.
+    """
+    reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
+    rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)
+    spline = CubicSpline(data.t, data.y[:, _MOTION_SIGNALS])
+    forces = data.y[rows][:, FORCES]
+    total = (forces * forces).sum(axis=0)
+
+    def cost(shift: float) -> float:
+        x = spline(data.t[rows] + shift)
+        size = np.sqrt((x * x).mean(axis=0))
+        x = x[:, size > 1e-9 * size.max()]
+        x /= np.sqrt((x * x).mean(axis=0))
+        found = np.linalg.lstsq(x.T @ x, x.T @ forces, rcond=1e-10)[0]
+        left = total - ((x.T @ forces) * found).sum(axis=0)
+        return float(np.log(np.maximum(left, 1e-12 * total + 1e-30)).sum())
+
+    shifts = (
+        np.arange(-round(reach / _DELAY_STEP_S), round(reach / _DELAY_STEP_S) + 1) * _DELAY_STEP_S
+    )
+    costs = np.array([cost(x) for x in shifts])
+    best = int(np.argmin(costs))
+    if best in (0, len(shifts) - 1):
+        return 0.0
+    left, middle, right = costs[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    move = 0.5 * (left - right) / bend if bend > 0.0 else 0.0
+    return float(shifts[best] + _DELAY_STEP_S * np.clip(move, -1.0, 1.0))

@@ -1,11 +1,4 @@
-"""Covariance of a load that counts what the model leaves unexplained.
-
-The covariance of generalised least squares holds for stationary noise. Leaving out each of twelve
-parts of the record shows the rest: with f the root mean square of block deviation over stated
-deviation, all sixteen deviations grow by f / 1.15 if f > 1.5. A probe above 1.35 widens all of
-them further, and every candidate that the search rejected adds its distance from the estimate.
-Errors of the 36 gains of the sensor, if the residual shows any, add their effects.
-"""
+"""Covariance of a load including unexplained misfit (docs/theory.md, "Causes of a misfit")."""
 
 from __future__ import annotations
 
@@ -18,7 +11,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors
-from drake_teleop.logs.causes.fit import inverted
+from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.instants import FORCES
 from drake_teleop.logs.causes.model import LOAD
 from drake_teleop.logs.causes.rows import Rows
@@ -26,25 +19,24 @@ from drake_teleop.logs.causes.state import State
 
 _GROUPS = 12
 _TOLERATED, _USUAL = 1.5, 1.15
-_PROBE, _PROBE_SLOPE = 1.35, 3.0
-_CONSIDERED, _BELIEVED, _CALMER = 6.0, 15.0, 0.5
-_CABLE_FACTOR, _LOUD, _IMPLAUSIBLE, _MISFIT = 1.5, 20.0, 2.2, 6.0
-_CHANGING = ("offsets", "load", "linear drift", "drift")
-"""Causes whose effect leaving out parts of the record shows."""
-_GAINS, _GAINS_SHOWN, _GAINS_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
-_GAINS_MOST = 0.025
+_GOOD_SMOOTH_MISFIT, _SMOOTH_MISFIT_SLOPE = 1.35, 3.0
+_SMALLEST_SCORE, _CERTAIN_SCORE, _HALVED = 6.0, 15.0, 0.5
+_CABLE_FACTOR, _LARGE_RESIDUAL_RATIO, _CLEAR_SMOOTH_MISFIT, _LARGE_SMOOTH_MISFIT = (
+    1.5,
+    20.0,
+    2.2,
+    6.0,
+)
+_CHANGING_CAUSES = ("offsets", "load", "linear drift", "drift")
+"""Causes whose effects are included in the jackknife."""
+_GAIN_ERRORS, _MIN_GAIN_LIKELIHOOD, _MIN_GAIN_SHARE = np.geomspace(1e-4, 0.1, 31), 20.0, 0.5
+_LARGEST_GAIN_ERROR = 0.025
 
 
 def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return (16, 16) of [offsets; phi], widened by what the model leaves unexplained.
-
-    Args:
-        state: the model.
-        rejected: candidates of the last round.
-        blocks, gains: as of `block_deviations` and `gain_covariance`.
-    """
+    """(16, 16) of [offsets; phi], widened by unexplained misfit and rejected candidates."""
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
@@ -57,38 +49,42 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return (16,) deviations of a rigid load, as of `covariance_of`, where no cause is named."""
-    if state.probe > (_IMPLAUSIBLE if state.loudness > _LOUD else _MISFIT):
-        blocks = blocks * (1.0 + _PROBE_SLOPE * (state.probe - _PROBE))
-    lasting = [x for x in rejected if x.name not in _CHANGING]
+    """(16,) deviations of a rigid load without named cause."""
+    if state.smooth_misfit > (
+        _CLEAR_SMOOTH_MISFIT
+        if state.residual_ratio > _LARGE_RESIDUAL_RATIO
+        else _LARGE_SMOOTH_MISFIT
+    ):
+        blocks = blocks * (1.0 + _SMOOTH_MISFIT_SLOPE * (state.smooth_misfit - _GOOD_SMOOTH_MISFIT))
+    lasting = [x for x in rejected if x.name not in _CHANGING_CAUSES]
     variance = blocks**2 + _squared_distances(state, lasting) + np.diag(gains)
     return np.asarray(np.sqrt(variance))
 
 
 def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
-    """Return (16,) squared distances of the estimates of candidates that are not excluded."""
+    """(16,) squared distances of possible candidates."""
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
-        share = min(1.0, candidate.score / _BELIEVED) if candidate.score > _CONSIDERED else 0.0
-        if other.loudness < _CALMER * state.loudness:
-            share = 1.0  # coloured noise predicts a misfit as well
+        share = (
+            min(1.0, candidate.score / _CERTAIN_SCORE) if candidate.score > _SMALLEST_SCORE else 0.0
+        )
+        if other.residual_ratio < _HALVED * state.residual_ratio:
+            share = 1.0  # the likelihood hides a smooth misfit, which coloured noise predicts
         own = np.diag(other.fit.covariance)[LOAD]
         squares += share * ((other.x[LOAD] - state.x[LOAD]) ** 2 + own)
     return squares
 
 
 def gain_covariance(state: State) -> Array:
-    """Return (16, 16) of [offsets; phi] by errors of all gains of the size that the residual shows.
+    """(16, 16) of [offsets; phi] caused by errors of all gains, of the size in the residual.
 
-    The 36 errors have one standard deviation, a torque's as at `ARM`: the largest that is nearly
-    the most likely one; 0 if the likelihood without any is nearly the same, if they explain less
-    than half of what smooth columns do, or if no sensor has errors as large.
+    The 36 errors have one standard deviation (of a torque at `ARM`); 0 if gains explain little.
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
     unit = np.repeat([1.0, ARM], 3)
-    # The wrench of the model: the noise of a reading is that of the residual, too.
+    # Gains multiply the wrench of the model, because noise of the reading is in the residual.
     wrench = (rows.columns == np.arange(FORCES.start, FORCES.stop)[:, None]) - fit.residual
     J, inverse = state.model.derivative(state.x), fit.covariance
     mixed, gram, right = np.zeros((len(J), 36)), np.zeros((36, 36)), np.zeros(36)
@@ -108,12 +104,12 @@ def gain_covariance(state: State) -> Array:
         more = std * std * seen
         return float(np.sum(squares * more / (1.0 + more) - np.log1p(more)))
 
-    likely = np.array([gained(std) for std in _GAINS])
-    explaining = squares.sum() > _GAINS_SHARE * state.smooth_gain[0]
-    plausible = _GAINS[int(likely.argmax())] < _GAINS_MOST
-    if likely.max() < _GAINS_SHOWN or not explaining or not plausible:
+    likely = np.array([gained(std) for std in _GAIN_ERRORS])
+    explaining = squares.sum() > _MIN_GAIN_SHARE * state.smooth_gain[0]
+    plausible = _GAIN_ERRORS[int(likely.argmax())] < _LARGEST_GAIN_ERROR
+    if likely.max() < _MIN_GAIN_LIKELIHOOD or not explaining or not plausible:
         return np.zeros((16, 16))
-    largest = _GAINS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
+    largest = _GAIN_ERRORS[np.flatnonzero(likely > likely.max() - 2.0)[-1]]
     effects = largest * (inverse @ mixed)[LOAD]
     return np.asarray(effects @ effects.T)
 
@@ -128,7 +124,7 @@ def factor_covariance(state: State) -> Array:
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
-    """Factor of all deviations; 1 where the residual is stationary noise."""
+    """Factor of all deviations; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD])
     shown = deviations < natural_scale(state.x[6:16])
     factor = 1.0
@@ -136,12 +132,14 @@ def misfit_factor(state: State, blocks: Array) -> float:
         spread = float(np.sqrt(np.mean((blocks[shown] / deviations[shown]) ** 2)))
         factor = spread / _USUAL if spread > _TOLERATED else 1.0
     if "cable" in state.model.parts:
-        factor *= _CABLE_FACTOR  # a spring is a cable to first order
-    return factor * (1.0 + _PROBE_SLOPE * max(0.0, state.probe - _PROBE))
+        factor *= _CABLE_FACTOR  # a spring models a cable only to first order
+    return factor * (
+        1.0 + _SMOOTH_MISFIT_SLOPE * max(0.0, state.smooth_misfit - _GOOD_SMOOTH_MISFIT)
+    )
 
 
 def block_deviations(state: State) -> Array:
-    """(16,) deviations by leaving out each of twelve parts of the record (jackknife)."""
+    """(16,) jackknife deviations over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _GROUPS)
     whole, right = state.fit.normal(state.model, state.x)
@@ -151,6 +149,6 @@ def block_deviations(state: State) -> Array:
         used[part] = True
         few = Rows(rows.data, used, rows.times, rows.columns)
         gram, pull = replace(state.fit, rows=few).normal(state.model, state.x)
-        moves.append((inverted(whole - gram) @ (right - pull))[LOAD])
+        moves.append((regularized_inverse(whole - gram) @ (right - pull))[LOAD])
     spread = np.array(moves) - np.mean(moves, axis=0)
     return np.asarray(np.sqrt((_GROUPS - 1.0) / _GROUPS * np.sum(spread**2, axis=0)))

@@ -1,14 +1,4 @@
-"""A rigid load and what else acts: the wrench as a function of few parameters.
-
-The measured wrench of an instant is
-
-    F = o + tau dF/dt + D [V(s + R_SW d + A r, omega, alpha) phi - V(-g, 0, 0)[:, :4] w + cable] + e
-
-with offsets o, remaining delay tau, and extensions: gravity off by -d in the world, a pose frame
-displaced by r (A r = alpha x r + omega x (omega x r)), weight w = [m, m c] that the robot has
-removed, a cable R_SW (f0 + K p) that acts at a, drift, steps of offsets or load. D has the axes Q
-of the wrench, a small rotation, a factor of the torque and gains of single channels.
-"""
+"""Rigid load with further causes: the wrench as a function of few parameters, Eq. (T25)."""
 
 from __future__ import annotations
 
@@ -37,7 +27,7 @@ from drake_teleop.logs.causes.instants import (
 )
 
 LOAD, DELAY = slice(0, 16), 16
-"""Where the 16 parameters [offsets; phi] and the delay are."""
+"""Positions of the 16 parameters [offsets; phi] and of the delay."""
 _SIZES = {
     "gravity": 3,
     "weight": 4,
@@ -49,10 +39,10 @@ _SIZES = {
     "cable": 12,
 }
 _LIMITS = {"frame": 0.3, "rotation": 0.6, "torque factor": 0.3, "gain": 0.5}
-"""Largest change of a parameter in a step [m, rad, 1]."""
+"""Largest change of a parameter in an iteration [m, rad, 1]."""
 _R_OF_STEP = slice(16, 25)
-_LARGEST_DELAY = 0.03  # s, in a step
-_SMALL = 1e-4  # rad, of the numerical derivative by a rotation
+_LARGEST_DELAY = 0.03  # s, in an iteration
+_ROTATION_STEP = 1e-4  # rad, step of the numerical derivative
 # (6, 10, 12) V of s, alpha and the products of omega.
 _V = coefficients()[:, 6:, 7:19]
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -60,7 +50,7 @@ _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Step:
-    """A change at `time` [s] of the "offsets" (6) or of the "load" (10)."""
+    """Change at `time` [s] of the "offsets" (6) or of the "load" (10)."""
 
     kind: str
     time: float
@@ -73,14 +63,14 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Which extensions are active.
+    """Selection of active extensions.
 
     Attributes:
         parts: names of `_SIZES`.
-        gains: channels of which the gain is free.
+        gains: channels with a free gain.
         steps: changes, in the order of their columns.
         axes: (3, 3) Q, a signed permutation.
-        factor: of the torque, on which "torque factor" builds.
+        factor: of the torque; "torque factor" multiplies it.
     """
 
     parts: tuple[str, ...] = ()
@@ -90,12 +80,12 @@ class Model:
     factor: float = 1.0
 
     def extended(self, part: str) -> Model:
-        """The same with one more part."""
+        """Return the model with one more part."""
         return self if part in self.parts else replace(self, parts=(*self.parts, part))
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Where the parameters of each extension are."""
+        """Positions of the parameters of each extension."""
         out, at = {}, DELAY + 1
         sizes = [(name, _SIZES[name]) for name in self.parts]
         sizes += [(f"gain {c}", 1) for c in self.gains]
@@ -112,18 +102,18 @@ class Model:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Columns of y with its steps that the wrench depends on."""
+        """Columns of y and its steps that determine the wrench."""
         wide = bool({"gravity", "cable"} & set(self.parts))
         kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
         if not wide:
             kept[R], kept[RP] = False, False
             for i in range(len(self.steps)):
-                kept[_after(i)][_R_OF_STEP] = False
+                kept[_step_columns(i)][_R_OF_STEP] = False
         return np.flatnonzero(kept)
 
     @cached_property
     def limits(self) -> Array:
-        """(size,) largest change of each parameter in a step."""
+        """(size,) largest change of each parameter in an iteration."""
         out = np.full(self.size, np.inf)
         out[DELAY] = _LARGEST_DELAY
         for name, where in self.slices.items():
@@ -132,11 +122,11 @@ class Model:
 
     @property
     def times(self) -> tuple[float, ...]:
-        """Of the steps [s]."""
+        """Times of the steps [s]."""
         return tuple(step.time for step in self.steps)
 
     def start(self, x: Array, of: Model) -> Array:
-        """(size,) parameters x of another model, 0 where it has none."""
+        """(size,) parameters x of another model; new parameters are 0."""
         out = np.zeros(self.size)
         out[: DELAY + 1] = x[: DELAY + 1]
         for name, where in self.slices.items():
@@ -152,13 +142,13 @@ class Model:
         out[..., :WIDTH] = _load(x[:, 6:16]) @ motion
         for i, step in enumerate(self.steps):
             if step.kind == "load":
-                out[..., _after(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
+                out[..., _step_columns(i)] = _load(x[:, parts[f"step {i}"]]) @ motion[..., MOTION]
         if "weight" in parts:
             static = np.einsum("bj,cjk->bck", x[:, parts["weight"]], _V[:, :4, :3])
             out[..., G] += static  # - V(-g) w
         if "cable" in parts:
             out[..., :WIDTH] += _cable(x[:, parts["cable"]])
-        turned = self._turned(x)
+        turned = self._rotations(x)
         out[:, :3], out[:, 3:] = turned @ out[:, :3], turned @ out[:, 3:]
         factor = np.full(len(x), self.factor)
         if "torque factor" in parts:
@@ -170,13 +160,12 @@ class Model:
         return out
 
     def _add_constants(self, out: Array, x: Array) -> None:
-        """Add what is not the load's: offsets, their changes and drift, and the delay."""
         channels = np.arange(6)
         out[:, :, ONE] += x[:, :6]
         out[:, channels, RATES.start + channels] += x[:, DELAY, None]
         for i, step in enumerate(self.steps):
             if step.kind == "offsets":
-                out[:, :, _after(i).start] += x[:, self.slices[f"step {i}"]]
+                out[:, :, _step_columns(i).start] += x[:, self.slices[f"step {i}"]]
         for name, degree in (("linear drift", 1), ("drift", 3)):
             if name in self.slices:
                 rows = x[:, self.slices[name]].reshape(-1, 6, degree)
@@ -199,20 +188,19 @@ class Model:
             M[:, :3, PRODUCTS] += _centripetal(r)
         return M
 
-    def _turned(self, x: Array) -> Array:
-        """(B or 1, 3, 3) rotation of the wrench."""
+    def _rotations(self, x: Array) -> Array:
         if "rotation" not in self.slices:
             return self.axes[None]
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def derivative(self, x: Array) -> Array:
-        """(size, 6, k) of the wrench's coefficients in `columns` by the parameters x (size,).
+        """(size, 6, k) derivative of the coefficients in `columns` at x (size,).
 
-        They are linear in each parameter but the rotation, so that differences are exact.
+        Central differences are exact, because all parameters but the rotation are linear.
         """
         steps = np.ones(self.size)
         if "rotation" in self.slices:
-            steps[self.slices["rotation"]] = _SMALL
+            steps[self.slices["rotation"]] = _ROTATION_STEP
         moves = np.diag(steps)
         both = self.wrench(np.vstack([x + moves, x - moves]))
         change = both[: self.size] - both[self.size :]
@@ -225,8 +213,7 @@ class Model:
         return np.asarray(out[:, self.columns])
 
 
-def _after(i: int) -> slice:
-    """Columns of the motion after step i."""
+def _step_columns(i: int) -> slice:
     return slice(WIDTH + len(MOTION) * i, WIDTH + len(MOTION) * (i + 1))
 
 
@@ -235,7 +222,6 @@ def _load(phi: Array) -> Array:
 
 
 def _cable(x: Array) -> Array:
-    """(B, 6, WIDTH) of f0 (3), K (6, upper triangle), a (3)."""
     out = np.zeros((len(x), 6, WIDTH))
     K = x[:, 3:9][:, _SYMMETRIC]
     for i in range(3):
@@ -246,7 +232,6 @@ def _cable(x: Array) -> Array:
 
 
 def _cross(r: Array) -> Array:
-    """(B, 3, 3) with M v = r x v."""
     out = np.zeros((len(r), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, k, j], out[:, j, k] = r[:, i], -r[:, i]
@@ -254,7 +239,6 @@ def _cross(r: Array) -> Array:
 
 
 def _centripetal(r: Array) -> Array:
-    """(B, 3, 6) with M [products of omega] = omega x (omega x r)."""
     (x, y, z), o = r.T, np.zeros(len(r))
     rows = [[o, -x, -x, y, z, o], [-y, o, -y, x, o, z], [-z, -z, o, o, x, y]]
     return np.moveaxis(np.array(rows), -1, 0)

@@ -1,4 +1,4 @@
-"""Rows of a record outside and inside of contacts, and their whitened sums of products."""
+"""Selected rows of a record and their whitened sums of products."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.logs.causes.instants import ORDER, Instants
 from drake_teleop.logs.causes.model import Model
 
-_FEWEST_OF_NOISE = 50
-"""Rows that an autoregression is fitted to."""
+_MIN_NOISE_ROWS = 50
+"""Fewest rows for an autoregression."""
 Spans = tuple[tuple[float, float], ...]
 """(start, stop) of contacts [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows with the signals that a model depends on.
+    """Rows with the signals of a model.
 
     Attributes:
         data: the record.
-        used: (M,) rows that count.
+        used: (M,) selected rows.
         times: of the model's steps [s].
         columns: of y with its steps.
     """
@@ -35,12 +35,12 @@ class Rows:
     columns: NDArray[np.intp]
 
     def fits(self, model: Model) -> bool:
-        """Whether they have the columns of another model, and no more."""
+        """Return whether the columns are those of another model."""
         return self.times == model.times and np.array_equal(self.columns, model.columns)
 
     @cached_property
     def y(self) -> Array:
-        """(M, W) signals, 0 in rows that are not used."""
+        """(M, W) signals, 0 in unused rows."""
         return self.data.only(self.used).with_steps(self.times)[:, self.columns]
 
     @cached_property
@@ -50,7 +50,7 @@ class Rows:
 
     @cached_property
     def whole(self) -> NDArray[np.intp]:
-        """Rows with four used rows before them."""
+        """Indices of rows with four used rows before them."""
         whole = self.used.copy()
         whole[:ORDER] = False
         for d in range(1, ORDER + 1):
@@ -59,7 +59,7 @@ class Rows:
 
     @cached_property
     def _partial(self) -> Array:
-        """(K, 5, W) histories [y_n, y_n-1 ...] that begin before or end after a run of rows."""
+        """(K, 5, W) histories that cross the end of a run of rows."""
         padded = np.concatenate([self.used, np.zeros(ORDER, bool)])
         near = padded.copy()
         for d in range(1, ORDER + 1):
@@ -70,7 +70,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened(self, filters: Array) -> Array:
-        """(6, W, W) sums of the rows filtered by filters (6, 5), histories being whole."""
+        """(6, W, W) sums of the rows filtered by filters (6, 5)."""
         width = self.y.shape[1]
         taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
@@ -79,14 +79,14 @@ class Rows:
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise(self, residual: Array, floor: Array, order: int = ORDER) -> tuple[Array, Array]:
-        """Filters (6, 5) of an autoregression of the residual (6, W), and its power (6,)."""
+        """Fit an autoregression to the residual (6, W): filters (6, 5) and power (6,)."""
         e = self.y @ residual.T
         filters = np.zeros((6, ORDER + 1))
         filters[:, 0] = 1.0
         history = np.stack([e[self.whole - d] for d in range(ORDER + 1)], axis=2)
         products = np.einsum("nci,ncj->cij", history, history, optimize=True)
         products /= max(len(self.whole), 1)
-        if order == 0 or len(self.whole) < _FEWEST_OF_NOISE:
+        if order == 0 or len(self.whole) < _MIN_NOISE_ROWS:
             return filters, np.maximum(products[:, 0, 0], floor)
         inner = products[:, 1:, 1:] + 1e-9 * products[:, :1, :1] * np.eye(ORDER)
         inner += 1e-300 * np.eye(ORDER)

@@ -1,4 +1,4 @@
-"""The absolute test of a fit, and the search for what else acts where it fails."""
+"""Absolute test of a fit, and search for causes if it fails (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -9,36 +9,43 @@ from drake_teleop.logs.causes.candidates import (
     ORDER,
     Candidate,
     candidates,
-    negative,
-    plausible,
-    tilted,
+    has_negative_inertia,
+    is_plausible,
+    tilt_start,
 )
-from drake_teleop.logs.causes.contacts import contact_of_steps, phases, shrunk
-from drake_teleop.logs.causes.delay import free_delay
-from drake_teleop.logs.causes.instants import Instants
+from drake_teleop.logs.causes.contacts import (
+    replace_contacts_by_steps,
+    replace_steps_by_contact,
+    shrink_contacts,
+)
+from drake_teleop.logs.causes.instants import Instants, free_delay
 from drake_teleop.logs.causes.model import DELAY, Model
 from drake_teleop.logs.causes.state import State
 
 ROUNDS = 4
-Later = Callable[[float], Instants]
-_LATE, _LATEST, _SAME, _MOVES = 5e-4, 0.3, 0.004, 4  # s
-LOUD, IMPLAUSIBLE, SCORE = 1.25, 2.2, 20.0
+WithDelay = Callable[[float], Instants]
+_SMALLEST_DELAY_S, _LARGEST_DELAY_S, _SAME_DELAY_S, _DELAY_ITERATIONS = 5e-4, 0.3, 0.004, 4  # s
+MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
 """Limits of the absolute test: residual over white noise, `State.probe`, `State.score`."""
-_NAMED, _NEAR, _SHARE = 40.0, 25.0, 0.02
-_HALF, _FIFTH, _COLOURED, _SMALLER, _CERTAIN = 0.5, 0.2, 15.0, 0.9, 1000.0
-_ATTENUATED = 1.0 / 3.0
-_SMOOTH = 1.35
-"""Largest probe of good records; what is left beyond it could resemble any cause."""
-_STEPS, _LARGER = ("offsets", "load"), 3.0
+_MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
+_HALVED, _FIFTH, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = 0.5, 0.2, 15.0, 0.9, 1000.0
+_ATTENUATED_SHARE = 1.0 / 3.0
+_GOOD_SMOOTH_MISFIT = 1.35
+"""Largest probe of good records."""
+_STEP_CAUSES, _LARGEST_INCREASE = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
-_FLEXIBLE, _WIDE, _WIDE_SHARE = ("cable", "drift"), 80.0, 0.1
-"""Causes whose many columns resemble others, and the margin by which they have to win."""
+_FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"), 80.0, 0.1
+"""Causes with many columns, which resemble others; required margins of their scores."""
 
 
-def explained(state: State) -> bool:
-    """Whether the residual is the sensor's noise: size, smooth columns, and likely extensions."""
-    if negative(state) or state.loudness > LOUD or state.probe > IMPLAUSIBLE:
+def is_noise(state: State) -> bool:
+    """Return whether the residual is sensor noise: size, smooth columns, extensions."""
+    if (
+        has_negative_inertia(state)
+        or state.residual_ratio > MAX_RESIDUAL_RATIO
+        or state.smooth_misfit > MAX_SMOOTH_MISFIT
+    ):
         return False
     model = state.model
     parts = ["frame", "linear drift", "rotation"]
@@ -46,157 +53,169 @@ def explained(state: State) -> bool:
         parts += ["gravity", "weight"]
     larger = [model.extended(name) for name in parts if name not in model.parts]
     larger += [replace(model, gains=(*model.gains, c)) for c in range(6) if c not in model.gains]
-    return all(state.score(x) < SCORE for x in larger)
+    return all(state.score(x) < MAX_EXTENSION_SCORE for x in larger)
 
 
 Found = tuple[State, float, list[Candidate]]
 
 
-def search(data: Instants, later: Later | None = None, given: tuple[str, ...] = ()) -> Found:
-    """Find the model that explains a record.
+def search(
+    data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
+) -> Found:
+    """Return the model of a record, an additional delay [s], and the last rejected candidates.
 
-    A delay that was estimated with a wrong model may be wrong. If nothing explains the record, the
-    search starts again from the delay that the motion has in the least squares of all signals.
+    If nothing explains the record, the search is repeated with the delay from `free_delay`,
+    because a wrong model may have caused a wrong delay.
 
     Args:
         data: the record.
-        later: returns the record with the motion of a delay [s] more.
-        given: parts of the model from the start.
-
-    Returns:
-        the model, the delay that was added [s], and the candidates that the last round rejected.
+        with_delay: returns the record with an additional delay of the motion [s].
+        given: active parts of the model.
     """
-    found = _search(_begun(data, given), 0.0, later)
-    if later is None or settled(found[0]) or explained(found[0]):
+    found = _search(_initial_state(data, given), 0.0, with_delay)
+    if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
         return found
-    late = free_delay(data)
-    if abs(late - found[1]) < _SAME:
+    delay_s = free_delay(data)
+    if abs(delay_s - found[1]) < _SAME_DELAY_S:
         return found
-    other = _search(_begun(later(late), given), late, later)
-    better = explained(other[0]) or other[0].likelihood > found[0].likelihood + _NAMED
-    better = better or other[0].loudness < _FIFTH * found[0].loudness
-    return other if better else found
+    repeated = _search(_initial_state(with_delay(delay_s), given), delay_s, with_delay)
+    better = is_noise(repeated[0]) or repeated[0].likelihood > found[0].likelihood + _MIN_SCORE
+    better = better or (repeated[0].residual_ratio < _FIFTH * found[0].residual_ratio)
+    return repeated if better else found
 
 
-def settled(state: State) -> bool:
+def may_be_coloured_noise(state: State) -> bool:
     """Return whether the residual may be coloured noise: no smooth signal explains it."""
-    return state.probe < _SMOOTH and state.loudness < _COLOURED
+    return (
+        state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
+    )
 
 
-def clearly_wrong(state: State) -> bool:
-    """Return whether smooth signals explain the residual, or it exceeds any coloured noise."""
-    return state.probe > IMPLAUSIBLE or state.loudness > _COLOURED
+def is_clear_misfit(state: State) -> bool:
+    """Return whether smooth signals explain the residual, or it exceeds coloured noise."""
+    return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
 
 
-def _begun(data: Instants, given: tuple[str, ...]) -> State:
+def _initial_state(data: Instants, given: tuple[str, ...]) -> State:
     state = State.of(data, Model(parts=given))
-    start = tilted(state) if "gravity" in given else None
+    start = tilt_start(state) if "gravity" in given else None
     return state if start is None else State.of(data, state.model, start)
 
 
-def _search(state: State, late: float, later: Later | None) -> Found:
-    """Add the most plausible extension until the record is explained or nothing explains more."""
-    state, late = _in_time(state, late, later)
-    last: list[Candidate] = []
+def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found:
+    state, delay_s = _remove_delay(state, delay_s, with_delay)
+    rejected: list[Candidate] = []
     for number in range(ROUNDS):
-        if explained(state):
-            return state, late, []
+        if is_noise(state):
+            return state, delay_s, []
         found = _without_attenuation(list(candidates(state, first=number == 0)))
-        last = [x for x in found if plausible(x.state)]
-        effective = [x for x in last if _effective(x, state)]
-        winner, calm = _winner(effective), _of_smallest_residual(state, last)
-        if winner is None or _much_calmer(calm, winner):
-            winner = calm
+        rejected = [x for x in found if is_plausible(x.state)]
+        effective = [x for x in rejected if _is_effective(x, state)]
+        winner, calmest = _best_candidate(effective), _smallest_residual(state, rejected)
+        if winner is None or _much_smaller_residual(calmest, winner):
+            winner = calmest
         if winner is None:
-            other = _phases(state, last)
-            if other is None:
+            explained = _without_contact(state, rejected)
+            if explained is None:
                 break
-            state, late = _in_time(other, late, later)
+            state, delay_s = _remove_delay(explained, delay_s, with_delay)
             continue
-        larger = contact_of_steps(winner.state)
+        larger = replace_steps_by_contact(winner.state)
         if winner.name == "contact":
-            larger = phases(larger) or shrunk(larger)
+            larger = replace_contacts_by_steps(larger) or shrink_contacts(larger)
         elif larger.spans != winner.state.spans:
-            larger = phases(larger) or larger
-        state, late = _in_time(larger, late, later)
-        last = [x for x in last if x is not winner]
+            larger = replace_contacts_by_steps(larger) or larger
+        state, delay_s = _remove_delay(larger, delay_s, with_delay)
+        rejected = [x for x in rejected if x is not winner]
         if winner.name == "cable":
-            return state, late, []
-    return state, late, last
+            return state, delay_s, []
+    return state, delay_s, rejected
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove the cable if a third of its score comes from an inertial mass below the weight's.
+    """Remove the cable if an attenuated inertial mass explains a third of its score.
 
-    Noise of the accelerations makes the inertial mass too small if the load hardly accelerates. The
-    columns of a cable explain this effect, too.
+    Noise of the accelerations attenuates it if the load hardly accelerates.
     """
-    best = max((x.score for x in found if x.name == "weight" and not plausible(x.state)), default=0)
-    return [x for x in found if x.name != "cable" or best < _ATTENUATED * x.score]
+    best = max(
+        (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
+    )
+    return [x for x in found if x.name != "cable" or best < _ATTENUATED_SHARE * x.score]
 
 
-def _in_time(state: State, late: float, later: Later | None) -> tuple[State, float]:
-    """Take the remaining delay out of the motion, which the model has to first order only."""
-    for _ in range(_MOVES):
-        if later is None or abs(state.x[DELAY]) < _LATE or abs(late) > _LATEST:
+def _remove_delay(
+    state: State, delay_s: float, with_delay: WithDelay | None
+) -> tuple[State, float]:
+    """Remove the remaining delay from the motion; the model is linear in it."""
+    for _ in range(_DELAY_ITERATIONS):
+        if (
+            with_delay is None
+            or abs(state.x[DELAY]) < _SMALLEST_DELAY_S
+            or abs(delay_s) > _LARGEST_DELAY_S
+        ):
             break
-        late += float(state.x[DELAY])
+        delay_s += float(state.x[DELAY])
         x = state.x.copy()
         x[DELAY] = 0.0
-        state = State.of(later(late), state.model, x, state.spans)
-    return state, late
+        state = State.of(with_delay(delay_s), state.model, x, state.spans)
+    return state, delay_s
 
 
-def _of_smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
-    """Return the most plausible candidate that reduces the residual to a fifth, or None.
-
-    Only candidates with at most twice the smallest residual compete. The likelihood does not show a
-    large and smooth misfit, because coloured noise predicts it as well.
-    """
-    calm = [x for x in found if x.name in _SMOOTH_CAUSES]
-    calm = [x for x in calm if x.state.loudness < _FIFTH * state.loudness]
-    least = min([x.state.loudness for x in calm], default=0.0)
-    near = [x for x in calm if x.state.loudness < 2.0 * least]
+def _smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
+    """Return the most plausible candidate that reduces the residual to a fifth, or None."""
+    small = [x for x in found if x.name in _SMOOTH_CAUSES]
+    small = [x for x in small if x.state.residual_ratio < _FIFTH * state.residual_ratio]
+    least = min([x.state.residual_ratio for x in small], default=0.0)
+    near = [x for x in small if x.state.residual_ratio < 2.0 * least]
     return min(near, key=lambda x: ORDER.index(x.name), default=None)
 
 
-def _much_calmer(calm: Candidate | None, winner: Candidate) -> bool:
-    """Return whether a candidate other than a contact leaves a fifth of the winner's residual."""
-    if calm is None or calm.name == "contact":
+def _much_smaller_residual(calmest: Candidate | None, winner: Candidate) -> bool:
+    if calmest is None or calmest.name == "contact":
         return False
-    return calm.state.loudness < _FIFTH * winner.state.loudness
+    return calmest.state.residual_ratio < _FIFTH * winner.state.residual_ratio
 
 
-def _phases(state: State, found: list[Candidate]) -> State | None:
-    """Replace a contact that halves the residual by changes of load and offsets that explain it."""
+def _without_contact(state: State, found: list[Candidate]) -> State | None:
     for candidate in found:
-        if candidate.name == "contact" and candidate.state.loudness < _HALF * state.loudness:
-            return phases(candidate.state)
+        if (
+            candidate.name == "contact"
+            and candidate.state.residual_ratio < _HALVED * state.residual_ratio
+        ):
+            return replace_contacts_by_steps(candidate.state)
     return None
 
 
-def _effective(candidate: Candidate, state: State) -> bool:
-    """Whether the residual shrinks or becomes more like noise, and not its likelihood alone."""
-    other = candidate.state
-    smaller = other.loudness < _SMALLER * state.loudness
+def _is_effective(candidate: Candidate, state: State) -> bool:
+    fitted = candidate.state
+    smaller = fitted.residual_ratio < _REDUCED * state.residual_ratio
     if candidate.name == "cable":
-        return smaller  # its force is far above the noise
-    if candidate.name not in _STEPS and other.loudness > _LARGER * state.loudness:
-        return False  # coloured noise explains the residual that the candidate makes
-    better = smaller or other.probe < _SMALLER * state.probe
-    return bool(better or negative(state) or candidate.score > _CERTAIN)
+        return smaller  # the force of a cable far exceeds the noise
+    if (
+        candidate.name not in _STEP_CAUSES
+        and fitted.residual_ratio > _LARGEST_INCREASE * state.residual_ratio
+    ):
+        return False  # the candidate increases the residual, and coloured noise predicts it
+    better = smaller or fitted.smooth_misfit < _REDUCED * state.smooth_misfit
+    return bool(better or has_negative_inertia(state) or candidate.score > _CERTAIN_SCORE)
 
 
-def _winner(found: list[Candidate]) -> Candidate | None:
-    """The most plausible of the candidates with nearly the best score.
-
-    What it leaves has to be small for its score: a large misfit resembles many causes a little.
-    """
+def _best_candidate(found: list[Candidate]) -> Candidate | None:
+    """Return the most plausible candidate with nearly the best score and a small misfit."""
     best = max([x.score for x in found], default=0.0)
-    if best < _NAMED:
+    if best < _MIN_SCORE:
         return None
     top = max(found, key=lambda x: x.score).name
-    margin = max(_NEAR, _SHARE * best) if top not in _FLEXIBLE else max(_WIDE, _WIDE_SHARE * best)
-    near = [x for x in found if x.score > max(_NAMED, best - margin)]
+    margin = (
+        max(_SCORE_MARGIN, _SCORE_MARGIN_SHARE * best)
+        if top not in _FLEXIBLE_CAUSES
+        else max(_FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE * best)
+    )
+    near = [x for x in found if x.score > max(_MIN_SCORE, best - margin)]
     first = min(near, key=lambda x: ORDER.index(x.name))
-    return first if first.score > _NAMED * max(1.0, first.state.probe / _SMOOTH) ** 1.5 else None
+    return (
+        first
+        if first.score
+        > _MIN_SCORE * max(1.0, first.state.smooth_misfit / _GOOD_SMOOTH_MISFIT) ** 1.5
+        else None
+    )

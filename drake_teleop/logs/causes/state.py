@@ -1,4 +1,4 @@
-"""A record with the model that explains it so far, and tests of the residual."""
+"""Fitted model of a record, and tests of its residual."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.rows import Rows, Spans, in_spans
 
 _SEGMENTS = 6
-_SPRINGS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """A model fitted to the rows of a record outside of contacts.
+    """Model fitted to the rows of a record outside of contacts.
 
     Attributes:
         data: the record.
@@ -40,7 +40,7 @@ class State:
         return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
 
     def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
-        """Another model in the same rows, from these parameters unless others are given."""
+        """Fit another model to the same rows."""
         if start is None:
             start = model.start(self.x, self.model)
         return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))
@@ -57,8 +57,13 @@ class State:
 
     @property
     def x(self) -> Array:
-        """Its parameters."""
+        """(size,) parameters."""
         return self.fit.x
+
+    def extension(self, name: str) -> tuple[Array, Array]:
+        """Return the parameters of an extension and their covariance."""
+        where = self.model.slices[name]
+        return self.x[where], self.fit.covariance[where, where]
 
     @property
     def rows(self) -> Rows:
@@ -67,40 +72,40 @@ class State:
 
     @cached_property
     def likelihood(self) -> float:
-        """Logarithm of the likelihood of all rows; those in contact have a noise of their own."""
+        """Logarithm of the likelihood of all rows; contacts have separate noise."""
         if not self.spans:
             return self.fit.likelihood
         used = self.data.used & ~self.rows.used
         inside = Rows(self.data, used, self.model.times, self.model.columns)
         power = inside.noise(self.fit.residual, 1e-6 * self.fit.power)[1]
-        # The rows at the edges belong to neither; they count as noise of this power.
+        # Rows at the edges of contacts count as noise of this power, too.
         count = len(self.whole) - len(self.rows.whole)
         return self.fit.likelihood - 0.5 * count * float(np.log(power).sum())
 
     @cached_property
     def whole(self) -> Array:
-        """Rows of the record with four used rows before them."""
+        """Indices of rows with four used rows before them."""
         return np.asarray(Rows(self.data, self.data.used, (), self.model.columns).whole)
 
     @cached_property
-    def loudness(self) -> float:
-        """Largest residual of a channel over its white noise."""
+    def residual_ratio(self) -> float:
+        """Largest ratio of rms residual and white noise of a channel."""
         white = np.maximum(self.data.white, 1e-12)
         return float(np.max(self.rows.rms(self.fit.residual) / white))
 
     @cached_property
-    def probe(self) -> float:
-        """Gain of twice the log likelihood per degree of freedom by smooth columns of no meaning.
+    def smooth_misfit(self) -> float:
+        """Gain of twice the log likelihood per degree of freedom by generic smooth columns.
 
-        The columns are all signals in each channel alone, offsets of six parts of the record, R and
-        springs in the world: about 45 in each channel. Near 1 or below for noise of any colour.
+        These are all signals, offsets of six parts of the record, R and springs, for each channel.
+        The gain is about 1 or below for noise of any colour.
         """
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by the smooth columns of `probe`, and their number."""
+        """Gain of twice the log likelihood by the columns of `smooth_misfit`, and their number."""
         columns = self.data.y[:, self._smooth()]
         if self.data.positions:
             columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
@@ -134,12 +139,7 @@ class State:
 
 
 def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
-    """right^T gram^-1 right without directions that are rounding, and the rank.
-
-    Args:
-        gram, right: (k, k) and (k,).
-        least: of the diagonal, below which it is rounding.
-    """
+    """Return right^T gram^-1 right and the rank; diagonals below `least` are rounding errors."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
     if not used.any():
@@ -153,9 +153,9 @@ def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[floa
 
 
 def _springs() -> Array:
-    """(18, 27) entries of R_SW K p for six symmetric K, of the products R p."""
+    """(18, 27) entries of R_SW K p for six symmetric K."""
     out = np.zeros((6, 3, 27))
-    for row, (j, k) in enumerate(_SPRINGS):
+    for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
         for i in range(3):
             for a, b in {(j, k), (k, j)}:
                 out[row, i, 9 * i + 3 * a + b] = 1.0

@@ -1,1 +1,1 @@
-"""What is suspicious about a log."""
+"""Checks of a log: suspicious properties and their remedies."""

@@ -1,19 +1,26 @@
-"""The wrench against Eqs. (1)-(2): edits of the description with which some load explains it."""
+"""Edits of the description with which a load explains the wrench, Eqs. (1)-(2)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.edits import edit_field, load_edits, tried
-from drake_teleop.logs.check.finding import CLOCK, Finding
+from drake_teleop.logs.check.corrections import (
+    MIN_CLOCK_ERROR_S,
+    Finding,
+    edit_field,
+    load_edits,
+    try_edit,
+)
 from drake_teleop.logs.check.load_fit import (
-    BELIEVABLE,
+    VALID_SHARE,
     LoadFit,
     decisive_factor,
     load_fit,
@@ -25,52 +32,56 @@ from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.delay import SEARCH_RANGE, estimate_delay
 from drake_teleop.logs.read.description import Description
 
-HARDLY = 0.9
-"""A load that leaves more than this share of the wrench's variance drowns in the rest."""
-LAG = 0.002
-"""Delays below this are not mentioned [s]."""
+UNDETERMINED_SHARE = 0.9
+"""Unexplained share of the wrench's variance above which a load is undetermined."""
+SMALLEST_LAG_S = 0.002
+"""Shorter delays are not reported [s]."""
+_PARTS, _FEWEST_PARTS = 8, 4
+_SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
+"""Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
+_HALVED = 0.5
 
 
 def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
-    """Findings about wrench, orientation and clocks from the load, and the delay."""
+    """Return findings about wrench, orientation and clocks, and the delay."""
     log = data.read(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.thin(description)
 
     def fitted(edited: Description) -> LoadFit:
-        # A delay that was estimated under a wrong description may be wrong too.
-        log = _rewrenched(thin, description, edited) or data.thin(edited)
+        # A wrong description may cause a wrong delay.
+        log = _edit_wrench(thin, description, edited) or data.thin(edited)
         fits = [load_fit(undelayed(log, shift)) for shift in {0.0, delay or 0.0}]
         return min(fits, key=lambda fit: fit.unexplained)
 
     given = fitted(description)
-    # Slow motion fits well enough with a wrong clock, but not with a delay within the range.
+    # Slow motion fits well with a wrong clock, but then the delay is at the limit of its range.
     inside = delay is not None and abs(delay) < 0.9 * SEARCH_RANGE
     edits: list[tuple[Finding | None, Description]] = []
     if not (given.good and inside):
-        edits += _shifted(description, thin)
+        edits += _clock_edits(description, thin)
     if not given.good:
         edits = [*load_edits(description), *edits]
     found: list[tuple[LoadFit, Finding | None, Description]] = []
     for finding, edited in edits:
-        fit = tried(fitted, edited)
+        fit = try_edit(fitted, edited)
         if fit is not None and fit.mass > 0:
             found.append((fit, finding, edited))
-    # A negative mass is impossible: then it is enough to be as good with a positive one.
+    # A negative mass is impossible: an equally good fit with a positive one suffices.
     limit = (
         given.unexplained * 1.01 if given.mass < 0 else given.unexplained / decisive_factor(given)
     )
-    limit = min(limit, BELIEVABLE + given.noise)
+    limit = min(limit, VALID_SHARE + given.noise)
     found = [entry for entry in found if entry[0].unexplained < limit]
     if not found and given.good:
-        return lag_finding(description, delay) if _shows(thin, delay) else [], delay
+        return lag_finding(description, delay) if _is_delay_significant(thin, delay) else [], delay
     if not found:
         return _without_remedy(description, log, given, delay)
     least = 1.2 * min(fit.unexplained for fit, *_ in found) + 1e-9
     equals = [(finding, edited) for fit, finding, edited in found if fit.unexplained <= least]
     finding, edited = equals[0]
     delay = None if log.static else estimate_delay(data.read(edited), 30.0)
-    if finding is None:  # The clock of the wrench, which the edit set to the nearest 20 ms.
+    if finding is None:  # The edit shifted the clock of the wrench to the nearest 20 ms.
         assert description.wrench is not None and edited.wrench is not None
         shift = edited.wrench.time.offset - description.wrench.time.offset + (delay or 0.0)
         return lag_finding(description, shift), shift
@@ -79,8 +90,7 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
     return [Finding(finding.name, message), *lag_finding(description, delay)], delay
 
 
-def _shows(log: Log, delay: float | None) -> bool:
-    """Whether the delay is five standard errors from none: twice a log likelihood ratio of 25."""
+def _is_delay_significant(log: Log, delay: float | None) -> bool:
     if delay is None:
         return False
     none, aligned = load_fit(log), load_fit(undelayed(log, delay))
@@ -88,8 +98,7 @@ def _shows(log: Log, delay: float | None) -> bool:
     return bool(gain > 25.0)
 
 
-def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
-    """The log of another description of the wrench, without reading it again; None if it must."""
+def _edit_wrench(log: Log, old: Description, new: Description) -> Log | None:
     a, b = old.wrench, new.wrench
     if a is None or b is None or "base" in (a.frame, b.frame):
         return None
@@ -98,21 +107,20 @@ def _rewrenched(log: Log, old: Description, new: Description) -> Log | None:
         return None
     R_old, R_new = (np.array(w.frame) if w.frame != "sensor" else np.eye(3) for w in (a, b))
     parts = []
-    for x, force, again in (
+    for x, force, new_columns in (
         (log.wrench[:, :3], a.force.columns, b.force.columns),
         (log.wrench[:, 3:], a.torque.columns, b.torque.columns),
     ):
-        if set(force) != set(again) or len(force) != 3:
+        if set(force) != set(new_columns) or len(force) != 3:
             return None
-        given = x @ R_old  # In the axes of the file.
-        parts.append(given[:, [force.index(column) for column in again]] @ R_new.T)
+        given = x @ R_old  # in the axes of the file
+        parts.append(given[:, [force.index(column) for column in new_columns]] @ R_new.T)
     return replace(log, wrench=a.sign * b.sign * np.hstack(parts))
 
 
 def _without_remedy(
     description: Description, log: Log, given: LoadFit, delay: float | None
 ) -> tuple[list[Finding], float | None]:
-    """What is left to say of a wrench that no load explains and no edit mends."""
     smooth = low_passed(log, 30.0)
     fit = identify_batch(smooth.wrench, *smooth.motion, shared_noise=log.static)
     load = fit.identification
@@ -122,25 +130,18 @@ def _without_remedy(
     kept = ~fit.rejected
     wrench, (s, omega, alpha) = smooth.wrench[kept], (x[kept] for x in smooth.motion)
     residual = contact_wrench(wrench, load.offsets, s, omega, alpha, load.phi)
-    if delay is None or unexplained_share(wrench, residual) > BELIEVABLE + given.noise:
+    if delay is None or unexplained_share(wrench, residual) > VALID_SHARE + given.noise:
         return [], None
     if fit.rejected.any():
-        # A contact pulls at the delay.
+        # Contacts bias the delay.
         lost = fit.rejected if log.bridged is None else fit.rejected | log.bridged
         delay = estimate_delay(replace(log, bridged=lost), 30.0)
     return lag_finding(description, delay), delay
 
 
 def payload_finding(load: Identification, unexplained: float) -> Finding | None:
-    """That a record says nothing about the mass of a load, if so.
-
-    Args:
-        load: what was fitted.
-        unexplained: share of the wrench's variance that it leaves, besides noise. With 0.9 the
-            rest (contacts, with the sensor's cross-talk and drift) is at least three times as large
-            as the load's part, and a robust fit believes the samples that suit it.
-    """
-    if load.verdicts[6] != "not" and unexplained < HARDLY:
+    """Return a finding if a record does not determine the mass of a load."""
+    if load.verdicts[6] != "not" and unexplained < UNDETERMINED_SHARE:
         return None
     deviation = float(load.standard_deviations[6])
     fitted = f"{load.mass:.2g} ± {deviation:.2g} kg in the fit"
@@ -154,8 +155,7 @@ def payload_finding(load: Identification, unexplained: float) -> Finding | None:
     )
 
 
-def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
-    """The clock of the wrench shifted within 2 s, or a quarter of the record, to the best fit."""
+def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Description]]:
     if description.wrench is None:
         return
     reach = min(2.0, 0.25 * float(log.t[-1] - log.t[0]))
@@ -175,11 +175,11 @@ def _shifted(description: Description, log: Log) -> Iterator[tuple[None, Descrip
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    """Return what to change if the motion is `delay` seconds behind the wrench."""
-    if delay is None or abs(delay) <= LAG or description.wrench is None:
+    """Return the remedy if the motion is `delay` seconds behind the wrench."""
+    if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"
-    if abs(delay) > CLOCK:
+    if abs(delay) > MIN_CLOCK_ERROR_S:
         offset = description.wrench.time.offset + delay
         return [
             Finding(
@@ -195,3 +195,58 @@ def lag_finding(description: Description, delay: float | None) -> list[Finding]:
             f" to say so in the description, add {delay:.4f} to wrench.time.offset",
         )
     ]
+
+
+def drift_finding(description: Description, data: LogData) -> tuple[list[Finding], Description]:
+    """Return a finding for a steadily growing delay, and the corrected description."""
+    name = "imu" if description.pose is None else "pose"
+    stream = getattr(description, name)
+    if stream is None or description.wrench is None or (description.imu and description.pose):
+        return [], description
+    log = data.thin(description)
+    line = _delay_line(log)
+    if line is None:
+        return [], description
+    late, slope = line
+    start = data.start(stream, description) - data.start(description.wrench, description)
+    scale = 1.0 / (1.0 + slope)
+    lag = scale * (late + slope * start)
+    offset, factor = stream.time.offset - lag, scale * stream.time.scale
+    edited = edit_field(description, f"{name}.time.offset", offset)
+    edited = edit_field(edited, f"{name}.time.scale", factor)
+    if _unexplained(data.thin(edited)) > _HALVED * _unexplained(log):
+        return [], description
+    finding = Finding(
+        "clock",
+        f"the clock of the {name} drifts by {1e3 * slope:.3g} ms per second against that of the"
+        f" wrench; set {name}.time.offset: {offset:.3f}"
+        f" and {name}.time.scale: {factor:.6f}",
+    )
+    return [finding], edited
+
+
+def _delay_line(log: Log) -> tuple[float, float] | None:
+    span = float(log.t[-1] - log.t[0])
+    edges = np.linspace(0, len(log), _PARTS + 1).astype(int)
+    found = []
+    for a, b in pairwise(edges):
+        part = log.only(slice(int(a), int(b)))
+        delay = estimate_delay(part, 15.0)
+        if delay is not None:
+            found.append((0.5 * float(part.t[0] + part.t[-1]), delay))
+    if len(found) < _FEWEST_PARTS:
+        return None
+    t, delays = np.array(found).T
+    slope, late = np.polyfit(t, delays, 1)
+    change = abs(slope) * span
+    deviation = float(np.std(delays - late - slope * t))
+    if change < _SMALLEST_DRIFT_S or deviation > _LARGEST_DEVIATION * change or abs(slope) > 0.2:
+        return None
+    return float(late + slope * log.t[0]), float(slope)
+
+
+def _unexplained(log: Log) -> float:
+    try:
+        return load_fit(undelayed(log, estimate_delay(log, 15.0) or 0.0)).unexplained
+    except DrakeTeleopError:
+        return np.inf

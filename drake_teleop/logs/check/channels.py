@@ -1,4 +1,4 @@
-"""Channels of wrench and IMU that are dead, or stand twice where two should stand."""
+"""Dead and repeated channels of wrench and IMU."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.logs.check.finding import Finding
+from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.tables import Table
@@ -19,22 +19,15 @@ _FIELDS = {
     "wrench": ("force", "torque"),
     "imu": ("specific_force", "angular_velocity", "angular_acceleration"),
 }
-_NOISY = 1e-6
+_MIN_NOISE_SHARE = 1e-6
 
 
 def channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """What is wrong with single channels; nothing else of them can be judged before it is mended.
+    """Return findings about single channels of "wrench" or "imu", which invalidate further checks.
 
-    A constant is dead only beside a channel of the same instrument that has noise: in a simulated
-    log a channel may be constant for good reasons. Two columns of numbers that are the same in all
-    rows are one column, in a simulated log as well.
-
-    Args:
-        stream: "wrench" or "imu".
-        description: of the log.
-        tables: its files by `source`, all of them.
+    A constant channel is dead only beside a noisy one: simulated channels may be constant.
     """
     described = getattr(description, stream)
     found: list[Finding] = []
@@ -45,8 +38,8 @@ def channel_findings(
             continue
         where = f"{stream}.{field}"
         numbers = _numbers(tables[described.source], quantity.columns, where)
-        twice = _named_twice(where, quantity.columns, named)
-        found += twice or [*_dead(where, numbers), *_equal(where, numbers)]
+        twice = _repeated_names(where, quantity.columns, named)
+        found += twice or [*_dead_channels(where, numbers), *_equal_channels(where, numbers)]
     return found
 
 
@@ -59,8 +52,7 @@ def _numbers(table: Table, columns: Any, where: str) -> dict[str, NDArray[np.flo
     return numbers
 
 
-def _named_twice(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
-    """Of one quantity, or of two; `named` is where columns stood so far."""
+def _repeated_names(where: str, columns: Any, named: dict[str, str]) -> list[Finding]:
     found = []
     for column, times in Counter(map(str, columns)).items():
         before = where if times > 1 else named.get(column)
@@ -77,10 +69,10 @@ def _named_twice(where: str, columns: Any, named: dict[str, str]) -> list[Findin
     return found
 
 
-def _dead(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _dead_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise(np.stack(list(numbers.values()), axis=1))
-    alive = noise > _NOISY * (np.array(list(spread.values())) + 1e-300)
+    alive = noise > _MIN_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
     dead = [name for name, width in spread.items() if width == 0.0]
     if not dead or not (alive & (noise > 0.0)).any():
         return []
@@ -95,7 +87,7 @@ def _dead(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     ]
 
 
-def _equal(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _equal_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
     return [
         Finding(
             "repeated channel",

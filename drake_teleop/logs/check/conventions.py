@@ -1,13 +1,13 @@
-"""Errors of convention in a log, found by what they do to the laws of motion.
+"""Errors of convention in a log, found by the laws of motion.
 
-Every suspicion is an edit of the description (`edits`). The log is read again with it, thinned to
-about 100 Hz (`log_data`), and the edit is named only if the data then agree decisively better: with
-Eqs. (1)-(2) for some load (`against_load`), or, of the IMU, with the motion of the pose
-(`against_pose`). Nothing is changed in the log; a finding says what to change.
+Each suspicion is a correction of the description (`corrections`). It is reported only if the data
+agree decisively better with it: with Eqs. (1)-(2) for some load, or, of an IMU, with the poses.
+`drake_teleop.logs.causes` finds axes and units of the wrench and the frame of the poses.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,38 +18,40 @@ from numpy.typing import NDArray
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.identification import Identification
-from drake_teleop.logs.check.against_frame import against_frame
-from drake_teleop.logs.check.against_load import against_load, payload_finding
-from drake_teleop.logs.check.against_pose import against_pose
-from drake_teleop.logs.check.against_position import position_finding
+from drake_teleop.logs.check.against_load import against_load, drift_finding, payload_finding
 from drake_teleop.logs.check.channels import channel_findings
-from drake_teleop.logs.check.edits import in_other_unit, unit_findings
-from drake_teleop.logs.check.finding import CLOCK, OF_MOTION, Finding
-from drake_teleop.logs.check.imu_alone import against_itself
-from drake_teleop.logs.check.load_fit import EXPLAINED, LoadFit, load_fit, unexplained_share
+from drake_teleop.logs.check.corrections import (
+    MIN_CLOCK_ERROR_S,
+    MOTION_ERRORS,
+    Finding,
+    correct_gravity_unit,
+)
+from drake_teleop.logs.check.imu_checks import against_itself, against_pose
+from drake_teleop.logs.check.load_fit import GOOD_SHARE, LoadFit, load_fit, unexplained_share
 from drake_teleop.logs.check.log_data import LogData
-from drake_teleop.logs.check.over_time import drift_finding
-from drake_teleop.logs.check.rest_poses import rest_finding
-from drake_teleop.logs.check.wrench_alone import wrench_findings
+from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.delay import estimate_delay
 from drake_teleop.logs.read.description import NO_YAML, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
 from drake_teleop.logs.read.tables import FORMATS, Table, read_table
 
-_STILL = 0.3, 0.1
-"""Specific force [m/s^2] and angular velocity [rad/s], rms, below which nothing is said of axes."""
-_SAME = 1e-6  # share of the largest reading by which a wrench changes that is read and not repeated
+_REST_RMS = 0.3, 0.1
+"""Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""
+_FEWEST_POSES = 6
+"""Fewest poses that allow a check of the fit."""
+_SMALLEST_SPREAD = 0.15
+"""Smallest deviation of gravity's direction that separates offsets from a load."""
+_CONSTANT_SHARE = 1e-6  # smallest change of a live wrench, as a share of the largest reading
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """What the data say about a description.
+    """Result of the checks of a description.
 
     Args:
-        findings: the suspected errors.
-        fit: of a load, to the description as given but for what is wrong with the IMU.
-        mounting: of the IMU against the pose, if both are there and move enough.
+        findings: suspected errors.
+        fit: of a load, apart from errors of the IMU.
+        mounting: of the IMU against the pose, if determined.
         delay_s: of the motion behind the wrench, if determined [s].
     """
 
@@ -59,8 +61,8 @@ class Conventions:
     delay_s: float | None
 
 
-def check_log(path: Path) -> Conventions:
-    """`check_conventions` of a canonical log or a log description, arguments as `read_log`.
+def check_file(path: Path) -> Conventions:
+    """Compare a canonical log or a log description with its data.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -72,25 +74,23 @@ def check_log(path: Path) -> Conventions:
 
 
 def question_fit(
-    path: Path, log: Log, load: Identification, predicted: NDArray[np.float64], delay: float | None
+    log: Log,
+    load: Identification,
+    predicted: NDArray[np.float64],
+    delay: float | None,
+    check: Callable[[], Conventions],
 ) -> tuple[Finding, ...]:
-    """What `check_log` says of a log, if what was identified from it looks wrong; else nothing.
+    """Return the findings, except "lag", of a log whose identified load is suspicious.
 
     Args:
-        path: the log's file.
-        log: the samples that were used.
-        load: what was identified.
-        predicted: (N, 6) the wrench according to it.
-        delay: what was taken out [s]; None if it could not be estimated.
-
-    Returns:
-        the findings but for "lag", which identification takes out; "payload" in the figures of
-        this fit.
+        log: used samples.
+        load: identified load.
+        predicted: (N, 6) wrench of that load.
+        delay: removed delay [s]; None if undetermined.
+        check: compares the log's description with its data.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used as it is: the mass is negative, or a load
-            explains less than half of the wrench, or the accelerometer is in another unit, and a
-            finding says what to change.
+        DrakeTeleopError: if the result is worthless and a finding has a remedy.
     """
     if _never_changes(log):
         raise DrakeTeleopError(
@@ -100,11 +100,11 @@ def question_fit(
         )
     unexplained = unexplained_share(log.wrench, log.wrench - predicted)
     weight = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-    clocks = log.static or (delay is not None and abs(delay) < CLOCK)
-    if load.mass > 0 and unexplained < EXPLAINED and clocks and 5.0 < weight < 20.0:
-        # What a good fit hides; `check_log` takes longer than the fit.
-        return tuple(_findings(path, log))
-    found = _findings(path, None)
+    clocks = log.static or (delay is not None and abs(delay) < MIN_CLOCK_ERROR_S)
+    if load.mass > 0 and unexplained < GOOD_SHARE and clocks and 5.0 < weight < 20.0:
+        # A good fit may hide errors of the IMU, but `check` takes longer than the fit.
+        return tuple(_findings(check)) if _is_suspicious(log) else ()
+    found = _findings(check)
     if any(finding.name == "payload" for finding in found):
         own = payload_finding(load, unexplained)
         found = [own if own and f.name == "payload" else f for f in found]
@@ -130,72 +130,60 @@ def question_fit(
     return tuple(found)
 
 
-def errors_of_motion(path: Path) -> tuple[Finding, ...]:
-    """Return the errors of the described motion that `check_log` finds."""
-    return tuple(x for x in _findings(path, None) if x.name in OF_MOTION)
+def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
+    """Return the errors of the described motion."""
+    return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
 
 
-def _findings(path: Path, doubted: Log | None) -> list[Finding]:
-    """What `check_log` says, if it can: the log was read, so that no failure of it is the log's.
-
-    Args:
-        path: of the log.
-        doubted: the samples that have to look wrong first; None if they do.
-    """
-    with suppress(ValueError, ArithmeticError):
-        if doubted is None or _doubted(path, doubted):
-            return [finding for finding in check_log(path).findings if finding.name != "lag"]
+def _findings(check: Callable[[], Conventions]) -> list[Finding]:
+    with suppress(ValueError, ArithmeticError):  # the log itself was readable
+        return [finding for finding in check().findings if finding.name != "lag"]
     return []
 
 
 def _check_moves(log: Log) -> None:
-    """Refuses a record at rest: any unit, axis and sign explains it as badly as any other."""
     s, omega = (np.linalg.norm(x.std(axis=0)) for x in (log.specific_force, log.angular_velocity))
-    if s < _STILL[0] and omega < _STILL[1]:
+    if s < _REST_RMS[0] and omega < _REST_RMS[1]:
         seconds = log.t[-1] - log.t[0]
         raise DrakeTeleopError(
             f"in {seconds:.2g} s the sensor hardly moves or turns ({s:.2g} m/s^2, {omega:.2g} rad/s"
-            " rms): a load cannot be told from offsets",
+            " rms): load and offsets cannot be separated",
             where=log.source,
             remedy="record 10 s of brisk turns about all axes, as `drake-teleop excite` designs",
         )
 
 
-def _doubted(path: Path, log: Log) -> bool:
-    """Whether units or axes of wrench and IMU are questioned by the samples that were used."""
-    if log.static or path.suffix.lower() in FORMATS:
+def _is_suspicious(log: Log) -> bool:
+    """Return whether a channel of the wrench is constant or the IMU contradicts itself."""
+    if log.static or log.described is None or Path(log.source).suffix.lower() in FORMATS:
         return False
-    description = load_description(path)
     few = log.only(slice(None, None, max(1, int(0.01 / log.dt))))
     if (np.ptp(few.wrench, axis=0) < 1e-9 * np.abs(few.wrench).max()).any():
         return True
-    return bool(against_itself(description, few)[0] or wrench_findings(description, few)[0])
+    with suppress(ValueError, ArithmeticError):
+        return bool(against_itself(log.described, few)[0])
+    return False
 
 
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Compares the description with its data.
-
-    Args:
-        description: with absolute paths.
-        source: its file, for messages.
-        tables: its files, if they are read already.
+    """Compare the description with its data.
 
     Raises:
-        DrakeTeleopError: if the log cannot be read as it is described.
+        DrakeTeleopError: if the log cannot be read.
     """
     with one_blas_thread():
         found = _check(LogData(description, source, dict(tables or {})), description)
     if Path(source).suffix.lower() not in FORMATS:
         return found
-    # A canonical table has no lines that could be changed.
+    # A canonical table has no description to edit.
     findings = (replace(f, message=f"{f.message} ({NO_YAML})") for f in found.findings)
     return replace(found, findings=tuple(findings))
 
 
 def _never_changes(log: Log) -> bool:
-    return bool((np.ptp(log.wrench, axis=0) <= _SAME * np.abs(log.wrench).max()).all())
+    return bool((np.ptp(log.wrench, axis=0) <= _CONSTANT_SHARE * np.abs(log.wrench).max()).all())
 
 
 def _check(data: LogData, description: Description) -> Conventions:
@@ -203,13 +191,12 @@ def _check(data: LogData, description: Description) -> Conventions:
     if _never_changes(log):
         message = "the wrench is the same in all samples; check the sensor's cable and its driver"
         return Conventions((Finding("dead channel", message),), LoadFit(1.0, 0.0), None, None)
-    if "gravity" in log.free and log.described is not None:  # found once, not for each edit
+    if "gravity" in log.free and log.described is not None:  # determine it once, not for each edit
         description = description.model_copy(update={"gravity": log.described.gravity})
     dead, broken = (channel_findings(name, description, data.tables) for name in ("imu", "wrench"))
-    if dead:  # What that does to motion and load would be taken for something else.
+    if dead:  # A dead channel would cause wrong findings about motion and load.
         return Conventions((*dead, *broken), load_fit(data.thin(description)), None, None)
-    findings = list(unit_findings(description, log))
-    description = in_other_unit(description, log)
+    findings, description = correct_gravity_unit(description, log)
     more, description = against_itself(description, data.thin(description))
     findings += more
     mounting = None
@@ -219,25 +206,16 @@ def _check(data: LogData, description: Description) -> Conventions:
     fit = load_fit(data.thin(description))
     if broken or (mounting is not None and mounting.mirrored):
         return Conventions((*broken, *findings), fit, mounting, None)
-    if "weight" in log.free:  # the checks below take the weight for the load's
+    if "weight" in log.free:  # the checks below require the weight of the load in the wrench
         return Conventions(tuple(findings), fit, mounting, None)
     if not findings:
         more, description = drift_finding(description, data)
         findings += more
         lag = 0.0 if mounting is None else mounting.lag_s
         findings += position_finding(description, data, lag)
-    thin = data.thin(description)
-    delay = None if thin.static else estimate_delay(thin, 30.0)
-    more, description = wrench_findings(description, thin, (0.0, delay or 0.0))
-    findings += more
-    if any(finding.name in ("swapped axes", "mounting") for finding in more):
-        return Conventions(tuple(findings), fit, mounting, None)
     more, delay = against_load(description, data)
     findings = _one_clock(description, [*findings, *more], mounting, delay)
-    wrench, pose = description.wrench, description.pose
-    if wrench and pose and all(finding.name == "lag" for finding in findings):
-        findings += against_frame(wrench, pose, log, delay or 0.0)
-    rest = rest_finding(log)
+    rest = _rest_finding(log)
     if rest is not None:
         findings.append(rest)
     return Conventions(tuple(findings), fit, mounting, delay)
@@ -249,11 +227,11 @@ def _one_clock(
     mounting: Mounting | None,
     delay: float | None,
 ) -> list[Finding]:
-    """If IMU and wrench disagree with the pose by the same time, its clock is wrong, not theirs."""
+    """Merge two clock findings if IMU and wrench differ from the pose by the same time."""
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
         return findings
-    if abs(mounting.lag_s + delay) > CLOCK:
+    if abs(mounting.lag_s + delay) > MIN_CLOCK_ERROR_S:
         return findings
     assert description.pose is not None
     finding = Finding(
@@ -262,3 +240,26 @@ def _one_clock(
         f" set pose.time.offset: {description.pose.time.offset - delay:.3f}",
     )
     return [finding, *(other for other in findings if other.name != "clock")]
+
+
+def _rest_finding(log: Log) -> Finding | None:
+    """Return a finding for too few or too similar poses at rest."""
+    if not log.static:
+        return None
+    if len(log) < _FEWEST_POSES:
+        return Finding(
+            "static poses",
+            f"{len(log)} poses at rest are too few to check the fit; record 12, turned about two"
+            " horizontal axes",
+        )
+    up = log.specific_force / np.linalg.norm(log.specific_force, axis=1, keepdims=True)
+    least = float(np.linalg.svd(up - up.mean(axis=0), compute_uv=False)[-1]) / np.sqrt(len(up))
+    if least >= _SMALLEST_SPREAD:
+        return None
+    angle = float(np.degrees(np.arcsin(least)))
+    return Finding(
+        "static poses",
+        f"the poses are too alike: along one direction gravity in S varies by only {angle:.2g} deg,"
+        " which does not separate offsets from the load; add poses that are turned by 45 deg or"
+        " more about two horizontal axes",
+    )

@@ -1,4 +1,4 @@
-"""A draft of a log description for a table whose columns nobody has described."""
+"""Draft of a log description for an unknown table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drake_teleop.logs.read.description import UNITS
 from drake_teleop.logs.read.tables import Table
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
-# How the names of vectors end, before the axis.
+# Ends of the names of vectors, before the axis.
 _VECTORS = {
     "force": "f|forces?",
     "torque": "t|m|tau|torques?|moment",
@@ -24,7 +24,7 @@ _VECTORS = {
     "orientation": "q|quat|quaternion|orientation",
     "position": "p|pos|position|translation",
 }
-# What the names of numbered columns are, and where in them the components of a vector.
+# Names of numbered columns, and positions of the components of a vector.
 _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
     r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)(f|ft)$": {
         "force": (0, 1, 2),
@@ -39,11 +39,11 @@ _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
 _HOMOGENEOUS = {"matrix": (0, 1, 2, 4, 5, 6, 8, 9, 10), "position": (3, 7, 11)}
 _MATRIX = [f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
 _IN_BASE = r"tcp_force$|^o_f_ext"
-_REMARKS = {
+_ROBOT_NOTES = {
     r"tcp_force$": "The payload that the controller was told is not in the TCP's force: tell it 0.",
     r"f_ext": "An external wrench is estimated, and without the load that the robot was told.",
 }
-_SAID = {
+_UNIT_NAMES = {
     **{re.sub(r"[ ^]", "", unit).lower(): unit for unit in (*UNITS, "g")},
     "µs": "us",
     "°": "deg",
@@ -65,28 +65,25 @@ _FILL_IN = "FILL IN"
 _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
 
 
-class _Found(NamedTuple):
-    """Columns of one kind, and the unit that stands in their names: "" if none does."""
+class _Columns(NamedTuple):
+    """Columns of one kind, and the unit in their names ("" for none)."""
 
     columns: list[str]
     unit: str
 
 
-_NOTHING = _Found([], "")
+_NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
-    """A draft of a log description, guessed from names and magnitudes of a table's columns.
+    """Guess a log description (YAML) from names and magnitudes of a table's columns.
 
     Args:
         table: any table.
-        folder: where the draft will be, which its path to the table starts from.
-        header: whether the file holds their names.
-
-    Returns:
-        YAML text whose first line says that it is a draft, and what was not found.
+        folder: of the draft, start of the relative path to the table.
+        header: whether the file contains column names.
     """
-    plain = {name: _plain(name) for name in table.columns}
+    plain = {name: _normalized(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
@@ -94,11 +91,11 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         beside = next(iter(groups.values()))["columns"][0]
         return {**file, "time": _time(table, plain, beside), **groups}
 
-    none = _Found([_FILL_IN] * 3, "")
+    none = _Columns([_FILL_IN] * 3, "")
     wrench = stream(
         **{kind: _group(table, kind, found.get(kind, none)) for kind in ("force", "torque")}, sign=1
     )
-    forces = [_base(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
+    forces = [_without_number(plain[name][0]) for name in found.get("force", _NOTHING).columns[:1]]
     if any(re.search(_IN_BASE, name) for name in forces):
         wrench["frame"] = "base"
     draft: dict[str, Any] = {}
@@ -115,14 +112,14 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     if pose:
         draft["pose"] = stream(**pose)
     if not draft:
-        draft["wrench"] = wrench  # to begin with something
+        draft["wrench"] = wrench  # a template
     groups = [group for stream in draft.values() for group in stream.values()]
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
     times = {stream["time"]["column"] for stream in draft.values()}
     used |= times
-    arrays = _names_of_arrays(table)
+    arrays = _array_names(table)
     used |= {name.partition("[")[0] for name in used}
     parts = {
         name for name in table.columns if name not in arrays and name.partition("[")[0] in arrays
@@ -133,25 +130,23 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
         "above all wrench.sign, units and frames, and inspect it.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
         *([_WITHOUT_TIME] if _FILL_IN in times else []),
-        *(text for what, text in _REMARKS.items() for n in forces if re.search(what, n)),
+        *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
     return yaml_text(draft, head=head)
 
 
-def _plain(name: str) -> tuple[str, str]:
-    """A name in small letters, parts joined by _, and the unit that stands in brackets in it."""
+def _normalized(name: str) -> tuple[str, str]:
     unit = re.search(r"[\[(]\s*([^\])\d][^\])]*)[\])]\s*$", name)
     rest = name[: unit.start()] if unit else name
     return re.sub(r"[^a-z0-9]+", "_", rest.lower()).strip("_"), unit[1].strip() if unit else ""
 
 
-def _base(plain: str) -> str:
+def _without_number(plain: str) -> str:
     return re.sub(r"_?\d+$", "", plain)
 
 
-def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """By kind, the columns with x, y, z (w first) at the end of one and the same name."""
-    found: dict[str, _Found] = {}
+def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
     for kind, names in _VECTORS.items():
         axes = "wxyz" if kind == "orientation" else "xyz"
         ends = rf"^(.*?)(?:(?:^|_)(?:{names}))_?([{axes}])$"
@@ -164,63 +159,58 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
         whole = [group for group in groups.values() if len(group) == len(axes)]
         for group in (whole or list(groups.values()))[:1]:
             columns = [group[axis] for axis in axes if axis in group]
-            found[kind] = _Found(columns, plain[columns[0]][1])
+            found[kind] = _Columns(columns, plain[columns[0]][1])
     return found
 
 
-def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """The same of columns whose names end with numbers; and of a matrix r11, r12 ... r33."""
+def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(r"\d$", words):
-            groups.setdefault(_base(words), []).append(name)
-    found: dict[str, _Found] = {}
+            groups.setdefault(_without_number(words), []).append(name)
+    found: dict[str, _Columns] = {}
     for start, kinds in _NUMBERED.items():
         most = max(k for places in kinds.values() for k in places)
         fit = [base for base in groups if re.search(start, base) and len(groups[base]) > most]
         for base in sorted(fit, key=lambda name: "target" in name)[:1]:
             for kind, places in kinds.items():
                 columns = [groups[base][k] for k in places]
-                found[kind] = _Found(columns, plain[columns[0]][1])
+                found[kind] = _Columns(columns, plain[columns[0]][1])
     by_words = {words: name for name, (words, _) in plain.items()}
     if all(word in by_words for word in _MATRIX):
-        found["matrix"] = _Found([by_words[word] for word in _MATRIX], "")
+        found["matrix"] = _Columns([by_words[word] for word in _MATRIX], "")
     return found
 
 
-def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Found]:
-    """The same of arrays with several columns, which NPZ and MAT files hold, by their names."""
-    found: dict[str, _Found] = {}
-    arrays = _names_of_arrays(table)
+def _arrays(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    found: dict[str, _Columns] = {}
+    arrays = _array_names(table)
     for kind, names in {**_VECTORS, "matrix": "r|rot|rotation(_matrix)?"}.items():
         width = {"orientation": 4, "matrix": 9}.get(kind, 3)
         for name in arrays:
             words, unit = plain[name]
-            whole = _Found([name], unit)
+            whole = _Columns([name], unit)
             fits = _width(table, whole) == width
             if kind not in found and fits and re.search(rf"(?:^|_)(?:{names})$", words):
                 found[kind] = whole
     for name in [name for name in arrays if table.columns[name].shape[1:] == (4, 4)][:1]:
         for kind, places in _HOMOGENEOUS.items():
-            found[kind] = _Found([f"{name}[{k}]" for k in places], "")
+            found[kind] = _Columns([f"{name}[{k}]" for k in places], "")
     return found
 
 
-def _names_of_arrays(table: Table) -> list[str]:
-    """Of columns with several numbers in a row; without reading any, which Parquet leaves to us."""
+def _array_names(table: Table) -> list[str]:
     return [name for name in table.columns if f"{name}[0]" in table.columns]
 
 
-def _width(table: Table, found: _Found) -> int:
-    """How many numbers the columns have in a row."""
+def _width(table: Table, found: _Columns) -> int:
     return sum(math.prod(table.columns[name].shape[1:]) for name in found.columns)
 
 
-def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
-    """Columns and unit of a vector: that of its name, or what its magnitude lets expect."""
+def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
     if found.unit:
-        unit = _SAID.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
+        unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
         group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
         return group
     if _FILL_IN in found.columns or kind in ("force", "torque"):
@@ -236,8 +226,7 @@ def _group(table: Table, kind: str, found: _Found) -> dict[str, Any]:
     return group
 
 
-def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
-    """Orientation, and position if there is one."""
+def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
     if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
     elif "matrix" in found:
@@ -254,10 +243,6 @@ def _pose(table: Table, found: dict[str, _Found]) -> dict[str, Any]:
 
 
 def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[str, Any]:
-    """The column of time: by its name, or the unit in that.
-
-    Of several, the first in the structure of a column that it goes with, or else of as many rows.
-    """
     named = [name for name, (words, _) in plain.items() if re.search(_TIME, words)]
     named += [name for name, (_, unit) in plain.items() if unit.lower() in _UNITS["time"]]
     named = [name for name in named if f"{name}[0]" not in table.columns]
@@ -271,7 +256,7 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
                 len(table.columns[name]) != rows,
             )
         )
-    unit = _SAID.get(plain[named[0]][1].lower(), "")
+    unit = _UNIT_NAMES.get(plain[named[0]][1].lower(), "")
     return {
         "column": named[0],
         "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),
@@ -279,7 +264,6 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
 
 
 def _time_unit(table: Table, column: str) -> str:
-    """The unit in which the median step is between 50 us and 1 s, the longest such step."""
     step = float(np.median(np.abs(np.diff(table.single(column, column)))))
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if step * scale <= 0.3:

@@ -1,9 +1,7 @@
-"""How well some load explains a wrench, and by how much another description has to do so better.
+"""Share of a wrench that a load explains, and limits for a better description.
 
-When is better decisive? Unexplained variances u of n independent samples, noise and nothing else,
-have ratios that follow Fisher's F(n, n). An edit has to exceed the quantile of F that one good log
-in a million would exceed with any of `_EDITS` edits, and the factor `DECISIVE`, which is for what
-is no noise: bending, cross-talk, a contact. n = 2 * cut-off * duration (Shannon).
+Unexplained variances of n independent noise samples have ratios of Fisher's F(n, n). An edit must
+exceed its quantile for one false alarm in a million logs. n = 2 * cut-off * duration (Shannon).
 """
 
 from __future__ import annotations
@@ -18,16 +16,15 @@ from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured
 from drake_teleop.logs.read.canonical import Log
 
-EXPLAINED = 0.02
-"""A fit that leaves less than this share of the variance, besides the sensor's white noise, and has
-a positive mass, is not questioned."""
-BELIEVABLE = 0.05
-"""A hypothesis has to leave less than this share, besides the noise."""
-DECISIVE = 4.0
-"""... and at least this factor less than the description as given."""
-_FALSE_ALARMS, _EDITS = 1e-6, 50
-_CUTOFF = 15.0
-_SAMPLES = 1500
+GOOD_SHARE = 0.02
+"""Unexplained share of the variance, beside white noise, of a good fit with positive mass."""
+VALID_SHARE = 0.05
+"""Largest unexplained share, beside noise, of a valid hypothesis."""
+MIN_IMPROVEMENT = 4.0
+"""Smallest factor by which an edit reduces the unexplained share."""
+_FALSE_ALARMS, _TESTED_EDITS = 1e-6, 50
+_CUTOFF_HZ = 15.0
+_MAX_SAMPLES = 1500
 
 
 @dataclass(frozen=True)
@@ -35,10 +32,10 @@ class LoadFit:
     """Least squares of Eq. (5).
 
     Args:
-        unexplained: share of the wrench's variance that is left.
+        unexplained: share of the wrench's variance.
         mass: of the fit [kg].
-        noise: share of the variance that is white noise of the sensor.
-        independent: how many samples say something new.
+        noise: share of white noise in the variance.
+        independent: number of independent samples.
     """
 
     unexplained: float
@@ -49,21 +46,14 @@ class LoadFit:
     @property
     def good(self) -> bool:
         """Whether some load of positive mass explains the wrench."""
-        return self.mass > 0 and self.unexplained < EXPLAINED + self.noise
+        return self.mass > 0 and self.unexplained < GOOD_SHARE + self.noise
 
 
 def load_fit(log: Log) -> LoadFit:
-    """How much of the wrench a constant offset and some load explain.
-
-    Forces weigh as their variance, torques as theirs or as forces 3 cm away, whichever is more: a
-    torque that is nothing but noise does not count.
-
-    Args:
-        log: the log; it is low-passed at 15 Hz for this.
-    """
+    """Fit a constant offset and a load to a log, low-passed at 15 Hz."""
     cutoff = _cutoff(log)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
-    rows = slice(None, None, max(1, len(log) // _SAMPLES))
+    rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
     wrench = smooth.wrench[rows]
     w = wrench - wrench.mean(axis=0)
     scale = _scale(wrench)
@@ -76,28 +66,25 @@ def load_fit(log: Log) -> LoadFit:
     size = np.linalg.norm(matrix, axis=0) + 1e-12
     theta = np.linalg.lstsq(matrix / size, (w / scale).ravel(), rcond=1e-6)[0] / size
     total = float((w / scale).var(axis=0).sum()) + 1e-30
-    left_over = float((w / scale - V @ theta).var(axis=0).sum()) / total
+    unexplained = float((w / scale - V @ theta).var(axis=0).sum()) / total
     if cutoff is None:
-        return LoadFit(left_over, float(theta[0]), independent=max(1.0, len(w) - 8.0))
-    # The low-pass lets 0.83 * 2 * cut-off * dt of white noise pass.
+        return LoadFit(unexplained, float(theta[0]), independent=max(1.0, len(w) - 8.0))
+    # The low-pass passes the share 0.83 * 2 * cut-off * dt of white noise.
     passed = min(1.0, 1.67 * cutoff * log.dt)
     noise = passed * float(((white_noise(log.wrench) / scale) ** 2).sum()) / total
     independent = 2 * cutoff * float(log.t[-1] - log.t[0])
-    return LoadFit(left_over, float(theta[0]), noise, independent)
+    return LoadFit(unexplained, float(theta[0]), noise, independent)
 
 
 def unexplained_share(wrench: NDArray[np.float64], residual: NDArray[np.float64]) -> float:
-    """Share of the variance of a wrench (N, 6) in a residual (N, 6), weighed as `load_fit` does."""
+    """Share of the variance of a wrench (N, 6) in a residual (N, 6)."""
     scale = _scale(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
 
 
 def white_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviations (k,) of white noise in (N, k), from third differences.
-
-    Those know nothing of smooth motion.
-    """
+    """Standard deviations (k,) of white noise in (N, k), from third differences."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
     # The squares of 1, 3, 3, 1 sum to 20; 1.4826 median |x| is the deviation of a normal x.
@@ -105,17 +92,16 @@ def white_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cutoff(log: Log) -> float | None:
-    return None if log.static else min(_CUTOFF, 0.2 / log.dt)
+    return None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
 
 
 def _scale(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6,) units in which forces and torques weigh alike."""
     force, torque = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1))
     least = 1e-9 * float(np.abs(wrench).max()) + 1e-15
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)
 
 
 def decisive_factor(fit: LoadFit) -> float:
-    """The factor by which another description has to leave less."""
+    """Return the factor by which another description must reduce the residual."""
     n = max(1.0, fit.independent)
-    return max(DECISIVE, float(fdtri(n, n, 1 - _FALSE_ALARMS / _EDITS)))
+    return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))

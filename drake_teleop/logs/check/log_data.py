@@ -1,4 +1,4 @@
-"""A log's tables, to be read with one description after the other: whole, or thinned to 100 Hz."""
+"""Tables of a log for repeated reading with other descriptions: whole, or at 100 Hz."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
-_RATE = 100.0
-_STAMPS = "time stamps of a stream without"
+_RATE_HZ = 100.0
+_TIME_COLUMN = "time stamps of a stream without"
 
 
 class LogData:
-    """The tables of a log, as they are, by their `source`, and thinned."""
+    """Tables of a log by `source`, whole and thinned."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
@@ -42,14 +42,16 @@ class LogData:
             self._thin(stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
-        """The whole log."""
+        """Read the whole log."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
-        """The log with as many samples as a comparison needs."""
+        """Read the log at about 100 Hz."""
         stamped = {
             name: stream.model_copy(
-                update={"time": stream.time.model_copy(update={"column": _STAMPS, "rate": None})}
+                update={
+                    "time": stream.time.model_copy(update={"column": _TIME_COLUMN, "rate": None})
+                }
             )
             for name in ("wrench", "imu", "pose")
             if (stream := getattr(description, name)) and stream.time.column is None
@@ -58,14 +60,13 @@ class LogData:
         return read_description(description, self._source, tables=self._thinned)
 
     def start(self, stream: Any, description: Description) -> float:
-        """When the stream's first row was taken, on the common clock [s]."""
+        """Return the time of the stream's first row [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
         t = self.tables[stream.source].single(stream.time.column, "time")
         return float(t[0]) * description.scale(stream.time.unit) + stream.time.offset
 
     def _stride(self, description: Description, stream: Any) -> int:
-        """Rows that become one; an odd number, so that one of them is in the middle."""
         time: Time | None = getattr(stream, "time", None)
         if time is None:
             return 1
@@ -73,22 +74,20 @@ class LogData:
             rate = time.rate
         else:
             t = self._stamps(stream)
-            if len(t) < 2:  # read_log says what is wrong
+            if len(t) < 2:  # read_log raises the error
                 return 1
             rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
-        # So that enough are left of a short record.
-        most = min(rate / _RATE, self.tables[stream.source].rows / MINIMUM_SAMPLES)
+        # A short record keeps enough samples.
+        most = min(rate / _RATE_HZ, self.tables[stream.source].rows / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _stamps(self, stream: Any) -> NDArray[np.float64]:
-        """The stream's time stamps; those that rows share are spread, as `read_clock` does."""
         t = self.tables[stream.source].single(str(stream.time.column), "time")
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
         return spread(t) if shared else t
 
     def _thin(self, stream: Any, thin: Table, k: int) -> None:
-        """Means over k rows; of an orientation, which has no mean, the row in the middle."""
         table = self.tables[stream.source]
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
@@ -100,7 +99,7 @@ class LogData:
         if time is not None and time.column is not None:
             thin.columns[str(time.column)] = _means(self._stamps(stream)[:, None], k)
         elif time is not None and time.rate is not None:
-            thin.columns[_STAMPS] = _means(np.arange(table.rows)[:, None] / time.rate, k)
+            thin.columns[_TIME_COLUMN] = _means(np.arange(table.rows)[:, None] / time.rate, k)
 
 
 def _streams(description: Description) -> list[Any]:

@@ -9,10 +9,8 @@ import numpy as np
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.causes.candidates import part
-from drake_teleop.logs.causes.delay import free_delay
 from drake_teleop.logs.causes.explain import explain
-from drake_teleop.logs.causes.instants import Instants, instants
+from drake_teleop.logs.causes.instants import Instants, free_delay, instants
 from drake_teleop.logs.read.alignment import resample, undelayed
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, Description
@@ -62,7 +60,7 @@ def describe_gravity(
         log_instants(log), lambda delay_s: log_instants(undelayed(log, delay_s)), ("gravity",)
     )
     if explanation.theta[6] > 0.0:
-        change, covariance = part(explanation.state, "gravity")
+        change, covariance = explanation.state.extension("gravity")
         estimated = description.gravity_W - change
         estimated *= STANDARD_GRAVITY / np.linalg.norm(estimated)
         across = np.eye(3) - np.outer(estimated, estimated) / STANDARD_GRAVITY**2

@@ -1,18 +1,41 @@
-"""Edits of a description: each would put one suspected error of convention right."""
+"""Findings, and corrections of a description, each of which corrects one suspected error."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.check.finding import Finding
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.rotations import right_angled_rotations
+
+EFFECTS = ("lag", "units", "payload")
+"""Findings that may be the effect of a cause, such as drift."""
+MOTION_ERRORS = (
+    *("clock", "reversed gravity", "inverted orientation", "quaternion order", "degrees"),
+    "base axes",
+)
+"""Errors of the described motion, which resemble causes."""
+MIN_CLOCK_ERROR_S = 0.05
+"""Larger delays are errors of a clock, not the lag of a filter [s]."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Suspicious property of a log.
+
+    Args:
+        name: category for programs: "sign", "units" ...
+        message: observation and remedy.
+    """
+
+    name: str
+    message: str
 
 
 def _gravity_field(description: Description) -> str | None:
@@ -24,25 +47,18 @@ def _gravity_field(description: Description) -> str | None:
     return None
 
 
-def unit_findings(description: Description, log: Log) -> Iterator[Finding]:
-    """That an accelerometer, or gravity at rest, is not in the unit that is given, if so."""
+def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Finding], Description]:
+    """Return a finding for an accelerometer in another unit, and the corrected description."""
     field = _gravity_field(description)
     unit = None if field is None else _right_unit(description, log, field)
     if field is None or unit is None:
-        return
-    ratio = _over_gravity(description, log)
-    yield Finding(
+        return [], description
+    finding = Finding(
         "units",
-        f"the accelerometer reads {ratio:.3g} times gravity: it is not in"
+        f"the accelerometer reads {_over_gravity(description, log):.3g} times gravity: it is not in"
         f" {_field(description, field).unit}; set {field}.unit: {unit}",
     )
-
-
-def in_other_unit(description: Description, log: Log) -> Description:
-    """The description with that unit exchanged."""
-    field = _gravity_field(description)
-    unit = None if field is None else _right_unit(description, log, field)
-    return description if unit is None else edit_field(description, f"{field}.unit", unit)
+    return [finding], edit_field(description, f"{field}.unit", unit)
 
 
 def _over_gravity(description: Description, log: Log) -> float:
@@ -51,10 +67,6 @@ def _over_gravity(description: Description, log: Log) -> float:
 
 
 def _right_unit(description: Description, log: Log, field: str) -> str | None:
-    """The unit in which the median is gravity, if it is not the one that is given.
-
-    Units are 9.81 or more apart; a median that far from gravity is no motion.
-    """
     given = _field(description, field).unit
     number = _over_gravity(description, log) / description.scale(given)
     for unit in ("m/s^2", "g", "mm/s^2"):
@@ -71,7 +83,7 @@ def _field(description: Description, path: str) -> Any:
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
-    """The description with one field changed."""
+    """Return the description with one field changed."""
     first, *rest = path.split(".", 1)
     if rest:
         model: Any = getattr(description, first)
@@ -80,13 +92,21 @@ def edit_field(description: Description, path: str, value: Any) -> Description:
 
 
 Edit = tuple[Finding, Description]
-"""What was seen, and the description without it."""
+"""Finding, and the corrected description."""
+
+
+def _edit(description: Description, name: str, text: str, path: str, value: Any) -> Edit:
+    """Return the finding "<text>; set <path>: <value>" and the edited description."""
+    shown = str(value).lower() if isinstance(value, bool) else value
+    finding = Finding(name, f"{text}; set {path}: {shown}")
+    return finding, edit_field(description, path, value)
 
 
 def pose_edits(description: Description) -> Iterator[Edit]:
-    """Orientations in another form, gravity or an accelerometer that point the other way."""
+    """Yield other forms of orientation and reversed gravity."""
     pose, imu = description.pose, description.imu
-    if imu is not None and imu.specific_force is not None:
+    sensed = imu is not None and imu.specific_force is not None
+    if imu is not None and sensed:
         yield (
             Finding(
                 "reversed gravity",
@@ -99,7 +119,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
     if orientation is None:
         return
-    if imu is None or imu.specific_force is None:
+    if not sensed:
         turned = tuple(0.0 - x for x in description.gravity_W.tolist())
         yield (
             Finding(
@@ -108,38 +128,22 @@ def pose_edits(description: Description) -> Iterator[Edit]:
             ),
             edit_field(description, "gravity", turned),
         )
-    inverse = orientation.inverse
-    yield (
-        Finding(
-            "inverted orientation",
-            "the orientation is that of the world in S, R_SW, not R_WS;"
-            f" set {field}.inverse: {str(not inverse).lower()}",
-        ),
-        edit_field(description, f"{field}.inverse", not inverse),
-    )
+    text = "the orientation is that of the world in S, R_SW, not R_WS"
+    path = f"{field}.inverse"
+    yield _edit(description, "inverted orientation", text, path, not orientation.inverse)
     forms = {"quaternion_wxyz": "quaternion_xyzw", "quaternion_xyzw": "quaternion_wxyz"}
     if orientation.form in forms:
+        text = f"the quaternions are not {orientation.form}"
         other = forms[orientation.form]
-        yield (
-            Finding(
-                "quaternion order",
-                f"the quaternions are not {orientation.form}; set {field}.form: {other}",
-            ),
-            edit_field(description, f"{field}.form", other),
-        )
+        yield _edit(description, "quaternion order", text, f"{field}.form", other)
     if orientation.form == "rotation_vector":
+        text = f"the rotation vectors are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
-        yield (
-            Finding(
-                "degrees",
-                f"the rotation vectors are not in {orientation.unit}; set {field}.unit: {unit}",
-            ),
-            edit_field(description, f"{field}.unit", unit),
-        )
+        yield _edit(description, "degrees", text, f"{field}.unit", unit)
 
 
-def tried(function: Callable[[Description], Any], edited: Description) -> Any:
-    """What the function makes of an edited description; None if such a log cannot be read."""
+def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
+    """Return the result for an edited description; None if it cannot be read."""
     try:
         return function(edited)
     except DrakeTeleopError:
@@ -147,44 +151,33 @@ def tried(function: Callable[[Description], Any], edited: Description) -> Any:
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """A wrench of the other sign or in other axes, other units of the motion, and `pose_edits`."""
+    """Yield other signs, axes and units of wrench and motion, and `pose_edits`."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
-    yield (
-        Finding("sign", f"the sign of the wrench is inverted; set {stream}.sign: {-sensor.sign}"),
-        edit_field(description, f"{stream}.sign", -sensor.sign),
-    )
+    text = "the sign of the wrench is inverted"
+    yield _edit(description, "sign", text, f"{stream}.sign", -sensor.sign)
     yield from pose_edits(description)
     if sensor.frame == "sensor":
-        yield (
-            Finding(
-                "base axes",
-                f"the wrench is in the axes of the base; set {stream}.frame: base",
-            ),
-            edit_field(description, f"{stream}.frame", "base"),
-        )
+        text = "the wrench is in the axes of the base"
+        yield _edit(description, "base axes", text, f"{stream}.frame", "base")
     elif sensor.frame == "base":
-        yield (
-            Finding("base axes", f"the wrench is not in base axes; set {stream}.frame: sensor"),
-            edit_field(description, f"{stream}.frame", "sensor"),
-        )
+        text = "the wrench is not in base axes"
+        yield _edit(description, "base axes", text, f"{stream}.frame", "sensor")
     imu, pose = description.imu, description.pose
     if pose is not None and pose.position and (imu is None or imu.specific_force is None):
+        text = f"the position is not in {pose.position.unit}"
         unit = "mm" if pose.position.unit == "m" else "m"
-        yield (
-            Finding(
-                "units",
-                f"the position is not in {pose.position.unit}; set pose.position.unit: {unit}",
-            ),
-            edit_field(description, "pose.position.unit", unit),
-        )
+        yield _edit(description, "units", text, "pose.position.unit", unit)
     if imu is not None and imu.angular_velocity and imu.angular_velocity.unit == "rad/s":
-        yield (
-            Finding("degrees", "the gyroscope is in degrees; set imu.angular_velocity.unit: deg/s"),
-            edit_field(description, "imu.angular_velocity.unit", "deg/s"),
-        )
-    for order in list(permutations(range(3)))[1:]:
-        if len(sensor.force.columns) == 3 and len(sensor.torque.columns) == 3:
+        text = "the gyroscope is in degrees"
+        yield _edit(description, "degrees", text, "imu.angular_velocity.unit", "deg/s")
+    yield from _axis_edits(description, stream, sensor)
+
+
+def _axis_edits(description: Description, stream: str, sensor: Any) -> Iterator[Edit]:
+    """Yield other orders of the wrench's columns, and right-angled rotations of its axes."""
+    if len(sensor.force.columns) == 3 and len(sensor.torque.columns) == 3:
+        for order in list(permutations(range(3)))[1:]:
             force, torque = (
                 tuple(x.columns[i] for i in order) for x in (sensor.force, sensor.torque)
             )

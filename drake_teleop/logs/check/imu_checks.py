@@ -1,0 +1,324 @@
+"""Checks of an IMU: consistency of its three quantities, and its motion against the pose.
+
+- The angular acceleration is the derivative of the angular velocity.
+- Rotated back by the gyroscope for a few seconds, the mean specific force is minus gravity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.logs.check.corrections import (
+    MIN_CLOCK_ERROR_S,
+    Edit,
+    Finding,
+    edit_field,
+    pose_edits,
+    try_edit,
+)
+from drake_teleop.logs.check.load_fit import GOOD_SHARE, MIN_IMPROVEMENT, VALID_SHARE
+from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.read.alignment import low_pass, smooth_derivatives
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import Description, Imu
+from drake_teleop.logs.read.mounting import Mounting, find_mounting
+from drake_teleop.logs.read.rotations import rotation_matrices
+
+Array = NDArray[np.float64]
+DEGREE_RATIOS = (40.0, 80.0)
+"""Range of the ratio 180 / pi of two speeds with noise and gain errors."""
+MIN_GRAVITY_ERROR = 0.02
+"""Smallest reported error of gravity; calibrated sensors are within 1 %."""
+_SIGNIFICANT = 5.0
+_MIN_CORRELATION = 0.8
+_BAND_HZ = 5.0
+_MAX_OWN_SHARE = 0.5
+_WINDOW_S, _MIN_WINDOWS, _MAX_WINDOWS = (2.0, 8.0), 6, 60
+_ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
+
+
+def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
+    """Return findings about an IMU, and the corrected description."""
+    imu = description.imu
+    if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
+        return [], description
+    unit = _angle_unit_finding(imu, log)
+    if unit is not None:
+        return [unit[0]], edit_field(description, *unit[1:])
+    if imu.specific_force is None or imu.frame == "base":
+        return [], description
+    gravity = float(np.linalg.norm(description.gravity_W))
+    axes = _gyro_axes(imu, log, gravity)
+    if axes is not None:
+        finding, columns = axes
+        if columns is not None:
+            description = edit_field(description, "imu.angular_velocity.columns", columns)
+        return [finding], description
+    alpha = _alpha_axes(imu, log)
+    if alpha is not None:
+        return [alpha], description
+    scale = _gravity_finding(imu, log, gravity)
+    return ([] if scale is None else [scale]), description
+
+
+def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
+    assert imu.angular_velocity is not None
+    if imu.angular_acceleration is None:
+        return None
+    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
+    given_alpha, derived_alpha = (
+        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
+    )
+    sizes = float(np.linalg.norm(given_alpha)), float(np.linalg.norm(derived_alpha))
+    if (
+        min(sizes) == 0.0
+        or float(np.sum(given_alpha * derived_alpha)) < _MIN_CORRELATION * sizes[0] * sizes[1]
+    ):
+        return None
+    ratio = sizes[0] / sizes[1]
+    field, now = "angular_acceleration", imu.angular_acceleration.unit
+    if DEGREE_RATIOS[0] < ratio < DEGREE_RATIOS[1] and now == "rad/s^2":
+        unit = "deg/s^2"
+    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and now == "deg/s^2":
+        unit = "rad/s^2"
+    elif DEGREE_RATIOS[0] < 1.0 / ratio < DEGREE_RATIOS[1] and imu.angular_velocity.unit == "rad/s":
+        field, unit = "angular_velocity", "deg/s"
+    else:
+        return None
+    finding = Finding(
+        "degrees",
+        f"the angular acceleration is {ratio:.3g} times the derivative of the angular velocity;"
+        f" set imu.{field}.unit: {unit}",
+    )
+    return finding, f"imu.{field}.unit", unit
+
+
+def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
+    """Return a finding for axes of the gyroscope that differ from the accelerometer."""
+    assert imu.angular_velocity is not None
+    few = log.only(slice(None, None, max(1, round(1.0 / (_ROTATION_HZ * log.dt)))))
+    given = _gravity_misfit(few, np.eye(3), gravity)
+    if not given > _MIN_MISFIT:
+        return None
+    best, P = min(
+        ((_gravity_misfit(few, P, gravity), P) for P in _signed_permutations()),
+        key=lambda entry: entry[0],
+    )
+    if _MIN_RATIO * best > given:
+        return None
+    order = np.abs(P).argmax(axis=1)
+    text = "the axes of the gyroscope are not those of the accelerometer"
+    names = imu.angular_velocity.columns
+    if (P < 0).any() or len(names) != 3 or imu.frame != "sensor":
+        rows = ", ".join(f"{'-' if P[i, k] < 0 else ''}{'xyz'[k]}" for i, k in enumerate(order))
+        return Finding(
+            "swapped axes",
+            f"{text}: its x, y, z should be its {rows}; correct imu.angular_velocity.columns, in"
+            " the file where a sign is wrong",
+        ), None
+    ordered = tuple(names[k] for k in order)
+    return Finding(
+        "swapped axes", f"{text}; set imu.angular_velocity.columns: {list(ordered)}"
+    ), ordered
+
+
+def _alpha_axes(imu: Imu, log: Log) -> Finding | None:
+    if imu.angular_acceleration is None:
+        return None
+    rate = smooth_derivatives(log.angular_velocity, log.dt, 30.0)[1]
+    given_alpha, derived_alpha = (
+        low_pass(x, log.dt, _BAND_HZ) for x in (log.angular_acceleration, rate)
+    )
+    size = float(np.linalg.norm(given_alpha) * np.linalg.norm(derived_alpha)) + 1e-300
+    alike = given_alpha.T @ derived_alpha / size
+    best = max(_signed_permutations(), key=lambda P: float(np.sum(alike * P)))
+    if np.sum(alike * best) < _MIN_CORRELATION or np.trace(alike) > _MAX_OWN_SHARE * np.sum(
+        alike * best
+    ):
+        return None
+    axes = ["xyz"[k] if row[k] > 0 else f"-{'xyz'[k]}" for row in best for k in np.flatnonzero(row)]
+    return Finding(
+        "swapped axes",
+        "the axes of the angular acceleration are not those of the gyroscope: its x, y, z are"
+        f" the gyroscope's {', '.join(axes)}; correct imu.angular_acceleration.columns, or take it"
+        " out",
+    )
+
+
+def _signed_permutations() -> list[Array]:
+    return [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+
+
+@dataclass(frozen=True)
+class MeanGravity:
+    """Length of the mean specific force over gravity, and its standard deviation."""
+
+    ratio: float
+    deviation: float
+
+
+def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
+    """Return the ratio from all windows; None if the record is too short."""
+    forces = _mean_forces(log, np.eye(3))[0]
+    if len(forces) < _MIN_WINDOWS:
+        return None
+    ratios = np.linalg.norm(forces, axis=1) / gravity
+    return MeanGravity(float(np.mean(ratios)), float(np.std(ratios, ddof=1) / np.sqrt(len(ratios))))
+
+
+def _mean_forces(log: Log, P: Array) -> Array:
+    """(2, n, 3) Hann-weighted mean specific force of windows, and half a window later [m/s^2]."""
+    length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
+    half = max(1, int(0.5 * length / log.dt))
+    count = max(0, len(log) // half - 2)
+    starts = np.linspace(0, len(log) - 3 * half, min(count, _MAX_WINDOWS)).astype(int)
+    take = starts[:, None] + np.arange(3 * half)
+    omega, s = log.angular_velocity[take] @ P.T, log.specific_force[take]
+    steps = rotation_matrices((omega * log.dt).reshape(-1, 3), "rotation_vector")
+    steps = steps.reshape(*omega.shape, 3)
+    weight = np.zeros((2, 3 * half))
+    weight[0, : 2 * half] = weight[1, half:] = np.hanning(2 * half + 2)[1:-1]
+    weight /= weight[0].sum()
+    R, means = np.broadcast_to(np.eye(3), (len(starts), 3, 3)), np.zeros((2, len(starts), 3))
+    for k in range(3 * half):
+        means += weight[:, k, None, None] * np.einsum("nij,nj->ni", R, s[:, k])
+        R = R @ steps[:, k]
+    return means
+
+
+def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
+    """Return the rms distance of the means from gravity and from each other."""
+    means = _mean_forces(log, P) / gravity
+    if means.shape[1] == 0:
+        return np.nan
+    off = np.linalg.norm(means, axis=2) - 1.0
+    return float(np.sqrt(np.mean(off**2) + np.mean(np.sum((means[1] - means[0]) ** 2, axis=1))))
+
+
+def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
+    found = mean_gravity(log, gravity)
+    if found is None or not 0.7 < found.ratio < 1.4:
+        return None
+    off = found.ratio - 1.0
+    if (
+        abs(off) < MIN_GRAVITY_ERROR + 3.0 * found.deviation
+        or abs(off) < _SIGNIFICANT * found.deviation
+    ):
+        return None
+    assert imu.specific_force is not None
+    measured_gravity = found.ratio * gravity
+    remedy = f"divide the columns of imu.specific_force by {found.ratio:.4f}, or calibrate them"
+    if imu.specific_force.unit != "g" and abs(measured_gravity / 9.80665 - 1.0) < 0.01:
+        remedy = f"set gravity: {measured_gravity:.4g}"
+    return Finding(
+        "gravity",
+        f"the accelerometer reads {measured_gravity:.4g} m/s^2 of gravity in the mean,"
+        f" {100 * abs(off):.2g} % (+- {100 * found.deviation:.1g})"
+        f" {'more' if off > 0 else 'less'} than the description says:"
+        f" the mass would be wrong by as much; {remedy}",
+    )
+
+
+def against_pose(
+    description: Description, data: LogData
+) -> tuple[list[Finding], Mounting | None, Description]:
+    """Return findings about the IMU, its mounting, and the corrected description."""
+
+    def mounting(edited: Description) -> Mounting | None:
+        pose_alone = edited.model_copy(update={"imu": None})
+        return find_mounting(data.thin(edited), data.thin(pose_alone))
+
+    given = mounting(description)
+    if given is None:
+        return [], None, description
+    findings: list[Finding] = []
+    if given.unexplained > GOOD_SHARE or given.mirrored or given.angle_deg > 10:
+        better = [
+            (found.unexplained, finding, edited, found)
+            for finding, edited in pose_edits(description)
+            if (found := try_edit(mounting, edited)) and not found.mirrored
+        ]
+        limit = min(VALID_SHARE, given.unexplained / MIN_IMPROVEMENT)
+        if given.mirrored:
+            better = [entry for entry in better if entry[3].angle_deg < 10]
+        elif given.angle_deg > 10 and given.unexplained < VALID_SHARE:
+            # In a rotation about one axis an inverted orientation resembles a rotated IMU. An edit
+            # that keeps the described mounting is the simpler explanation.
+            better = [entry for entry in better if entry[3].angle_deg < 10]
+            limit = min(VALID_SHARE, 1.5 * given.unexplained + 1e-4)
+        best = min(better, key=lambda entry: entry[0], default=None)
+        if best and best[0] < limit:
+            findings.append(best[1])
+            description, given = best[2], best[3]
+    if given.unexplained > VALID_SHARE and not given.mirrored:
+        return findings, given, description
+    if abs(given.lag_s) > MIN_CLOCK_ERROR_S or given.drift:
+        finding, description = _imu_clock(description, given, data)
+        findings.append(finding)
+    if given.speed_ratio is not None and 40 < given.speed_ratio < 80:
+        findings.append(
+            Finding(
+                "degrees",
+                f"the gyroscope reads {given.speed_ratio:.3g} times the speed of the pose;"
+                " set imu.angular_velocity.unit: deg/s",
+            )
+        )
+        description = edit_field(description, "imu.angular_velocity.unit", "deg/s")
+    if given.mirrored:
+        findings.append(
+            Finding(
+                "swapped axes",
+                "the axes of the IMU are those of the pose mirrored: two columns are exchanged or"
+                " one has the wrong sign; correct imu.specific_force.columns",
+            )
+        )
+    elif given.angle_deg > 10:
+        assert description.imu is not None
+        old = np.eye(3)
+        if isinstance(description.imu.frame, tuple):
+            old = np.array(description.imu.frame)
+        frame = np.array(given.right_angled if given.is_right_angled else given.R_SI) @ old
+        shown = np.round(frame, 4).tolist()
+        kind = "swapped axes" if given.is_right_angled else "mounting"
+        findings.append(
+            Finding(
+                kind,
+                f"the IMU is turned by {given.angle_deg:.0f} deg against S; set imu.frame: {shown}"
+                + ("" if given.is_right_angled else " (not a right-angled mounting)"),
+            )
+        )
+        description = edit_field(description, "imu.frame", tuple(map(tuple, frame.tolist())))
+    return findings, given, description
+
+
+def _imu_clock(description: Description, found: Mounting, data: LogData) -> Edit:
+    assert description.imu is not None and description.wrench is not None
+    time = description.imu.time
+    if not found.drift:
+        offset = time.offset - found.lag_s
+        finding = Finding(
+            "clock",
+            f"the clock of the IMU lags that of the pose by {found.lag_s:.3f} s;"
+            f" set imu.time.offset: {offset:.3f}",
+        )
+        return finding, edit_field(description, "imu.time.offset", offset)
+    start = data.start(description.imu, description) - data.start(description.wrench, description)
+    scale = 1 / (1 + found.drift)
+    lag = scale * (found.lag_middle_s + found.drift * (start - found.middle_s))
+    offset, factor = time.offset - lag, scale * time.scale
+    finding = Finding(
+        "clock",
+        f"the clock of the IMU lags that of the pose by {lag:.3f} s at its first row and by"
+        f" {1e3 * found.drift:.3g} ms more each second ({found.lag_s:.3f} s is the best constant);"
+        f" set imu.time.offset: {offset:.3f} and imu.time.scale: {factor:.6f}",
+    )
+    edited = edit_field(description, "imu.time.offset", offset)
+    return finding, edit_field(edited, "imu.time.scale", factor)

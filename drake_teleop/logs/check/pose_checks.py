@@ -1,0 +1,188 @@
+"""Unit and frame of the poses, checked with the accelerometer or with the wrench."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.vectors import cross_matrix
+from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.check.log_data import LogData
+from drake_teleop.logs.pose_motion.poses import Posed
+from drake_teleop.logs.read.alignment import low_pass, resample
+from drake_teleop.logs.read.canonical import Log
+from drake_teleop.logs.read.description import UNITS, Description
+
+if TYPE_CHECKING:
+    from drake_teleop.logs.pose_motion.estimate import PoseEstimate
+
+Array = NDArray[np.float64]
+_CUTOFF_HZ = 3.0
+_WORST_CONDITION = 1e8
+_SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
+_SIGNIFICANT = 5.0  # standard deviations
+_POSITION_UNITS = {"mm": 1e-3, "m": 1e3}
+_UNIT_RANGE, _UNIT_ERROR = (0.7, 1.43), 0.15
+_UNKNOWN_UNIT = 50.0
+SHORTEST_S = 4.0
+"""Shorter records have too few frequencies for an estimate by poses alone [s]."""
+_UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
+_TORQUE_UNITS = ("N m", "N mm", "lbf in")
+_TORQUE_RATIOS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(_TORQUE_UNITS, 2))
+_SAME_COM = 0.03
+
+
+def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
+    """Return a finding for positions in another unit, or of another point than So.
+
+    In S, a_P = k (a_S + alpha x r + omega x (omega x r)) with the unit k and the point r.
+    """
+    imu, pose = description.imu, description.pose
+    if imu is None or pose is None or imu.specific_force is None or pose.position is None:
+        return []
+    if imu.automatic or pose.automatic:
+        return []
+    sensed = data.thin(description)
+    posed = data.thin(description.model_copy(update={"imu": None}))
+    if sensed.gravity is None or posed.gravity is None:
+        return []
+    # Both logs begin with the wrench, so that their times are on one clock.
+    t = sensed.t[(sensed.t + lag <= sensed.t[-1]) & (sensed.t + lag >= sensed.t[0])]
+    t = t[(t >= posed.t[0]) & (t <= posed.t[-1])]
+    g = resample(t, posed.t, posed.gravity)
+    by_pose = resample(t, posed.t, posed.specific_force) + g
+    s, omega, alpha = (resample(t + lag, sensed.t, x) for x in sensed.motion)
+    turning = np.stack([cross_matrix(w) @ cross_matrix(w) for w in omega])
+    turning += np.stack([cross_matrix(x) for x in alpha])
+    columns = np.concatenate([(s + g)[:, :, None], turning], axis=2)
+    columns, by_pose = (low_pass(x, sensed.dt, _CUTOFF_HZ) for x in (columns, by_pose))
+    inner = slice(len(t) // 50, len(t) - len(t) // 50)
+    fit = _fit_with_offset(columns[inner], by_pose[inner], 2.0 * _CUTOFF_HZ * float(t[-1] - t[0]))
+    if fit is None or abs(fit[0][0]) <= _SIGNIFICANT * fit[1][0]:
+        return []
+    x, deviations = fit
+    k = float(x[0])
+    unit = _position_unit(pose.position.unit, 1.0 / k, float(deviations[0]) / k**2)
+    if unit is not None:
+        return [unit]
+    shift, deviation = x[1:] / k, float(np.linalg.norm(deviations[1:]))
+    size = float(np.linalg.norm(shift))
+    if abs(k - 1.0) > _UNIT_ERROR or deviation > _LARGEST_DEVIATION:
+        return []
+    if size < max(_SMALLEST_SHIFT, _SIGNIFICANT * deviation):
+        return []
+    place = np.round(shift + np.array(pose.position_in_sensor), 4) + 0.0
+    return [
+        Finding(
+            "pose frame",
+            f"the pose's origin is {1e3 * size:.0f} mm (+- {1e3 * deviation:.2g}) from the"
+            f" accelerometer; if imu.position is right, set pose.position_in_sensor:"
+            f" {place.tolist()}, otherwise set imu.position: {(0.0 - place).tolist()}",
+        )
+    ]
+
+
+def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
+    """Return a finding for positions in another unit than `now`.
+
+    `kappa` is the acceleration of another instrument over that of the positions.
+    """
+    if not abs(kappa) > _SIGNIFICANT * deviation:
+        return None
+    text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
+    for unit, ratio in _POSITION_UNITS.items():
+        if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
+            return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
+    if 1.0 / _UNKNOWN_UNIT < abs(kappa) < _UNKNOWN_UNIT:  # noise or another error
+        return None
+    return Finding(
+        "units",
+        f"{text} they are neither in mm nor in m; multiply pose.position.scale (1 by default) by"
+        f" {kappa:.3g}",
+    )
+
+
+def _fit_with_offset(
+    columns: Array, target: Array, independent: float
+) -> tuple[Array, Array] | None:
+    """Solve columns (N, c, k) x + offsets (c,) = target (N, c).
+
+    Returns:
+        x (k,) and its standard deviations, None if x is undetermined.
+    """
+    if len(columns) == 0:
+        return None
+    columns, target = columns - columns.mean(axis=0), target - target.mean(axis=0)
+    A, b = columns.reshape(-1, columns.shape[2]), target.ravel()
+    size = np.linalg.norm(A, axis=0)
+    if (size == 0.0).any():
+        return None
+    gram = (A / size).T @ (A / size)
+    if np.linalg.cond(gram) > _WORST_CONDITION:
+        return None
+    inverse = np.linalg.inv(gram)
+    x = inverse @ ((A / size).T @ b)
+    variance = float(np.sum((b - (A / size) @ x) ** 2)) / (target.shape[1] * max(1.0, independent))
+    return x / size, np.sqrt(variance * np.diag(inverse)) / size
+
+
+def usable(log: Log) -> bool:
+    """Return whether the poses of a log suffice for its motion."""
+    return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
+
+
+def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
+    """Return a finding for positions in another unit, or for a pose frame that is not S."""
+    assert log.posed is not None
+    pose = None if log.described is None else log.described.pose
+    seen = found.seen
+    if pose is not None and pose.position is not None and seen.usable and not seen.mirrored:
+        unit = _position_unit(pose.position.unit, seen.kappa, seen.kappa_deviation)
+        if unit is not None:
+            return unit
+    return frame_finding(found, log.posed)
+
+
+def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
+    """Return the finding for a displaced or rotated pose frame, unless another error is likely."""
+    frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
+    if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
+        return None
+    unit = abs(seen.kappa - 1.0) > max(_UNIT_TOLERANCE, 5.0 * seen.kappa_deviation)
+    if (
+        unit
+        or (seen.usable and seen.mirrored)
+        or _is_torque_unit(phi[1:4] / phi[0], frame.p_SoPo_S)
+    ):
+        return None
+    place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
+    texts, lines = [], []
+    if frame.shifted:
+        shift = ", ".join(f"{1e3 * x:.1f}" for x in frame.p_SoPo_S)
+        deviation = 1e3 * float(frame.position_deviations.max())
+        texts.append(
+            f"its origin is [{shift}] mm from that of S in the axes of S (+- {deviation:.2g})"
+        )
+        lines.append(f"pose.position_in_sensor: {_rounded(place)}")
+    if frame.turned:
+        angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(frame.R_SP) - 1.0), -1.0, 1.0)))
+        deviation = float(frame.turn_deviations_deg.max())
+        texts.append(f"its axes are turned by {angle:.1f} deg (+- {deviation:.2g})")
+        lines.append(f"pose.rotation_in_sensor: {_rounded(frame.R_SP @ posed.R_SP)}")
+    return Finding(
+        "pose frame",
+        f"the pose is not that of S: {', and '.join(texts)}; set {' and '.join(lines)}",
+    )
+
+
+def _is_torque_unit(com: Array, shift: Array) -> bool:
+    size = float(np.linalg.norm(com))
+    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _TORQUE_RATIOS]
+    return not _NEAREST_COM < size < _FARTHEST_COM or bool(min(off) < _SAME_COM * size)
+
+
+def _rounded(x: Array) -> list[Any]:
+    return list((np.round(x, 4) + 0.0).tolist())
