@@ -1,29 +1,27 @@
-"""`drake-teleop analyze`: is a station stable, for whom, and how transparent is it?
+"""`drake-teleop analyze`: stability and transparency of a station at rest, along one direction.
 
-Along one direction of the task, at rest. The two-port between hand and environment is that of the
-Diagram itself, linearised; the closed form of one axis stands beside it. `summary.json` holds
+The two-port between hand and environment is that of the linearised Diagram. `summary.json` contains
 
 ============ ==================================================================================
-scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (its
-             leaf or wall, or else the paper's 5.1 kN/m), wall_is (which of them)
-axis         the numbers of `analysis.one_axis.OneAxis`, and tool_coupling
-diagram      list: operating point, states, stable, decay_1_per_s (of what dies last),
+scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (of its
+             leaf or wall, otherwise the paper's 5.1 kN/m), wall_is (source of this value)
+axis         fields of `analysis.one_axis.OneAxis`, and tool_coupling
+diagram      list: operating point, states, stable, decay_1_per_s (of the slowest motion),
              frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
-two_port     greatest deviation of the Diagram's H, hand's mass included, up to 30 Hz: closed_form
-             with the exact delay, sampled with the station's rates as well
-margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: without bound)
+two_port     largest deviation of the Diagram's H, hand's mass included, up to 30 Hz, from the
+             closed_form and the sampled model of one axis
+margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: no limit)
 absolute     absolutely_stable, least_parameter (>= 1 is stable) and at_Hz,
              lacking_damping_Ns_per_m, passive, scattering_norm
 bounded      grips: stiffest wall [N/m] for every hand between the lightest and the firmest grip;
-             each: for each grip alone, as it is; null: no wall is too stiff
-transparency free and wall: mass_kg, damping_Ns_per_m, stiffness_N_per_m of what is felt and of the
-             ideal; unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades;
-             smallest_stiffness_N_per_m
+             each: for each grip alone; null: no limit
+transparency free and wall: mass_kg, damping_Ns_per_m, stiffness_N_per_m, displayed and ideal;
+             unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades; smallest_stiffness_N_per_m
 z_width      device's damping and rate; list: wall_damping, passive_N_per_m, stable_N_per_m
-maps         list: x, y, stable (share of the map), boundary (places)
+maps         list: x, y, stable (fraction of the map), boundary (points)
 measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
-             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation
-             (hand's mass included); null if free motion is unstable
+             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation;
+             null if free motion is unstable
 verdict      list of short sentences
 ============ ==================================================================================
 """
@@ -75,7 +73,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_PRESSED = 5e-3  # m, how deep the hand presses into the leaf
+_PRESSED = 5e-3  # m, depth in the leaf
 
 
 def analyze_command(
@@ -86,23 +84,19 @@ def analyze_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Analyses a scenario; writes summary.json, report.html and its pictures.
+    """Analyse a scenario; write summary.json, report.html and its pictures into `out`.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
-        out: the folder.
         direction: x, y or z of the world.
         quiet: no progress bars and no tables.
-        progress: False for no progress bars alone.
+        progress: False hides only the progress bars.
 
     Returns:
         The summary, see the top of this module.
-
-    Raises:
-        DrakeTeleopError: for a scenario that cannot be, or cannot be linearised.
     """
     setup = LoadScenario(scenario)
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # before the work, so that a bad path fails early
     summary, curves = analyze(setup, direction, progress and not quiet)
     summary = {"scenario": str(scenario), **summary}
     with output_folder(out):
@@ -116,17 +110,9 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """The figures of a scenario along x, y or z of the world, and its curves.
+    """Return the figures of a scenario along x, y or z of the world, and its curves.
 
-    A method of passivity in the channel is not linear: then the station is analysed without it.
-
-    Args:
-        scenario: of the station.
-        direction: x, y or z.
-        progress: whether bars are shown, or where: see `pages/progress.py`.
-
-    Raises:
-        DrakeTeleopError: see `analyze_command`.
+    A passivity method, which is not linear, is left out. `progress`: whether or where to show it.
     """
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
@@ -205,12 +191,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
 
 
 def wall_is(scenario: Scenario, is_known: bool) -> str:
-    """What the wall of the closed forms is: only leaf and wall have a stiffness along one line.
-
-    Args:
-        scenario: with or without something to touch.
-        is_known: whether that has a stiffness.
-    """
+    """Return the report's description of the wall."""
     if scenario.leaf is not None:
         return "the leaf"
     surroundings = scenario.surroundings
@@ -222,7 +203,7 @@ def wall_is(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """The rates of a scenario."""
+    """Return the rates of a scenario."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -233,11 +214,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 
 def pressing(scenario: Scenario) -> list[float]:
-    """Displacement of the master [m], in B, at which the tip is 5 mm deep in the leaf.
-
-    Raises:
-        DrakeTeleopError: if the motion is not scaled to anything.
-    """
+    """Return the displacement of the master [m], in B, that presses the tip 5 mm into the leaf."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -253,14 +230,17 @@ def pressing(scenario: Scenario) -> list[float]:
 
 
 def closed(system: Linearization, scenario: Scenario) -> Linearization:
-    """All loops closed: the operator holds the stylus over the network."""
+    """Return the system with all loops closed."""
     return _network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def held_elsewhere(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Closed but for the hand's grip along the direction, if that is an axis of B; else let go."""
+    """Return the system with all loops closed except the hand's along the direction.
+
+    If the direction is no axis of B, the hand's loop remains open.
+    """
     system = _network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(AXES) if len(aligned) and k != aligned[0]]
@@ -276,7 +256,6 @@ def _network(system: Linearization, scenario: Scenario) -> Linearization:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can say: no numpy, and None for what is not finite."""
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

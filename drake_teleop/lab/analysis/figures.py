@@ -1,4 +1,4 @@
-"""The figures of `drake-teleop analyze`, a function for each part of its summary."""
+"""Figures of `drake-teleop analyze`, one function for each part of its summary."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.scenario import Scenario, replace
 
 Array = NDArray[np.float64]
-#: N/m, before which the margins are taken; the scenario's own leaf comes on top of them.
+#: N/m, walls of the table of margins, in addition to the scenario's own.
 WALLS = (0.0, 1000.0, 5100.0, 20000.0)
-BAND = 2 * np.pi * 30.0  #: rad/s, up to which models are compared
+BAND = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S: Complex = 1j * OMEGA.astype(complex)
-_FELT_BAND = 2 * np.pi * 5.0  # rad/s, up to which mass, damping and stiffness are fitted
-_NOTHING = 1e-9  # a loop that is nowhere larger than this is none
-_PIXELS = 80  # of a map, each way
+_FELT_BAND = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
+_NOTHING = 1e-9  # largest |L| that counts as no loop
+_PIXELS = 80  # of a map, in each direction
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def held_by(axis: OneAxis, grip: str) -> OneAxis:
-    """The axis with another grip of the hand."""
+    """Return the axis with another grip of the hand."""
     hand = GRIPS[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
@@ -59,9 +59,9 @@ def held_by(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Whether an operating point is stable, and what of it dies last.
+    """Return whether an operating point is stable, and its slowest motion.
 
-    Beyond a second or so of delay the Diagram's multipliers are too many; then one axis says it.
+    Above `MOST_STATES` states (about a second of delay) only one axis is analysed.
     """
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
@@ -88,7 +88,7 @@ def _dying(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """How far the Diagram's two-port is from the closed form, and from the sampled one.
+    """Return the deviations of the Diagram's two-port from the closed and the sampled form.
 
     The hand's mass moves with the stylus and is compared as a part of the device.
     """
@@ -106,7 +106,7 @@ def deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[st
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Gain, phase and round trip of the sampled loop, for each grip before each wall."""
+    """Return the margins of the sampled loop for each grip and wall."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIPS:
@@ -133,7 +133,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """For anything passive at either end: Llewellyn; Raisbeck and scattering on scaled ports."""
+    """Return criteria for passive loads; passivity on scaled ports."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -149,7 +149,7 @@ def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
 
 
 def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """The stiffest wall before which hands are stable: all between two grips, and each alone."""
+    """Return the stiffest stable wall for all hands between two grips, and for each grip."""
     hands = absolute_stability.range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {grip: _stiffest(held_by(axis, grip), sampling) for grip in GRIPS}
@@ -157,7 +157,7 @@ def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, 
 
 
 def _stiffest(axis: OneAxis, sampling: Sampling) -> float:
-    """[N/m] up to which every wall is stable; 0 if free motion is not; inf beyond the grid."""
+    """Return the stiffness up to which walls are stable [N/m]; 0 if free motion is unstable."""
     tried = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": tried, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)
@@ -166,7 +166,7 @@ def _stiffest(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """What is felt in free motion and of the wall, next to what should be."""
+    """Return displayed and ideal impedance in free motion and at the wall."""
     fitted = OMEGA <= _FELT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
@@ -196,7 +196,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Virtual walls that the device itself could render at the hand's rate."""
+    """Return the virtual walls that the device itself could render."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -225,9 +225,9 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """What the hand feels in free motion, simulated with all of the sensor's noise.
+    """Return the impedance displayed in free motion, simulated with all noise of the sensor.
 
-    Coulomb friction of device and arm is left out here too: what it does depends on the amplitude.
+    Coulomb friction is left out: its effect depends on the amplitude.
     """
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
@@ -236,7 +236,7 @@ def measured_figures(
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0
     found = measure_frequency_response(smooth, along, _MULTI_SINE, load_estimate=estimate)
-    # Of a force that is held for a period, the share of the frequency itself, as in the two-port.
+    # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
     # The hand's mass moves with the stylus and belongs to the hand.
@@ -255,7 +255,7 @@ def measured_figures(
 def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
-    """Title -> grip -> stability over two parameters."""
+    """Return title -> grip -> map."""
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _PIXELS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)

@@ -1,8 +1,4 @@
-"""How far a loop with a delay is from its limit: gain, phase and delay margins.
-
-`margins` of loops of known coefficients, exactly but for the gain margin's search;
-`margins_of_response` of loops that are known by their frequency response only.
-"""
+"""Gain, phase and delay margins of a loop with delay."""
 
 from __future__ import annotations
 
@@ -27,32 +23,25 @@ from drake_teleop.lab.analysis.polynomials import Array
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of a loop or of each loop of a grid (...); those of an unstable loop are 1, 0 and 0.
+    """Margins of a loop, or of each loop of a grid (...); an unstable loop has 1, 0 and 0.
 
-    Args:
-        unstable_poles: of the closed loop.
-        gain, gain_frequency: factor by which L may grow, and where it then meets -1 [rad/s].
-        phase, phase_frequency: by which L may turn either way [rad], and where [rad/s].
-        delay, delay_frequency: that may be added [s], and where [rad/s].
-
-    Where there is no limit the margin is inf and its frequency NaN.
+    Without a limit the margin is inf and its frequency NaN.
     """
 
-    unstable_poles: Array
-    gain: Array
-    gain_frequency: Array
-    phase: Array
-    phase_frequency: Array
-    delay: Array
-    delay_frequency: Array
+    unstable_poles: Array  #: of the closed loop
+    gain: Array  #: factor by which L may grow
+    gain_frequency: Array  #: where L then reaches -1 [rad/s]
+    phase: Array  #: rotation of L to -1, in either direction [rad]
+    phase_frequency: Array  #: [rad/s]
+    delay: Array  #: that may be added [s]
+    delay_frequency: Array  #: [rad/s]
 
 
 def margins(loop: DelayedLoop) -> Margins:
-    """Gain, phase and delay margins with the delay exact.
+    """Return the margins of a loop with known coefficients; the delay is exact.
 
-    Phase and delay margins follow from the exact gain crossings. The phase crossings of the gain
-    margin are bracketed on a grid of frequencies and bisected, for one loop at a time: for large
-    grids of parameters take `delay_margin` and `unstable_poles`.
+    The gain margin needs a grid of frequencies for each loop: for large grids of parameters use
+    `delay_margin` and `unstable_poles`.
     """
     unstable = unstable_poles(loop)
     stable = unstable == 0
@@ -81,19 +70,15 @@ def margins_of_response(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Margins:
-    """The margins of loops that are known by their frequency response, measured or sampled.
+    """Return the margins of loops from their frequency responses, measured or sampled.
 
-    Between frequencies, log |L| and the phase are taken as linear in log w: an error of the second
-    order in the spacing. The response of a control.FrequencyResponseData is its `frdata[0, 0]`.
+    log |L| and the phase are interpolated linearly in log w.
 
     Args:
-        omega: (n,) [rad/s], rising, positive.
-        response: L(jw) or L(e^(jw Ts)), (n, ...).
-        delay: (...) [s], to be added to the response, exactly.
+        omega: (n,) [rad/s], increasing, positive.
+        response: L(jw) or L(e^(jw Ts)), (n, ...), as `frdata[0, 0]` of a control.FRD.
+        delay: (...) [s], added to the response, exactly.
         open_loop_poles, poles_at_origin, sampled: as in `encirclements`.
-
-    Raises:
-        DrakeTeleopError: frequencies that do not rise from above zero; else as in `encirclements`.
     """
     omega = np.asarray(omega, dtype=float)
     if omega.ndim != 1 or not np.all(np.diff(omega, prepend=0.0) > 0):
@@ -132,9 +117,9 @@ def margins_of_response(
 
 
 def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
-    """The least factor above 1 that puts a single L on -1 and its frequency, inf for the tail."""
+    """Return the least factor above 1 that puts a single L on -1, and its frequency."""
     slow, fast = break_frequencies(loop)
-    # Past the last pole |L| falls, and with a delay its phase passes -pi within one turn of that.
+    # Above the last pole |L| falls, and with a delay its phase passes -pi within one turn.
     delay = float(loop.delay)
     turn = 2 * np.pi / (delay if delay > 1e-9 / fast else 1e-3 / fast)
     omega = frequency_grid(loop, slow, 3 * fast + 2 * turn)
@@ -157,7 +142,7 @@ def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
 
 
 def _zero_between(value: Array) -> Array:
-    """Fraction of each step (n - 1, ...) at which the value passes zero, NaN where it does not."""
+    """Return the fraction of each step at which the value is zero, else NaN."""
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)

@@ -1,4 +1,4 @@
-"""Nyquist's curve: unstable poles of a loop that is known by its frequency response only."""
+"""Nyquist's criterion for a loop that is known by its frequency response."""
 
 from __future__ import annotations
 
@@ -17,19 +17,18 @@ def encirclements(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Array:
-    """Unstable closed-loop poles (...), from the turns of 1 + L about the origin.
+    """Return the unstable closed-loop poles (...), from the turns of 1 + L about the origin.
 
-    A continuous response must reach so far that |L| < 1 from there on: 1 + L then stays in the
-    right half plane and turns no more. A sampled one must reach half the sampling rate.
+    A continuous response must extend to where |L| < 1 remains, a sampled one to half the sampling
+    rate.
 
     Args:
-        response: L at rising frequencies from near zero on, (n, ...).
-        open_loop_poles: of L, in the right half plane or outside the unit circle.
+        response: L at increasing frequencies from near zero, (n, ...).
+        open_loop_poles: unstable poles of L.
         poles_at_origin: of L, at s = 0 or z = 1; the contour passes them on the unstable side.
-        sampled: the response is that of a sampled loop.
 
     Raises:
-        DrakeTeleopError: the frequencies are too coarse to follow 1 + L, or end too early.
+        DrakeTeleopError: the frequencies are too coarse, or end too early.
     """
     difference = 1 + np.asarray(response, dtype=complex)
     steps = np.angle(difference[1:] / difference[:-1])
@@ -41,7 +40,7 @@ def encirclements(
     if not sampled and not np.all(np.abs(difference[-1] - 1) < 1):
         raise DrakeTeleopError("|L| is not below 1 at the last frequency", remedy="go further up")
     start, end = np.angle(difference[0]), np.angle(difference[-1])
-    # At s = 0 itself, or right of the poles there, 1 + L is real.
+    # At s = 0, or right of poles there, 1 + L is real.
     start_turn = start + poles_at_origin * np.pi / 2
     turn = np.sum(steps, axis=0) + start_turn - np.pi * np.round(start_turn / np.pi)
     turn = turn - poles_at_origin * np.pi / 2
@@ -51,13 +50,7 @@ def encirclements(
 
 
 def nyquist_frequencies(loop: DelayedLoop) -> Array:
-    """Frequencies [rad/s] that suffice to draw or count: 1 + L turns by less than 30 deg a step.
-
-    They reach beyond the last gain crossing of the loop, which is a single one.
-
-    Raises:
-        DrakeTeleopError: 1 + L passes so close to the origin that no grid resolves it.
-    """
+    """Return frequencies [rad/s] of a single loop between which 1 + L turns by less than 30 deg."""
     slow, fast = break_frequencies(loop)
     crossing, _ = gain_crossings(loop)
     omega = frequency_grid(loop, slow, float(np.nanmax(1.5 * crossing, initial=fast)))
@@ -71,13 +64,13 @@ def nyquist_frequencies(loop: DelayedLoop) -> Array:
 
 
 def break_frequencies(loop: DelayedLoop) -> tuple[float, float]:
-    """Least and largest magnitude of a single loop's poles without the delay, none at 0."""
+    """Return least and largest magnitude of the poles without delay, except 0."""
     breaks = np.abs(roots_of(loop.denominator))
     breaks = breaks[breaks > 0]
     return float(np.min(breaks, initial=1.0)), float(np.max(breaks, initial=1.0))
 
 
 def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
-    """Frequencies up to the top between which neither L nor its delay turns by much."""
+    """Return frequencies up to the top between which L and its delay turn little."""
     step = np.pi / 8 / max(float(loop.delay), 1 / top)
     return np.union1d(np.geomspace(1e-3 * slow, top, 1000), np.arange(step, top, step))

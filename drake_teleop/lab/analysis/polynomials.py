@@ -13,12 +13,12 @@ Array = NDArray[np.float64]
 
 
 def stack(*coefficients: Any) -> Array:
-    """(..., n) coefficients along the last axis, of n that are broadcast."""
+    """Return broadcast coefficients along the last axis."""
     return np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in coefficients)), axis=-1)
 
 
 def multiply(p: Array, q: Array) -> Array:
-    """Product of polynomials, coefficients along the last axis."""
+    """Return the product of polynomials."""
     n = q.shape[-1]
     grid = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
     product = np.zeros((*grid, p.shape[-1] + n - 1))
@@ -28,13 +28,13 @@ def multiply(p: Array, q: Array) -> Array:
 
 
 def squared_magnitude(p: Array) -> Array:
-    """Coefficients of |p(jw)|^2 in x = w^2: those of p(s) p(-s) with s^2 = -x."""
+    """Return |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
     powers = np.arange(p.shape[-1] - 1, -1, -1)
     return multiply(p, p * (-1.0) ** powers)[..., ::2] * (-1.0) ** powers
 
 
 def value_at(p: Array, x: Any) -> Any:
-    """Horner; p (..., n + 1) and x broadcast over the grid."""
+    """Return p(x) by Horner's method."""
     value = p[..., 0] + 0 * x
     for i in range(1, p.shape[-1]):
         value = value * x + p[..., i]
@@ -42,7 +42,7 @@ def value_at(p: Array, x: Any) -> Any:
 
 
 def roots_of(p: Array) -> Complex:
-    """Roots of polynomials (..., n + 1): (..., n). A leading zero gives a root far away."""
+    """Return the roots (..., n); a leading zero gives a very large root."""
     order = p.shape[-1] - 1
     if order == 0:
         return np.zeros((*p.shape[:-1], 0), dtype=complex)

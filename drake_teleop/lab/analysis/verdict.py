@@ -1,4 +1,4 @@
-"""What the figures of `drake-teleop analyze` say, in words."""
+"""Verdict of `drake-teleop analyze`: its figures in short sentences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """The figures in words: short sentences, each of which can be read alone."""
+    """Return the figures as short sentences, each understandable alone."""
     said = []
     if figures["method"] != "none":
         said += [
