@@ -1,13 +1,7 @@
-"""How much energy the elimination and the delay put into the loop, and the damping that covers it.
+"""Energy that elimination and delay add to the loop, and the damping that compensates it (T43).
 
-In front of an ideal network without a method, the hand feels along one axis
-
-    Z(s) = k_f [gamma k_e / s + sigma m_t s] G(s) e^(-s RTT)
-
-with the slave's closed loop G. The device with damping b is passive with it if and only if the
-damping covers the most negative resistance, b >= -min_w Re Z(j w) (Colgate and Schenkel 1994, for
-the continuous case). Elimination, sigma < 1, takes the second term away, which without delay is
-lossless and with delay is active at high frequency; it cannot change the first one.
+Without elimination the inertia is lossless without delay, and active at high frequency with delay.
+Elimination (sigma < 1) removes it; the contact term remains.
 """
 
 from __future__ import annotations
@@ -21,23 +15,20 @@ _FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """The least damping of the device that covers what delay and slave put in [N s/m].
+    """Return the least damping of the device that makes it passive with delay and slave [N s/m].
 
-    Args:
-        model: masses, servo, wall, scales.
-        round_trip: of the network; the command's interpolation and the held force add 1.5 periods.
+    The command's interpolation and the held force add 1.5 periods to `round_trip`.
     """
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 
 def worst_frequency(model: OneDof, round_trip: float) -> float:
-    """The frequency at which the most damping is needed [Hz]."""
+    """Return the frequency at which the most damping is needed [Hz]."""
     worst = np.argmin(_resistance(model, round_trip))
     return float(_FREQUENCIES[worst] / (2 * np.pi))
 
 
 def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
-    """Re Z at `_FREQUENCIES` [N s/m]."""
     s = 1j * _FREQUENCIES
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness

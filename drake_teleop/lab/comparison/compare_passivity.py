@@ -1,27 +1,22 @@
-"""`drake-teleop compare-passivity`: every method that keeps a station passive, over every network.
+"""`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies, with the same channel:
-
-* The whole 6-DoF station presses on a leaf (`delayed_contact`), for each method, network and leaf.
-* In one degree of freedom the hand lets go while it presses, and taps (`hands`).
-* There too: each method's longest round trip (`one_dof`), for walls of three stiffnesses.
-
-`summary.json` holds
+Three studies use the same channel: the whole station presses on leaves (`delayed_contact`); in one
+degree of freedom the hand lets go and taps (`hands`); there, the longest stable round trip for
+walls of three stiffnesses (`one_dof`). `summary.json` contains
 
 ========= ======================================================================================
-decision  list: method, network, verdict (`decision`); felt_N, and pressed_N that should be,
-          before each leaf; leaked_J: all of it null or empty if unstable
-station   list of runs: method, network, leaf, and the figures of `one_dof.Figures`, the energy
-          between hand and actual motion; pressed_force: what should be felt [N]; felt_share of it;
-          left_behind [m]; leaked [J], these three never negative. A run that is not at rest in its
-          hold ends there (left_behind and drift are null); `error` says why one ended earlier (its
-          other figures are then null)
-hands     list: method, network, and the figures of `hands.Hands`
-one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
-          to which every one was stable (0: none was), and grid_s, the round trips tried
-covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
-          has created in one run; damping_Ns_per_m: what the device needs so that it creates none
-networks, methods, scenario, seed  as asked for
+decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
+          leaked_J: all of it null or empty if unstable
+station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
+          hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
+          left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
+          (left_behind and drift are null); `error` says why a run ended early (others are null)
+hands     list: method, network, fields of `hands.Hands`
+one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
+          grid_s were stable (0: none)
+covering  list: sigma, round_trip_s, wall_N_per_m; injected_J, energy created in one run without
+          a method; damping_Ns_per_m of the device that prevents it
+networks, methods, scenario, seed  as requested
 ========= ======================================================================================
 """
 
@@ -60,21 +55,21 @@ from drake_teleop.station.simulation import MakeSimulator, advance, read_log
 from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
-#: Round trips that are tried in one degree of freedom [s].
+#: Round trips of the study in one degree of freedom [s].
 ROUND_TRIPS = (
     *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
 )
 WALLS = (500.0, 5100.0, 20000.0)  #: N/m
 IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
-"""(jitter, loss) of the networks that are tried in one degree of freedom."""
+"""(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
 _COVERED = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
-#: Of the station: a quarter of the shipped scenarios' for the sensor, half for the rest.
+#: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
-#: s; events cut it. One of their period would often end a rounding before them: a step of its own.
+#: s; longer than the events' period, to avoid extra steps of one rounding error before them.
 _LONGEST_STEP = 2e-3
-#: m/s, at which the leaf's friction is complete: Drake's own, as of all other surroundings. At the
-#: leaf's tenth of it a tip that rests takes 9,000 to 16,000 steps a second instead of 1,500.
+#: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
+#: needs 9,000 to 16,000 steps per second instead of 1,500.
 _SLIP = 1e-3
 
 
@@ -89,28 +84,22 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compares the methods; writes summary.json, runs.parquet, report.html and its pictures.
+    """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        out: the folder.
-        networks: names of presets.
-        methods: names of methods.
-        scenario: whose station it is, a shipped one or a YAML file: slave, master, sensor, scales,
-            grip; not its rates, its integrator, nor what it touches.
+        networks, methods: by name.
+        scenario: a shipped one or a YAML file; its rates, integrator and environment are not used.
         seed: of sensor and networks.
-        jobs: processes at once; -1: one for each core.
+        jobs: number of processes; -1: one for each core.
         quiet: no progress bars and no tables.
-        progress: False for no progress bars alone.
+        progress: False hides only the progress bars.
 
     Returns:
         The summary, see the top of this module.
-
-    Raises:
-        DrakeTeleopError: for an unknown method or network.
     """
     _check("network", networks, tuple(PRESETS))
     _check("method", methods, METHODS)
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
         let_go = _hands_study(networks, methods, seed, jobs, stage)
@@ -153,7 +142,7 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """The longest of `ROUND_TRIPS` [s] up to which every run is stable; 0 if none is."""
+    """Return the longest of `ROUND_TRIPS` [s] up to which every run is stable, or 0."""
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -166,8 +155,7 @@ def longest_round_trip(
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """The station of a scenario as the comparison has it: with rates and steps of its own, and
-    nothing to touch yet."""
+    """Return the scenario with the comparison's rates and steps, without environment."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_LONGEST_STEP),
@@ -179,12 +167,9 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """One run of the whole station: its row of the table, and what a picture shows of it.
+    """Run the whole station once; return its row of the table and the traces of a picture.
 
-    Args:
-        scenario: rates, sensor, scales and grip.
-        method, network, leaf: by name.
-        estimate: (16,) of the load.
+    `estimate` is (16,) of the load.
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
@@ -212,18 +197,18 @@ def station_run(
 def _as_far_as_it_holds(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, Figures]:
-    """The run and its figures; to the end of the hold alone if it is not at rest there."""
+    """Return a run and its figures; the run ends after the hold if it is not at rest there."""
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release)
     for part in (hold, task):
-        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # to the event's own instant
+        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # exactly to the event
         result = read_log(simulator, settle)
         found = station_figures(result, scenario, part)
         if not found.stable:
             break
-    # After a hold that is not at rest nobody looks what is left behind.
+    # Without rest in the hold the drift is not defined.
     return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
 
 
@@ -231,7 +216,7 @@ def _one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
-    # What is compiled here, processes side by side need not compile each for itself.
+    # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         steps_of(method)
@@ -283,7 +268,7 @@ def _station_study(
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
     base = station_base(scenario, seed)
     estimate = identified_load(base, stage).estimate
-    # The longest runs first, so that no process is left with one at the end.
+    # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAVES, methods))
     results = _each(
@@ -325,7 +310,7 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
 
 
 def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any) -> list[Any]:
-    """The function's result for each case, in order, in several processes."""
+    """Return the function's result for each case, in order, from several processes."""
     from joblib import Parallel, delayed
 
     results = []

@@ -1,12 +1,10 @@
-"""What a press does not show of a method: a hand that lets go while it presses, and one that taps.
+"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`).
 
-In one degree of freedom (`one_dof`), with the station's medium grip and servo, before a wall of 5.1
-kN/m, over the network as it is.
+Medium grip and servo of the station, wall of 5.1 kN/m, network as it is.
 
-* Let go: the hand presses for some round trips and is gone. What is left of the device, 0.15 kg on
-  its own, shows the force that nobody holds against any more.
-* Taps: eight of 30 mm in a row, at each of `RATES`. What is felt of them comes late, or comes from
-  what the method remembers of the wall.
+* Let go: after some round trips of pressing only the device of 0.15 kg remains on the held force.
+* Taps: eight of 30 mm at each of `RATES`. The displayed force is late, or comes from the method's
+  memory of the wall.
 """
 
 from __future__ import annotations
@@ -30,33 +28,23 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 RATES = (1.0, 1.5)  #: of the taps [Hz]
-_TAPS, _DEEP = 8, 0.03  # how many; m, how far to either side of the wall's surface
-_WATCHED = 2.0  # s, for how long one looks at a device that was let go
+_TAPS, _DEEP = 8, 0.03  # number; m, amplitude about the wall's surface
+_WATCHED = 2.0  # s, evaluated after letting go
 
 
 @dataclass(frozen=True)
 class Hands:
-    """One method over one network; nothing here can be negative.
+    """Result of one method over one network; no value is negative."""
 
-    Args:
-        release_force: felt on average in the last 0.1 s before the hand lets go [N].
-        release_speed: the largest of the device in 2 s after that [m/s].
-        release_way: how far it goes in them [m].
-        tap_shares: impulse felt over the wall's, from the second contact on, at each of `RATES`
-            [1]; 0 where what is felt pulls into the wall.
-        leaked: the most that came out between hand and actual motion beyond what the stores held at
-            the start, in any of these runs [J].
-    """
-
-    release_force: float
-    release_speed: float
-    release_way: float
-    tap_shares: tuple[float, ...]
-    leaked: float
+    release_force: float  #: mean on the hand in the last 0.1 s before it lets go [N]
+    release_speed: float  #: largest of the device in 2 s after that [m/s]
+    release_way: float  #: largest displacement in them [m]
+    tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `RATES`
+    leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
 
 
 def hands(method: str, network: str, seed: int = 0) -> Hands:
-    """Lets go and taps with a method over a preset."""
+    """Simulate letting go and taps with a method over a preset network."""
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
     def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:
@@ -93,7 +81,7 @@ def hands(method: str, network: str, seed: int = 0) -> Hands:
 
 
 def _taps(rate: float, round_trip: float) -> NDArray[np.float64]:
-    """(N, 2) position and velocity; at rest on the wall's surface before and after."""
+    """Return (N, 2) position and velocity; at rest on the wall's surface before and after."""
     t = np.arange(round((1.0 + _TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
     moving = (t > 0.0) & (t < _TAPS / rate)
     x = np.where(moving, -_DEEP * np.sin(2 * np.pi * rate * t), 0.0)
@@ -101,16 +89,12 @@ def _taps(rate: float, round_trip: float) -> NDArray[np.float64]:
 
 
 def _share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
-    """Of the wall's impulse, without that of the first contact, which nobody can know of before.
+    """Return the displayed impulse over the wall's, without the first contact.
 
-    Args:
-        run: of taps.
-        scale: of the wall's force to the hand.
-        rate: of the taps [Hz].
-        way: how long a packet travels [s].
+    `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` one way [s].
     """
     first = int(np.argmax(run.wall < 0.0))
-    second = first + round(0.75 / rate / PERIOD)  # half a period before it, and as long after
+    second = first + round(0.75 / rate / PERIOD)  # between first and second contact
     pressed = scale * run.wall[second:].sum()
     felt = run.felt[second + round(way / PERIOD) :].sum()
     return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0

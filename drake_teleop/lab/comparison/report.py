@@ -1,4 +1,4 @@
-"""The report of `drake-teleop compare-passivity`: one page with tables and pictures."""
+"""Report of `drake-teleop compare-passivity`: one page with tables and pictures."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ COLUMNS = (
     ("leaked", "Leaked [mJ]", 1e3, 1),
 )
 
-#: Of the verdicts: mark, colour of the cell, colour of what stands in it. They differ in lightness
-#: too, and the words say the same.
+#: Verdict -> mark, colour of the cell, colour of the text. The cells also differ in lightness.
 VERDICTS = {
     HOLDS: ("✓", "#CBE4F4", BLACK),
     LEAKS: ("⚠", "#FBEBB8", BLACK),
@@ -46,7 +45,7 @@ Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
-    """Writes report.html and decision, hands, runs, energy and limits as PNG into `out`."""
+    """Write report.html and its PNG pictures into `out`."""
     pictures = {
         "decision": draw_decision(summary),
         "hands": draw_hands(summary),
@@ -69,16 +68,16 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """The figures of one run of the station, as printed; a run that ended early has none."""
+    """Return the figures of one run of the station, as text."""
     return [
-        # Adding 0 to what is rounded takes the sign from -0.
+        # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
         for key, _, factor, decimals in COLUMNS
     ]
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    """What becomes of each method (a row) over each network (a column), in words."""
+    """Draw the verdict of each method (a row) over each network (a column)."""
     methods, networks, table = summary["methods"], summary["networks"], decide(summary)
     with house_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
@@ -111,7 +110,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """A hand that lets go and one that taps: a row for each method, a mark for each network."""
+    """Draw letting go and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
@@ -124,7 +123,7 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
         for axes, (title, scale, value) in zip(columns, panels, strict=True):
             for place, network in enumerate(networks):
                 shown = [row for row in rows if row["network"] == network]
-                # Side by side, so that none hides another.
+                # Offsets keep all marks visible.
                 y = [methods.index(row["method"]) + 0.12 * (place - 2) for row in shown]
                 marker, colour = _MARKERS[place % 5], COLOURS[place % len(COLOURS)]
                 x = [max(value(row), 0.0) for row in shown]
@@ -142,7 +141,7 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """What the hand feels over time: a row for each method, a column for each network."""
+    """Draw the displayed force over time: a row for each method, a column for each network."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
@@ -154,7 +153,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """What hand and environment have put in, with what was stored at the start, over time."""
+    """Draw the energy from hand and environment, with the initial one, over time."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
@@ -191,7 +190,7 @@ def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> F
 
 
 def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """The longest stable round trip of each method: a panel for each wall."""
+    """Draw the longest stable round trip of each method: a panel for each wall."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with house_style():
@@ -218,7 +217,7 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """The decision table on the terminal."""
+    """Print the decision table to the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
