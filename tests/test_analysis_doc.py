@@ -16,7 +16,6 @@ from drake_teleop.lab.analysis.absolute_stability import (
     worst_loads,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
-from drake_teleop.lab.analysis.delay_limits import delay_independent_mass, tolerated_mass_error
 from drake_teleop.lab.analysis.delayed_loop import held_device
 from drake_teleop.lab.analysis.linearization import AXES, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
@@ -138,12 +137,12 @@ def test_errors_of_the_load():
     error, sampling = np.arange(0.0, 14.0, 0.01), Sampling(low_pass_hz=500.0)
     for grip, *said in rows("grip | bound, kg"):
         axis = axis_of(grip)
-        device = held_device(axis)
+        m, b, k = held_device(axis)
         wrong = replace(axis, wall_stiffness=0.0, wall_damping=0.0, mass_error=error)
         unstable = unstable_multipliers(cut_loop(wrong, sampling), 0.0) > 0
         found = [
-            tolerated_mass_error(device[0], axis.force_scale, axis.position_scale),
+            m / (axis.force_scale * axis.position_scale),
             error[np.argmax(unstable)],
-            delay_independent_mass(*device) / axis.force_scale,
+            b * np.sqrt(m / k - b**2 / (4 * k**2)) / axis.force_scale,
         ]
         np.testing.assert_allclose(found, [float(x) for x in said], atol=0.06)

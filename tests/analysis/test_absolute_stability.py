@@ -29,9 +29,29 @@ def random_two_ports(n: int, seed: int) -> np.ndarray:
     return H
 
 
+def scanned_resistance(H: np.ndarray) -> np.ndarray:
+    """Return the least Re Z displayed to the hand over all lossless environments [N s/m].
+
+    Each of 8 rounds tries 17 susceptances around the best of the previous round.
+    """
+    h11, h12, h21, h22 = (entry[..., None] for entry in tp.entries(H))
+    scale = np.where(h22.real != 0, np.abs(h22.real), 1.0)
+    step = np.pi / 8
+    angles = np.linspace(-np.pi, np.pi, 17)
+    centre = np.zeros_like(scale)
+    for _ in range(8):
+        tried = centre + angles
+        susceptance = scale * np.tan(tried / 2) - h22.imag
+        resistance = (h11 - h12 * h21 / (h22 + 1j * susceptance)).real
+        best = np.argmin(resistance, axis=-1, keepdims=True)
+        centre = np.take_along_axis(tried, best, axis=-1)
+        angles, step = np.linspace(-step, step, 17), step / 8
+    return np.take_along_axis(resistance, best, axis=-1)[..., 0]
+
+
 def test_llewellyn_agrees_with_trying_lossless_loads():
     H = random_two_ports(5000, 1)
-    stable = (ab.scanned_resistance(H) >= 0) & (H[:, 1, 1].real >= 0)
+    stable = (scanned_resistance(H) >= 0) & (H[:, 1, 1].real >= 0)
     assert np.array_equal(ab.absolutely_stable(H), stable)
     assert 1000 < np.sum(stable) < 4000
     # And with loads at random, which know nothing of the circle that the scan walks on.
@@ -131,7 +151,7 @@ def test_force_and_velocity_through_a_delay():
     # The least resistance of the loads tried, times twice the loss added behind it, is the value.
     loss = 0.37
     lossy = tp.two_port(H[:, 0, 0], H[:, 0, 1], H[:, 1, 0], loss)
-    tried = 2 * loss * ab.scanned_resistance(lossy)
+    tried = 2 * loss * scanned_resistance(lossy)
     np.testing.assert_allclose(ab.llewellyn(H), tried, atol=1e-9)
     np.testing.assert_allclose(ab.llewellyn(H), np.cos(2 * wt) - 1, rtol=1e-9, atol=1e-12)
 
@@ -184,8 +204,8 @@ def test_position_force_is_not_absolutely_stable_even_without_delay():
     some = slice(1000, None, 100)
     less = tp.absorb(H, hand=0.999 * needed)
     more = tp.absorb(H, hand=1.001 * needed)
-    assert np.all(ab.scanned_resistance(less)[some] < 0)
-    assert np.all(ab.scanned_resistance(more)[some] > 0)
+    assert np.all(scanned_resistance(less)[some] < 0)
+    assert np.all(scanned_resistance(more)[some] > 0)
     # The servo that the station has damps its own velocity and asks for much less.
     paper = tp.hybrid(OneAxis(device_damping=0.0), 1j * np.geomspace(0.01, 1e6, 4000))
     assert np.max(ab.required_damping(paper)) == pytest.approx(95.1, abs=0.1)

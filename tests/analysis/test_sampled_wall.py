@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import eigh, toeplitz
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.sampled_wall import (
     _largest,
-    energy_damping,
     friction_stiffness,
     passive_damping,
     passive_damping_of,
@@ -18,7 +18,6 @@ from drake_teleop.lab.analysis.sampled_wall import (
     required_damping,
     sampled_poles,
     stable_stiffness,
-    wall_impulse_response,
 )
 
 PERIOD = 1e-3
@@ -51,6 +50,26 @@ def test_with_damping_and_delay_the_sum_is_only_a_bound():
     assert passive_damping(1000.0, 2.0, PERIOD, 1) == pytest.approx(2.5625, rel=1e-9)
     assert passive_damping(1000.0, 0.2, PERIOD, 3) == pytest.approx(3.30, rel=1e-9)
     assert passive_stiffness(2.0, 0.5, PERIOD, 1) == pytest.approx((7**0.5 - 1) / PERIOD, rel=1e-9)
+
+
+def wall_impulse_response(K: float, B: float, delay: int, samples: int) -> np.ndarray:
+    h = np.zeros(max(samples, delay + 2))
+    h[delay], h[delay + 1] = K + B / PERIOD, -B / PERIOD
+    return h[:samples]
+
+
+def energy_damping(impulse_response: np.ndarray) -> float:
+    """Return the device damping [N s/m] that makes a wall passive over n samples, from its energy.
+
+    The work on the wall in a period is f_k (x_(k+1) - x_k). From rest, the energy is v' W v with
+    mean velocities v and a strictly lower triangular Toeplitz matrix W of the step response. The
+    device dissipates at least b Ts v'v.
+    """
+    step_response = np.cumsum(impulse_response)
+    n = len(step_response)
+    work = toeplitz(np.r_[0.0, step_response[:-1]], np.zeros(n)) * PERIOD**2
+    least = eigh((work + work.T) / 2, eigvals_only=True, subset_by_index=[0, 0])
+    return float(-least[0] / PERIOD)
 
 
 def wall(z, K, B, delay):
@@ -88,7 +107,7 @@ def test_a_wall_of_control():
     filtered.dt = PERIOD
     h = control.impulse_response(filtered, T=PERIOD * np.arange(1500)).outputs * PERIOD
     damping = passive_damping_of(filtered, PERIOD)
-    assert 0.99 * damping < energy_damping(h, PERIOD) <= damping * (1 + 1e-9)
+    assert 0.99 * damping < energy_damping(h) <= damping * (1 + 1e-9)
     assert damping != pytest.approx(0.8, rel=1e-3)
 
 
@@ -99,10 +118,7 @@ def test_a_wall_of_control():
 def test_boundary_in_time(K, B, delay):
     """The least damping that leaves no motion with negative energy, within 1 % of the condition."""
     damping = float(passive_damping(K, B, PERIOD, delay))
-    found = [
-        energy_damping(wall_impulse_response(K, B, PERIOD, delay, n), PERIOD)
-        for n in (50, 200, 600)
-    ]
+    found = [energy_damping(wall_impulse_response(K, B, delay, n)) for n in (50, 200, 600)]
     assert found[0] <= found[1] + 1e-12 <= found[2] + 2e-12
     assert 0.99 * damping <= found[-1] <= damping * (1 + 1e-9)
 
@@ -110,7 +126,7 @@ def test_boundary_in_time(K, B, delay):
 def wall_work(x, K, B, delay, friction=0.0, resolution=None):
     """Work on wall and friction along positions at the samples, x[0] = 0 and at rest before."""
     seen = x if resolution is None else resolution * np.round(x / resolution)
-    h = wall_impulse_response(K, B, PERIOD, delay, len(x))
+    h = wall_impulse_response(K, B, delay, len(x))
     force = np.convolve(h, seen)[: len(x)]
     return np.cumsum(force[:-1] * np.diff(x) + friction * np.abs(np.diff(x)))
 
@@ -259,8 +275,6 @@ def test_a_grid_of_parameters():
         (lambda: stable_stiffness(1.0, 1.0, 0.0, PERIOD, 0.5), "whole number"),
         (lambda: passive_friction(1000.0, 0.0, PERIOD, 0.0), "resolution"),
         (lambda: friction_stiffness(1.0, -0.1, PERIOD, 1e-5), "friction"),
-        (lambda: energy_damping([1.0], -PERIOD), "period"),
-        (lambda: wall_impulse_response(1000.0, 0.0, PERIOD, -1, 10), "whole number"),
         (lambda: required_damping([1.0], [1.0], np.nan), "period"),
     ],
 )

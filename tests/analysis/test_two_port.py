@@ -134,6 +134,11 @@ def test_parameters_may_be_arrays():
         assert np.array_equal(together[:, i], tp.hybrid(OneAxis(delay=one, sigma=0.5), S))
 
 
+def hybrid_of_chain(A: np.ndarray) -> np.ndarray:
+    a11, a12, a21, a22 = tp.entries(A)
+    return tp.two_port(a12 / a22, a11 - a12 * a21 / a22, -1 / a22, a21 / a22)
+
+
 def test_wave_line_is_the_delay_of_the_waves():
     b, delay = 3.7, 0.023
     for s, H in zip(S[::20], tp.wave_line(S, delay, b)[::20], strict=True):
@@ -219,7 +224,7 @@ def test_conversions_relate_the_same_forces_and_velocities():
     for there, back in (
         (tp.impedance, tp.impedance),
         (tp.admittance, tp.admittance),
-        (tp.chain, tp.hybrid_of_chain),
+        (tp.chain, hybrid_of_chain),
     ):
         np.testing.assert_allclose(back(there(H)), H, rtol=1e-9)
 
@@ -232,7 +237,7 @@ def test_absorbed_impedances_are_what_hand_and_environment_were():
     np.testing.assert_allclose(tp.transmitted_impedance(inside, there), whole, rtol=1e-9)
     # A delay line behind a device is their chain.
     line, device = tp.wave_line(S, 0.01, 2.0), tp.two_port(0.15 * S + 0.5, 1.0, -1.0, 0.0)
-    chained = tp.hybrid_of_chain(tp.chain(device) @ tp.chain(line))
+    chained = hybrid_of_chain(tp.chain(device) @ tp.chain(line))
     np.testing.assert_allclose(chained, tp.absorb(line, hand=0.15 * S + 0.5), rtol=1e-9, atol=1e-9)
 
 

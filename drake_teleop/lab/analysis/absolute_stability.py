@@ -168,23 +168,6 @@ def _square(z: Complex) -> Real:
     return z.real**2 + z.imag**2
 
 
-def scanned_resistance(H: Complex) -> Real:
-    """Search the least Re Z displayed to the hand over lossless environments [N s/m]."""
-    h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
-    scale = np.where(h22.real != 0, np.abs(h22.real), 1.0)
-    step = np.pi / 8
-    angles = np.linspace(-np.pi, np.pi, 17)
-    centre = np.zeros_like(scale)
-    for _ in range(8):
-        tried = centre + angles
-        susceptance = scale * np.tan(tried / 2) - h22.imag
-        resistance = (h11 - h12 * h21 / (h22 + 1j * susceptance)).real
-        best = np.argmin(resistance, axis=-1, keepdims=True)
-        centre = np.take_along_axis(tried, best, axis=-1)
-        angles, step = np.linspace(-step, step, 17), step / 8
-    return np.take_along_axis(resistance, best, axis=-1)[..., 0]
-
-
 class WorstLoads(NamedTuple):
     """Reactances of the lossless loads that are closest to oscillation, each (...,) [N s/m].
 

@@ -57,7 +57,7 @@ from drake_teleop.lab.analysis.figures import (
 from drake_teleop.lab.analysis.linearization import (
     AXES,
     Linearization,
-    delays,
+    close_network,
     hybrid_along,
     linearize,
 )
@@ -231,7 +231,7 @@ def pressing(scenario: Scenario) -> list[float]:
 
 def closed(system: Linearization, scenario: Scenario) -> Linearization:
     """Return the system with all loops closed."""
-    return _network(system, scenario).close("operator_wrench", "hand_wrench")
+    return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def held_elsewhere(
@@ -241,18 +241,12 @@ def held_elsewhere(
 
     If the direction is no axis of B, the hand's loop remains open.
     """
-    system = _network(system, scenario)
+    system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(AXES) if len(aligned) and k != aligned[0]]
     return system.close(
         [f"operator_wrench.{axis}" for axis in others], [f"hand_wrench.{axis}" for axis in others]
     )
-
-
-def _network(system: Linearization, scenario: Scenario) -> Linearization:
-    forward, backward = delays(scenario)
-    system = system.close("pose_command", "pose_received", forward)
-    return system.close("wrench_B", "wrench_received", backward)
 
 
 def _plain(value: Any) -> Any:

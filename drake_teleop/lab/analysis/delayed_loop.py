@@ -5,14 +5,14 @@ can cross the imaginary axis only at roots of |N(jw)| = |D(jw)|, a polynomial in
 2 pi / w apart and always in the same direction (Walton and Marshall 1987; T59).
 
 If the displayed force contains an acceleration and the servo is ideal, |L| tends to a constant rho
-at high frequency. With rho >= 1 any delay causes infinitely many unstable poles. Parameters that are
-not positive, or N of higher order than D, raise DrakeTeleopError.
+at high frequency. With rho >= 1 any delay causes infinitely many unstable poles.
+
+Parameters that are not positive, or N of higher order than D, raise DrakeTeleopError.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,14 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.polynomials import (
-    Array,
-    multiply,
-    roots_of,
-    squared_magnitude,
-    stack,
-    value_at,
-)
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -96,17 +90,22 @@ class DelayedLoop:
         return np.abs(self.numerator[..., 0] / self.denominator[..., 0])
 
     def _at(self, s: Any) -> Complex:
-        ratio = value_at(self.numerator, s) / value_at(self.denominator, s)
+        ratio = polynomial_value(self.numerator, s) / polynomial_value(self.denominator, s)
         return ratio * np.exp(-s * self.delay)
 
 
 def held_device(axis: OneAxis) -> tuple[Array, Array, Array]:
     """Return mass, damping and stiffness of hand and device together."""
-    return checked_held(
-        np.asarray(axis.hand_mass) + axis.device_mass,
-        np.asarray(axis.hand_damping) + axis.device_damping,
-        axis.hand_stiffness,
+    mass = checked_positive(
+        np.asarray(axis.hand_mass) + axis.device_mass, "mass of hand and device"
     )
+    damping = checked_positive(
+        np.asarray(axis.hand_damping) + axis.device_damping, "damping of hand and device"
+    )
+    stiffness = np.asarray(axis.hand_stiffness, dtype=float)
+    if not np.all(stiffness >= 0):
+        raise DrakeTeleopError("the stiffness of the hand is negative")
+    return mass, damping, stiffness
 
 
 def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
@@ -119,22 +118,22 @@ def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
     if not contact:
         axis = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
     scale = axis.force_scale * axis.position_scale
-    numerator = stack(
+    numerator = stack_coefficients(
         scale * axis.felt_tool_mass,
         scale * axis.gamma * axis.wall_damping,
         scale * axis.gamma * axis.wall_stiffness,
     )
-    denominator = stack(*held_device(axis))
+    denominator = stack_coefficients(*held_device(axis))
     if not axis.ideal_servo:
         slave_mass = checked_positive(axis.slave_mass, "mass of the slave")
         gain = axis.velocity_gain * axis.position_gain
-        servo = stack(
+        servo = stack_coefficients(
             1.0,
             axis.velocity_gain + axis.wall_damping / slave_mass,
             gain + axis.wall_stiffness / slave_mass,
         )
         numerator = numerator * np.asarray(gain)[..., None]
-        denominator = multiply(servo, denominator)
+        denominator = multiply_polynomials(servo, denominator)
     return DelayedLoop(numerator, denominator, np.asarray(2 * axis.delay))
 
 
@@ -147,12 +146,12 @@ def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
     """
     excess = squared_magnitude(loop.denominator) - squared_magnitude(loop.numerator)
     slope = excess[..., :-1] * np.arange(excess.shape[-1] - 1, 0, -1)
-    roots = roots_of(excess)
+    roots = polynomial_roots(excess)
     x = np.where((roots.imag == 0) & (roots.real > 0), roots.real, np.nan)
     for _ in range(2):  # refine the eigenvalues
-        step = value_at(excess[..., None, :], x) / value_at(slope[..., None, :], x)
+        step = polynomial_value(excess[..., None, :], x) / polynomial_value(slope[..., None, :], x)
         x = np.where(np.abs(step) < 1e-3 * x, x - step, x)
-    direction = np.nan_to_num(np.sign(value_at(slope[..., None, :], x)))
+    direction = np.nan_to_num(np.sign(polynomial_value(slope[..., None, :], x)))
     return np.sqrt(x), direction
 
 
@@ -181,11 +180,19 @@ def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]
     if loop.high_frequency_gain >= 1:
         return []
     frequency, direction = gain_crossings(loop)
-    changes = [(0.0, int(_undelayed_count(loop)))]
+    changes = [(0.0, int(_undelayed_count(loop))), (longest, 0)]
     for w, sign, first in zip(frequency, direction, _first_delay(loop, frequency), strict=True):
         if sign:
             changes += [(float(t), 2 * int(sign)) for t in np.arange(first, longest, 2 * np.pi / w)]
-    return joined_windows(changes, longest, inside=lambda count: count == 0)
+    windows: list[tuple[float, float]] = []
+    unstable = 0
+    for (start, change), (end, _) in itertools.pairwise(sorted(changes)):
+        unstable += change
+        if unstable == 0 and end > start:
+            if windows and windows[-1][1] == start:
+                start = windows.pop()[0]
+            windows.append((start, end))
+    return windows
 
 
 def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -213,25 +220,9 @@ def _first_delay(loop: DelayedLoop, frequency: Array) -> Array:
 
 
 def _undelayed_count(loop: DelayedLoop) -> Array:
-    roots = roots_of(loop.numerator + loop.denominator)
+    roots = polynomial_roots(loop.numerator + loop.denominator)
     size = np.max(np.abs(roots), axis=-1, initial=0.0, keepdims=True)
     return np.sum(roots.real > 1e-9 * size, axis=-1).astype(float)
-
-
-def joined_windows(
-    changes: list[tuple[float, int]], longest: float, inside: Callable[[int], bool]
-) -> list[tuple[float, float]]:
-    """Return the joined intervals of [0, longest] where the sum of changes is `inside`."""
-    windows: list[tuple[float, float]] = []
-    changes = sorted([*changes, (longest, 0)])
-    count = 0
-    for (start, change), (end, _) in itertools.pairwise(changes):
-        count += change
-        if inside(count) and end > start:
-            if windows and windows[-1][1] == start:
-                start = windows.pop()[0]
-            windows.append((start, end))
-    return windows
 
 
 def least_along(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
@@ -251,21 +242,51 @@ def angle_of(value: Complex) -> Array:
     return np.arctan2(value.imag, value.real)
 
 
-def checked_held(
-    mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike
-) -> tuple[Array, Array, Array]:
-    """Return mass, damping and stiffness as arrays; raise if not valid."""
-    m = checked_positive(mass, "mass of hand and device")
-    b = checked_positive(damping, "damping of hand and device")
-    k = np.asarray(stiffness, dtype=float)
-    if not np.all(k >= 0):
-        raise DrakeTeleopError("the stiffness of the hand is negative")
-    return m, b, k
-
-
 def checked_positive(value: ArrayLike, what: str) -> Array:
     """Return the value as an array; raise if it is not positive."""
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive")
     return value
+
+
+def stack_coefficients(*coefficients: Any) -> Array:
+    """Return broadcast coefficients along the last axis."""
+    return np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in coefficients)), axis=-1)
+
+
+def multiply_polynomials(p: Array, q: Array) -> Array:
+    """Return the product of polynomials."""
+    n = q.shape[-1]
+    grid = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
+    product = np.zeros((*grid, p.shape[-1] + n - 1))
+    for i in range(p.shape[-1]):
+        product[..., i : i + n] += p[..., i : i + 1] * q
+    return product
+
+
+def squared_magnitude(p: Array) -> Array:
+    """Return |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
+    powers = np.arange(p.shape[-1] - 1, -1, -1)
+    return multiply_polynomials(p, p * (-1.0) ** powers)[..., ::2] * (-1.0) ** powers
+
+
+def polynomial_value(p: Array, x: Any) -> Any:
+    """Return p(x) by Horner's method."""
+    value = p[..., 0] + 0 * x
+    for i in range(1, p.shape[-1]):
+        value = value * x + p[..., i]
+    return value
+
+
+def polynomial_roots(p: Array) -> Complex:
+    """Return the roots (..., n); a leading zero gives a very large root."""
+    order = p.shape[-1] - 1
+    if order == 0:
+        return np.zeros((*p.shape[:-1], 0), dtype=complex)
+    far = 1e-30 * np.max(np.abs(p), axis=-1)
+    lead = np.where(p[..., 0] == 0, np.where(far == 0, 1.0, far), p[..., 0])
+    companion = np.zeros((*p.shape[:-1], order, order))
+    companion[..., np.arange(1, order), np.arange(order - 1)] = 1
+    companion[..., 0, :] = -p[..., 1:] / lead[..., None]
+    return np.linalg.eigvals(companion).astype(complex)

@@ -272,8 +272,12 @@ def linearize_station(
             remedy="linearise with method: none, or identify the frequency response",
         )
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
+    return close_network(cut.close("operator_wrench", "hand_wrench"), scenario)
+
+
+def close_network(system: Linearization, scenario: Scenario) -> Linearization:
+    """Return the system with its loops closed over the network's constant delays."""
     forward, backward = delays(scenario)
-    system = cut.close("operator_wrench", "hand_wrench")
     system = system.close("pose_command", "pose_received", forward)
     return system.close("wrench_B", "wrench_received", backward)
 

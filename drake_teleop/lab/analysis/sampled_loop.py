@@ -89,13 +89,6 @@ def growth_rate(system: Any) -> Any:
     return np.log(np.abs(multipliers(system)).max(axis=-1)) / period
 
 
-def sampled_response(system: Any, frequency: ArrayLike) -> Complex:
-    """Return C (z - A)^-1 B + D (N, outputs, inputs) at z = e^(j w T), w (N,) [rad/s]."""
-    period = system.period if isinstance(system, SampledLoop) else system.dt
-    z = np.exp(1j * np.atleast_1d(np.asarray(frequency, dtype=float)) * period)
-    return _resolvent(system.A, system.B, system.C, z) + system.D
-
-
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
     """Return H (N, 2, 2) of the sampled station with held forces, without hand and wall.
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.delayed_loop import checked_positive
 from drake_teleop.lab.analysis.one_axis import Complex
 
 Array = NDArray[np.float64]
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 
 def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Array:
     """Return the device damping for a wall H(e^(j theta)) at theta in (0, pi] (T62)."""
-    _require_positive(period, "period")
+    checked_positive(period, "period")
     H = np.asarray(response, dtype=complex)
     # Re[(1 - e^(-j theta)) H] / (1 - cos theta), without cancellation
     return period / 2 * (H.real - H.imag / np.tan(np.asarray(angle, dtype=float) / 2))
@@ -68,8 +69,10 @@ def passive_stiffness(
     device_damping: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
     """Return the largest K of a passive wall, 0 if there is none."""
-    b, B = np.broadcast_arrays(_positive(device_damping, "damping of the device"), wall_damping)
-    _require_positive(period, "period")
+    b, B = np.broadcast_arrays(
+        checked_positive(device_damping, "damping of the device"), wall_damping
+    )
+    checked_positive(period, "period")
     K = np.maximum((b + B) / (period * (delay + 0.5)), 0.0)  # upper bound, from theta = 0
     share = _cosines(np.ones_like(K), np.zeros_like(K), period, delay)
     # The required damping is convex in K: Newton's method from above finds the largest root.
@@ -92,8 +95,8 @@ def passive_friction(
     Half a step of error in each sample gives a force error of at most
     Delta / 2 (|K + B / Ts| + |B / Ts|). The device's damping must cover the wall in addition.
     """
-    _require_positive(period, "period")
-    _require_positive(resolution, "resolution of the encoder")
+    checked_positive(period, "period")
+    checked_positive(resolution, "resolution of the encoder")
     rate = np.asarray(wall_damping, dtype=float) / period
     return resolution / 2 * (np.abs(np.asarray(stiffness, dtype=float) + rate) + np.abs(rate))
 
@@ -105,9 +108,9 @@ def friction_stiffness(
 
     Diolaiti, Niemeyer, Barbagli and Salisbury (2006).
     """
-    b = _positive(device_damping, "damping of the device")
-    _require_positive(period, "period")
-    _require_positive(resolution, "resolution of the encoder")
+    b = checked_positive(device_damping, "damping of the device")
+    checked_positive(period, "period")
+    checked_positive(resolution, "resolution of the encoder")
     if np.any(np.asarray(friction) < 0):
         raise DrakeTeleopError("the friction of the device is negative")
     return np.minimum(2 * b / period, 2 * np.asarray(friction) / resolution)
@@ -182,38 +185,9 @@ def sampled_poles(
     return np.linalg.eigvals(step).astype(complex)
 
 
-def wall_impulse_response(
-    stiffness: float, wall_damping: float, period: float, delay: int, samples: int
-) -> Array:
-    """Return h_k of the wall, (samples,) [N/m]."""
-    _require_positive(period, "period")
-    _require_samples(delay)
-    h = np.zeros(max(samples, delay + 2))
-    h[delay] = stiffness + wall_damping / period
-    h[delay + 1] = -wall_damping / period
-    return h[:samples]
-
-
-def energy_damping(impulse_response: ArrayLike, period: float) -> float:
-    """Return the device damping that makes a wall passive over n samples, from its energy.
-
-    The work on the wall in a period is f_k (x_(k+1) - x_k). From rest, the energy is v' W v with
-    mean velocities v and a strictly lower triangular Toeplitz matrix W of the step response. The
-    device dissipates at least b Ts v'v, so b = -(least eigenvalue of the symmetric part of W) / Ts.
-    """
-    from scipy.linalg import eigh, toeplitz
-
-    _require_positive(period, "period")
-    step_response = np.cumsum(np.asarray(impulse_response, dtype=float))
-    n = len(step_response)
-    work = toeplitz(np.r_[0.0, step_response[:-1]], np.zeros(n)) * period**2
-    least = eigh((work + work.T) / 2, eigvals_only=True, subset_by_index=[0, 0])
-    return float(-least[0] / period)
-
-
 def _cosines(K: Array, B: Array, period: float, delay: int) -> Array:
     """Return the coefficients (..., d + 2) of the required damping over cos(i theta)."""
-    _require_positive(period, "period")
+    checked_positive(period, "period")
     _require_samples(delay)
     K, B = np.broadcast_arrays(K, B)
     coefficients = np.zeros((*K.shape, delay + 2))
@@ -258,11 +232,14 @@ def _held_motion(
     """Return Phi (..., 2, 2) and Gamma (..., 2) of position and velocity under held force."""
     from scipy.linalg import expm
 
-    m, b = _positive(mass, "mass of the device"), _positive(damping, "damping of the device")
+    m, b = (
+        checked_positive(mass, "mass of the device"),
+        checked_positive(damping, "damping of the device"),
+    )
     k = np.asarray(stiffness, dtype=float)
     if not np.all(k >= 0):
         raise DrakeTeleopError("the stiffness of the hand is negative")
-    _require_positive(period, "period")
+    checked_positive(period, "period")
     rates = np.zeros((*m.shape, 3, 3))
     rates[..., 0, 1] = 1
     rates[..., 1, 0], rates[..., 1, 1], rates[..., 1, 2] = -k / m, -b / m, 1 / m
@@ -284,15 +261,3 @@ def _closing_stiffness(
 def _require_samples(delay: int) -> None:
     if delay < 0 or delay != int(delay):
         raise DrakeTeleopError("the delay is not a whole number of samples from 0 on")
-
-
-def _require_positive(value: float, what: str) -> None:
-    if not value > 0:
-        raise DrakeTeleopError(f"the {what} is not positive")
-
-
-def _positive(value: ArrayLike, what: str) -> Array:
-    value = np.asarray(value, dtype=float)
-    if not np.all(value > 0):
-        raise DrakeTeleopError(f"the {what} is not positive")
-    return value

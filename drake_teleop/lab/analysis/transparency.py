@@ -31,11 +31,6 @@ class Apparent(NamedTuple):
     stiffness: NDArray[np.float64]  #: N/m
 
 
-def apparent_at_each(felt: Complex, omega: Real) -> Apparent:
-    """Return at each frequency Re Z as damping, and Im Z as mass or as stiffness."""
-    return Apparent(felt.imag / omega, felt.real, -felt.imag * omega)
-
-
 def apparent(felt: Complex, omega: Real) -> Apparent:
     """Return the m s + b + k / s nearest to an impedance (n, ...), by least squares."""
     basis = np.stack([omega, -1 / omega], axis=-1)

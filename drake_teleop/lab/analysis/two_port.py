@@ -134,13 +134,6 @@ def chain(H: Complex) -> Complex:
     return two_port(h12 - h11 * h22 / h21, -h11 / h21, -h22 / h21, -1 / h21)
 
 
-def hybrid_of_chain(A: Complex) -> Complex:
-    """Return H of the chain matrix A."""
-    a11, a12, a21, a22 = entries(A)
-    _must_not_vanish(a22, "hybrid", "the chain's last entry")
-    return two_port(a12 / a22, a11 - a12 * a21 / a22, -1 / a22, a21 / a22)
-
-
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
     """Return S from the waves F + b V to the waves F - b V, with -V_s at the slave's port.
 

@@ -35,7 +35,6 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.common.errors import DrakeTeleopError, meant
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.common.writing import make_folder, output_folder, write_json, write_table
-from drake_teleop.lab.comparison.active_elements import covering_damping
 from drake_teleop.lab.comparison.decision import decide
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAVES,
@@ -44,7 +43,15 @@ from drake_teleop.lab.comparison.delayed_contact import (
     vertical_traces,
 )
 from drake_teleop.lab.comparison.hands import hands
-from drake_teleop.lab.comparison.one_dof import ACTUAL, Figures, OneDof, Task, figures, run_one_dof
+from drake_teleop.lab.comparison.one_dof import (
+    ACTUAL,
+    Figures,
+    OneDof,
+    Task,
+    covering_damping,
+    figures,
+    run_one_dof,
+)
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig

@@ -41,6 +41,7 @@ _FRICTION_SPEED = 5e-3  # m/s, regularisation of the device's Coulomb friction
 _SLAVES_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
+_FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _QUIET = 0.5e-3  # m, peak to peak at rest
 TIP = 0.2  #: m, from the wrist to the tool's tip
 _FREE, _DEPTH = -0.04, 0.02  # m, from the wall: rest, and intended depth
@@ -295,6 +296,27 @@ def figures_of(
         rise_delay=_rise_delay(felt[start:], pressed[start:], steady) * dt,
         least_energy=float(energy.min()),
     )
+
+
+def covering_damping(model: OneDof, round_trip: float) -> float:
+    """Return the least device damping that makes it passive with delay and slave [N s/m] (T43).
+
+    Without elimination (sigma > 0) the delayed inertia is active at high frequency.
+    """
+    return max(0.0, -float(_resistance(model, round_trip).min()))
+
+
+def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
+    """Return Re Z at `_FREQUENCIES` [N s/m]."""
+    s = 1j * _FREQUENCIES
+    D, K = model.servo_damping, model.servo_stiffness
+    slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
+    closed_loop = 1.0 if model.ideal_servo else K / slave
+    # The command's interpolation and the held force add 1.5 periods.
+    late = np.exp(-s * (round_trip + 1.5 * PERIOD))
+    contact = model.gamma * model.wall_stiffness / s
+    felt = model.force_scale * (contact + model.sigma * model.tool_mass * s) * closed_loop * late
+    return np.asarray(felt.real)
 
 
 def _hunting(x: NDArray[np.float64]) -> float:

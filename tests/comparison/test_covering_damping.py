@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison.active_elements import covering_damping, worst_frequency
-from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, run_one_dof
+from drake_teleop.lab.comparison import one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, covering_damping, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
@@ -40,7 +40,8 @@ def test_it_covers_what_delay_puts_in_and_little_more(wall, round_trip):
     model = dataclasses.replace(FIRM, wall_stiffness=wall, sigma=1.0)
     damping = covering_damping(model, round_trip)
     # Before a wall the worst frequency is nearly 0, which takes too long to swing.
-    frequency = max(worst_frequency(model, round_trip), 0.5)
+    worst = one_dof._FREQUENCIES[np.argmin(one_dof._resistance(model, round_trip))]
+    frequency = max(worst / (2 * np.pi), 0.5)
     assert damping > 1.0
     without = work_of_the_hand(model, round_trip, frequency, 0.0)
     assert without < 0.0
