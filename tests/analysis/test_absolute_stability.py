@@ -245,7 +245,7 @@ def roots(axis: OneAxis, hand: np.ndarray, wall: np.ndarray) -> np.ndarray:
     zero = np.zeros_like(b_e)
     device = np.array([m_h + axis.device_mass, b_h + axis.device_damping, k_h])
     slave = np.array([zero + m_s, m_s * kv + b_e, m_s * kv * kp + k_e])
-    force = np.array([zero + axis.felt_tool_mass, axis.gamma * b_e, axis.gamma * k_e])
+    force = np.array([zero + axis.displayed_tool_mass, axis.gamma * b_e, axis.gamma * k_e])
     force *= axis.force_scale * axis.position_scale * m_s * kv * kp
     polynomial = np.zeros((5, len(m_h)))
     for i in range(3):

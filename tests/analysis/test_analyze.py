@@ -23,7 +23,7 @@ PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 def coarse_maps():
     """Maps of few pixels: they are tested by themselves."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(of_summary, "_PIXELS", 12)
+        patch.setattr(of_summary, "_MAP_POINTS", 12)
         yield
 
 

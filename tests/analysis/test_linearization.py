@@ -118,7 +118,7 @@ def exact_two_port(scenario: Scenario, omega):
             A[x] += slope * (moved[0] * T**3 / 6 + moved[1] * T**4 / 24)
             A[x + 1] = V + a * T + slope * (moved[0] * T**2 / 2 + moved[1] * T**3 / 6)
         felt = a + slope * (moved[0] * late + moved[1] * late**2 / 2)
-        A[10] -= axis.force_scale * axis.felt_tool_mass * felt
+        A[10] -= axis.force_scale * axis.displayed_tool_mass * felt
     A[10, 12] += axis.force_scale * axis.gamma
     C = np.zeros((2, 11))
     C[0, 1] = C[1, 3] = C[1, 7] = 1.0

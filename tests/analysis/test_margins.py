@@ -119,7 +119,7 @@ def test_the_loop_is_the_felt_impedance_over_that_of_hand_and_device():
     axis = OneAxis(sigma=0.7, gamma=0.9, mass_error=0.3, wall_damping=40.0, delay=0.02)
     s = 1j * np.geomspace(0.1, 1000, 50)
     G, Y, Z_e = servo_response(axis, s), servo_admittance(axis, s), environment_impedance(axis, s)
-    M, scale = axis.felt_tool_mass, axis.force_scale * axis.position_scale
+    M, scale = axis.displayed_tool_mass, axis.force_scale * axis.position_scale
     # h11 - Z_m and h12 h21 of the position-force two-port, then its transmitted impedance
     inertial = scale * M * s * G * np.exp(-2 * s * axis.delay)
     product = -scale * G * (axis.gamma - M * s * Y) * np.exp(-2 * s * axis.delay)

@@ -9,7 +9,7 @@ from scipy.linalg import eigh, toeplitz
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.sampled_wall import (
-    _largest,
+    _maximum,
     friction_stiffness,
     passive_damping,
     passive_damping_of,
@@ -95,7 +95,7 @@ def test_of_two_peaks_that_are_nearly_alike_the_higher_one_is_taken():
 
     The grid passes it by 0.4 of a step, which costs 1e-4 there.
     """
-    value, angle = _largest(np.array([0.0, 0.0, -5e-6, 0.0, 0.0, 1.0]))
+    value, angle = _maximum(np.array([0.0, 0.0, -5e-6, 0.0, 0.0, 1.0]))
     assert angle == pytest.approx(0.4 * np.pi, abs=1e-5)
     assert value == pytest.approx(1.0 - 5e-6 * np.cos(0.8 * np.pi), abs=1e-10)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.analyze import wall_is
+from drake_teleop.lab.analysis.analyze import describe_wall
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -58,7 +58,7 @@ def test_the_wall_is_a_leaf_or_a_wall_by_itself_or_said_to_be_none(things, stiff
     scenario = replace(Scenario(), environment=things)
     found = OneAxisFromScenario(scenario, (0, 0, 1)).wall_stiffness
     assert found == pytest.approx(stiffness)
-    assert wall_is(scenario, found > 0.0) == what
+    assert describe_wall(scenario, found > 0.0) == what
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])

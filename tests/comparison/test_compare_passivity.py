@@ -30,10 +30,10 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
     monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
     monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
-    monkeypatch.setattr(study, "_COVERED", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
+    monkeypatch.setattr(study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
     # With the load that the runs of the shipped scenario have identified as well.
     task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
-    monkeypatch.setattr(delayed_contact, "task_over", lambda round_trip: task)
+    monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
     compare = study.compare_command  # in this process, which has what was set above
@@ -107,7 +107,7 @@ def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
     bases = []
     monkeypatch.setattr(study, "identified_load", lambda base, stage: SimpleNamespace(estimate=0))
     monkeypatch.setattr(
-        study, "_each", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
+        study, "_run_parallel", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
     )
     study._station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]

@@ -159,12 +159,12 @@ def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> R
     size = np.abs(determinant)
     phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
     d, c = phase * np.conj(d), phase * np.conj(c)
-    sums = _square(a + d) + _square(b - c)
-    differences = _square(a - d) + _square(b + c)
+    sums = _squared_abs(a + d) + _squared_abs(b - c)
+    differences = _squared_abs(a - d) + _squared_abs(b + c)
     return (np.sqrt(sums) + np.sqrt(differences)) / 2
 
 
-def _square(z: Complex) -> Real:
+def _squared_abs(z: Complex) -> Real:
     return z.real**2 + z.imag**2
 
 
@@ -258,7 +258,7 @@ def can_oscillate(
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
     dz, de = np.roll(z, -1, axis=-2) - z, np.roll(e, -1, axis=-1) - e
-    t, u = _edges_meet(h11, h12 * h21, h22, z, dz, e, de)
+    t, u = _edge_crossings(h11, h12 * h21, h22, z, dz, e, de)
     crossing = np.any((t >= 0) & (t <= 1) & (u >= 0) & (u <= 1), axis=(0, -2, -1))
     # No edges cross if one region contains the other.
     felt = transmitted_impedance(H, e[..., 0, 0])
@@ -278,26 +278,26 @@ def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: floa
     z = hand.corners(omega)
     wall: Complex = np.array(damping, dtype=complex)
     stiffer: Complex = np.array(-1j / omega, dtype=complex)[..., None]
-    t, u = _edges_meet(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
+    t, u = _edge_crossings(h11, h12 * h21, h22, z, np.roll(z, -1, axis=-1) - z, wall, stiffer)
     limit = np.min(np.where((t >= 0) & (t <= 1) & (u >= 0), u, np.inf), axis=(0, -1))
     return np.where(hand.contains(-transmitted_impedance(H, wall), omega), 0.0, limit)
 
 
-def _edges_meet(
+def _edge_crossings(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
 ) -> tuple[Real, Real]:
     """Return (2, ...) t and u at which hand z + t dz and wall e + u de oscillate; nan if none."""
     # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u; it is zero where
     # t = -(a + c u) / (b + d u) is real.
-    held, give = z + h11, 1 + h22 * e
-    a, b = held * give - product * e, dz * give
-    c, d = (held * h22 - product) * de, dz * h22 * de
+    hand_side, environment_side = z + h11, 1 + h22 * e
+    a, b = hand_side * environment_side - product * e, dz * environment_side
+    c, d = (hand_side * h22 - product) * de, dz * h22 * de
     # (a + c u) conj(b + d u) as a polynomial of u: its imaginary part vanishes.
     p0, p1, p2 = a * b.conj(), a * d.conj() + c * b.conj(), c * d.conj()
     with np.errstate(divide="ignore", invalid="ignore"):
         half = -(p1.imag + np.copysign(np.sqrt(p1.imag**2 - 4 * p2.imag * p0.imag), p1.imag)) / 2
         u = np.stack([half / p2.imag, p0.imag / half])
-        size = _square(b) + u * (2 * (b * d.conj()).real + u * _square(d))
+        size = _squared_abs(b) + u * (2 * (b * d.conj()).real + u * _squared_abs(d))
         return -(p0.real + u * (p1.real + u * p2.real)) / size, u
 
 
@@ -309,27 +309,27 @@ def bounded_singular_value(
     Sufficient only, but graded: each rectangle is enlarged to discs of five sizes, and the best
     pair of discs counts.
     """
-    z, r1 = (values[..., :, None] for values in _discs(hand.corners(omega)))
-    e, r2 = (values[..., None, :] for values in _discs(environment.corners(omega)))
+    z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
+    e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
-    give = 1 / (1 + h22 * e)
-    felt = z + h11 - h12 * h21 * e * give
-    through = h12 * h21 * give**2 / felt
+    reduction = 1 / (1 + h22 * e)
+    felt = z + h11 - h12 * h21 * e * reduction
+    through = h12 * h21 * reduction**2 / felt
     # (z + r1 d1) + Z_to(e + r2 d2) vanishes for some |d1|, |d2| <= 1 where mu >= 1 of the matrix
     # with this diagonal and this product of the other two.
-    first, second, product = r1 / felt, r2 * (h22 * give - through), -r1 * r2 * through / felt
-    square = _square(first) + _square(second) + 2 * np.abs(product)
-    determinant = 4 * _square(first * second - product)
+    first, second, product = r1 / felt, r2 * (h22 * reduction - through), -r1 * r2 * through / felt
+    square = _squared_abs(first) + _squared_abs(second) + 2 * np.abs(product)
+    determinant = 4 * _squared_abs(first * second - product)
     square += np.sqrt(np.maximum(square**2 - determinant, 0.0))
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_WIDENING = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # of a disc, in half diagonals
+_DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # of a disc, in half diagonals
 
 
-def _discs(corners: Complex) -> tuple[Complex, Real]:
+def _enclosing_discs(corners: Complex) -> tuple[Complex, Real]:
     """Return centres and radii (..., 5) of discs through the two corners with least damping."""
     diagonal = corners[..., 2] - corners[..., 0]
-    right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _WIDENING
+    right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS
     middle = corners[..., 0] + 0.5j * diagonal.imag
     return middle[..., None] + right, np.hypot(right, diagonal.imag[..., None] / 2)

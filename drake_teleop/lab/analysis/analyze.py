@@ -45,13 +45,13 @@ from drake_teleop.lab.analysis.figures import (
     S,
     absolute_figures,
     bounded_figures,
-    deviations,
     diagram_figures,
-    held_by,
     margin_rows,
     measured_figures,
     parameter_maps,
     transparency_figures,
+    two_port_deviations,
+    with_grip,
     z_width_figures,
 )
 from drake_teleop.lab.analysis.linearization import (
@@ -73,7 +73,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_PRESSED = 5e-3  # m, depth in the leaf
+_LEAF_DEPTH = 5e-3  # m, depth in the leaf
 
 
 def analyze_command(
@@ -136,12 +136,14 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     points = [("free motion", free, axis)]
     if scenario.leaf is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.leaf)
-        pressed = linearize(alone, load_estimate=estimate, displacement=pressing(alone))
+        pressed = linearize(alone, load_estimate=estimate, displacement=leaf_displacement(alone))
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    with_hand = hybrid_along(held_elsewhere(free, linear, along), OMEGA, along.hand, along.tool)
+    with_hand = hybrid_along(
+        close_other_directions(free, linear, along), OMEGA, along.hand, along.tool
+    )
     H = absorb(with_hand, hand=-S * axis.hand_mass)
     closed_form = hybrid(axis, S)
     progress(0.3)
@@ -151,13 +153,13 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
-        "wall_is": wall_is(scenario, along.axis.wall_stiffness > 0.0),
+        "wall_is": describe_wall(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            diagram_figures(name, closed(system, linear), on_paper, sampling)
-            for name, system, on_paper in points
+            diagram_figures(name, close_all_loops(system, linear), one_axis, sampling)
+            for name, system, one_axis in points
         ],
-        "two_port": deviations(with_hand, axis, sampling),
+        "two_port": two_port_deviations(with_hand, axis, sampling),
         "margins": margin_rows(axis, sampling, wall[0]),
         "absolute": absolute_figures(H, axis),
         "bounded": bounded_figures(H, axis, sampling),
@@ -179,18 +181,20 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     figures["measured"] = None
     if figures["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        figures["measured"] = measured_figures(linear, along, held_elsewhere(free, linear, along))
+        figures["measured"] = measured_figures(
+            linear, along, close_other_directions(free, linear, along)
+        )
         measured(1.0)
     figures = _plain(figures)
     figures["verdict"] = verdict(figures)
     nyquist = {}
     for grip in GRIPS:
-        loop = cut_loop(held_by(contact, grip), sampling)
+        loop = cut_loop(with_grip(contact, grip), sampling)
         nyquist[grip] = -loop_response(loop, OMEGA, axis.delay)
     return figures, Curves(axis, OMEGA, H, closed_form, wall, nyquist, maps)
 
 
-def wall_is(scenario: Scenario, is_known: bool) -> str:
+def describe_wall(scenario: Scenario, is_known: bool) -> str:
     """Return the report's description of the wall."""
     if scenario.leaf is not None:
         return "the leaf"
@@ -213,7 +217,7 @@ def sampling_of(scenario: Scenario) -> Sampling:
     )
 
 
-def pressing(scenario: Scenario) -> list[float]:
+def leaf_displacement(scenario: Scenario) -> list[float]:
     """Return the displacement of the master [m], in B, that presses the tip 5 mm into the leaf."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
@@ -224,17 +228,17 @@ def pressing(scenario: Scenario) -> list[float]:
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
     tip = NominalSlave(scenario.slave).start_tip
-    way = np.array(scenario.leaf.position) - [0.0, 0.0, _PRESSED] - tip
+    displacement = np.array(scenario.leaf.position) - [0.0, 0.0, _LEAF_DEPTH] - tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    return list(R_WB.T @ way / scaling.translation_scale)
+    return list(R_WB.T @ displacement / scaling.translation_scale)
 
 
-def closed(system: Linearization, scenario: Scenario) -> Linearization:
+def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
     """Return the system with all loops closed."""
     return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
-def held_elsewhere(
+def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
     """Return the system with all loops closed except the hand's along the direction.

@@ -19,11 +19,11 @@ from drake_teleop.lab.analysis.period_map import RECEIVED, SAMPLE, Array, Sampli
 
 # Frequencies of the search, as angles of z: five decades up to half the hand's rate.
 _ANGLES = np.pi * np.logspace(-5, 0, 401)
-_AROUND = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
-_GOLDEN, _GOLDEN_STEPS = 0.6180339887498949, 25
-_MOST_CROSSINGS = 32
+_PEAK_OFFSETS = np.array([-4.0, -2.0, -1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
+_GOLDEN_RATIO, _GOLDEN_STEPS = 0.6180339887498949, 25
+_MAX_CROSSINGS = 32
 _DOUBLINGS, _HALVINGS, _NEWTON_STEPS = 12, 30, 12  # for the growth rate, from 1/s
-_ON_THE_CIRCLE = 1e-9  # distance from 1 at which a multiplier counts as 1
+_UNIT_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class CutLoop:
     ) -> CutLoop:
         """Return the loop of these multipliers, with its crossings of |L| = level."""
         shape, n = opened.shape[:-1], opened.shape[-1]
-        found = np.zeros((3, *shape, _MOST_CROSSINGS))
+        found = np.zeros((3, *shape, _MAX_CROSSINGS))
         _find_crossings(
             opened.reshape(-1, n),
             closed.reshape(-1, n),
             np.full(shape, level).ravel(),
             _ANGLES,
-            found.reshape(3, -1, _MOST_CROSSINGS),
+            found.reshape(3, -1, _MAX_CROSSINGS),
         )
         return cls(opened, closed, np.broadcast_to(period, shape), *found)
 
@@ -96,7 +96,7 @@ def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
     # Whole turns count twice, once for each sign of the frequency; the ends count half.
     around = np.where(loop.angles >= np.pi, np.rint(2 * turns), np.floor(turns) + np.ceil(turns))
-    outside = (np.abs(loop.open) > 1 + _ON_THE_CIRCLE).sum(axis=-1)
+    outside = (np.abs(loop.open) > 1 + _UNIT_TOLERANCE).sum(axis=-1)
     return outside - (loop.signs * around).sum(axis=-1).astype(np.int64)
 
 
@@ -158,8 +158,8 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
             # Roots that are found stay: at a root of P or M itself the slope is not valid.
             z = np.where(found | ~np.isfinite(step), z, z - step)
             found |= np.abs(step) < 1e-10
-    off = np.where(found, np.abs(np.abs(z) / radius - 1), np.inf)
-    z = np.take_along_axis(z, off.argmin(axis=-1)[..., None], axis=-1)[..., 0]
+    distance = np.where(found, np.abs(np.abs(z) / radius - 1), np.inf)
+    z = np.take_along_axis(z, distance.argmin(axis=-1)[..., None], axis=-1)[..., 0]
     return np.where(z.imag < 0, z.conj(), z)
 
 
@@ -179,17 +179,17 @@ def _find_crossings(opened, closed, levels, angles, found):
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
-        value = _loop(zeros, poles, 0.0, 1.0 + _ON_THE_CIRCLE)
+        value = _loop(zeros, poles, 0.0, 1.0 + _UNIT_TOLERANCE)
         before, size = 0.0, abs(value)
         phase = 0.0 if value.real >= 0.0 else math.pi
         if size > level:
             found[0, n, 0], found[1, n, 0], found[2, n, 0] = 0.0, phase, -1.0
             count = 1
-        at, values = _with_extremes(_with_peaks(angles, poles), poles, zeros, level)
+        at, values = _add_extremes(_add_pole_angles(angles, poles), poles, zeros, level)
         for i in range(at.shape[0]):
             angle, value = at[i], values[i]
             last_size, last_phase = size, phase
-            size, phase = abs(value), _unwrapped(value, last_phase)
+            size, phase = abs(value), _unwrapped_phase(value, last_phase)
             if (size > level) != (last_size > level) and count < found.shape[2]:
                 low, high = before, angle
                 while high - low > 1e-12 * high:
@@ -199,7 +199,7 @@ def _find_crossings(opened, closed, levels, angles, found):
                     else:
                         high = middle
                 found[0, n, count] = low
-                found[1, n, count] = _unwrapped(_loop(zeros, poles, low, 1.0), last_phase)
+                found[1, n, count] = _unwrapped_phase(_loop(zeros, poles, low, 1.0), last_phase)
                 found[2, n, count] = 1.0 if size < last_size else -1.0
                 count += 1
             before = angle
@@ -209,12 +209,12 @@ def _find_crossings(opened, closed, levels, angles, found):
 
 
 @njit(cache=True)
-def _with_peaks(angles, poles):
+def _add_pole_angles(angles, poles):
     """Return the angles and more at each pole: peaks of |L| are as narrow as 1 - |pole|."""
-    more = np.empty(_AROUND.shape[0] * poles.shape[0])
+    more = np.empty(_PEAK_OFFSETS.shape[0] * poles.shape[0])
     count = 0
     for pole in poles:
-        for share in _AROUND:
+        for share in _PEAK_OFFSETS:
             angle = abs(math.atan2(pole.imag, pole.real)) + share * abs(1.0 - abs(pole))
             if angles[0] < angle < math.pi:
                 more[count] = angle
@@ -223,7 +223,7 @@ def _with_peaks(angles, poles):
 
 
 @njit(cache=True)
-def _with_extremes(angles, poles, zeros, level):
+def _add_extremes(angles, poles, zeros, level):
     """Return more angles, at extremes of |L| near the level, and L at all angles."""
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
@@ -237,7 +237,7 @@ def _with_extremes(angles, poles, zeros, level):
         if is_extreme and 0.5 * level < size[i] < 2.0 * level:
             low, high = angles[i - 1], angles[i + 1]
             for _ in range(_GOLDEN_STEPS):
-                a, b = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+                a, b = high - _GOLDEN_RATIO * (high - low), low + _GOLDEN_RATIO * (high - low)
                 at_a, at_b = _loop(zeros, poles, a, 1.0), _loop(zeros, poles, b, 1.0)
                 if sign * abs(at_a) > sign * abs(at_b):
                     high = b
@@ -254,6 +254,6 @@ def _with_extremes(angles, poles, zeros, level):
 
 
 @njit(cache=True)
-def _unwrapped(value, near):
+def _unwrapped_phase(value, near):
     phase = math.atan2(value.imag, value.real)
     return phase + 2.0 * math.pi * np.rint((near - phase) / (2.0 * math.pi))

@@ -119,7 +119,7 @@ def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
         axis = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
     scale = axis.force_scale * axis.position_scale
     numerator = stack_coefficients(
-        scale * axis.felt_tool_mass,
+        scale * axis.displayed_tool_mass,
         scale * axis.gamma * axis.wall_damping,
         scale * axis.gamma * axis.wall_stiffness,
     )
@@ -160,7 +160,7 @@ def unstable_poles(loop: DelayedLoop) -> Array:
     frequency, direction = gain_crossings(loop)
     late = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
     crossed = np.ceil(np.clip(np.nan_to_num(late), 0, None))
-    count = _undelayed_count(loop) + 2 * np.sum(direction * crossed, axis=-1)
+    count = _unstable_without_delay(loop) + 2 * np.sum(direction * crossed, axis=-1)
     endless = (loop.delay > 0) & (loop.high_frequency_gain >= 1)
     return np.where(endless, np.inf, count)
 
@@ -180,7 +180,7 @@ def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]
     if loop.high_frequency_gain >= 1:
         return []
     frequency, direction = gain_crossings(loop)
-    changes = [(0.0, int(_undelayed_count(loop))), (longest, 0)]
+    changes = [(0.0, int(_unstable_without_delay(loop))), (longest, 0)]
     for w, sign, first in zip(frequency, direction, _first_delay(loop, frequency), strict=True):
         if sign:
             changes += [(float(t), 2 * int(sign)) for t in np.arange(first, longest, 2 * np.pi / w)]
@@ -198,13 +198,13 @@ def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]
 def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
     """Return the delay margin and the frequency at which a pole reaches the axis."""
     frequency, _ = gain_crossings(loop)
-    past = np.mod(angle_past_minus_one(loop, frequency), 2 * np.pi)
-    margin, at = least_along(past / frequency, frequency)
+    past = np.mod(phase_lag_to_minus_one(loop, frequency), 2 * np.pi)
+    margin, at = min_without_nan(past / frequency, frequency)
     neutral = loop.high_frequency_gain >= 1
     return np.where(stable & ~neutral, margin, 0.0), at
 
 
-def angle_past_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
+def phase_lag_to_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
     """Return the phase lag of each loop to -1 at frequencies (..., n)."""
     along = DelayedLoop(
         loop.numerator[..., None, :], loop.denominator[..., None, :], loop.delay[..., None]
@@ -216,16 +216,16 @@ def angle_past_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
 def _first_delay(loop: DelayedLoop, frequency: Array) -> Array:
     """Return the first delay (..., n) with a pole on the axis at these frequencies."""
     undelayed = replace(loop, delay=np.zeros_like(loop.delay))
-    return np.mod(angle_past_minus_one(undelayed, frequency), 2 * np.pi) / frequency
+    return np.mod(phase_lag_to_minus_one(undelayed, frequency), 2 * np.pi) / frequency
 
 
-def _undelayed_count(loop: DelayedLoop) -> Array:
+def _unstable_without_delay(loop: DelayedLoop) -> Array:
     roots = polynomial_roots(loop.numerator + loop.denominator)
     size = np.max(np.abs(roots), axis=-1, initial=0.0, keepdims=True)
     return np.sum(roots.real > 1e-9 * size, axis=-1).astype(float)
 
 
-def least_along(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
+def min_without_nan(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
     """Return the least value along the axis without NaN, or inf, and its place."""
     value = np.where(np.isnan(value), np.inf, value)
     if not value.shape[axis]:

@@ -28,7 +28,7 @@ from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-_DRAWS = 300  # of random phases; the flattest is used
+_PHASE_DRAWS = 300  # of random phases; the flattest is used
 _APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
 
 
@@ -47,8 +47,8 @@ class MultiSine:
 
     def multiples(self) -> NDArray[np.int64]:
         """Return the (n,) odd multiples of 1 / period."""
-        wanted = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
-        odd: NDArray[np.int64] = np.unique(2 * np.floor((wanted - 1) / 2 + 1e-9).astype(int) + 1)
+        spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
+        odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def segments(self, direction: Array, start: float) -> list[Sine]:
@@ -73,7 +73,7 @@ class MultiSine:
 
     def _phases(self) -> Array:
         k = self.multiples()
-        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_DRAWS, len(k)))
+        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
         angle = 2 * np.pi * np.outer(u, k)
         peaks = [np.abs(np.cos(angle + draw).sum(axis=1)).max() for draw in draws]

@@ -51,17 +51,17 @@ _INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
 _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
 # Displacements of the differences: the error is their square, or rounding over them.
-_ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
-_AT_THE_HAND = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
-_ACCELERATION = 20.0  # rad/s^2, requested of a joint: within the motors' torque
-_IN_CONTACT = 1e-6  # rad, m: much less than the indentation by 1 N
-_AT_REST = 1e-6  # motion per period at rest, relative to the displacements
-_MOST_STEPS = 8  # of Newton's method
-_RAMP, _SETTLE = 0.3, 0.1  # s, motion to the operating point, rest there
-_LARGEST_DENSE = 800  # states; more need the sparse eigenvalue search
-MOST_STATES = 8000  #: largest number, delay included, for multipliers
-_HIGHEST = 100.0  # Hz, limit of the sparse search
-_AT_ONCE = 40  # eigenvalues per shift
+_ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
+_HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
+_MAX_ACCELERATION = 20.0  # rad/s^2, requested of a joint: within the motors' torque
+_CONTACT_STEP = 1e-6  # rad, m: much less than the indentation by 1 N
+_REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
+_MAX_NEWTON_STEPS = 8  # of Newton's method
+_RAMP_S, _SETTLE_S = 0.3, 0.1  # s, motion to the operating point, rest there
+_MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
+MAX_STATES = 8000  #: largest number, delay included, for multipliers
+_MAX_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
+_EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,19 +118,21 @@ class Linearization:
         DrakeTeleopError.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
-        if size <= _LARGEST_DENSE:
+        if size <= _MAX_DENSE_STATES:
             values = np.linalg.eigvals(self.expanded().A)
-        elif size > MOST_STATES:
+        elif size > MAX_STATES:
             raise DrakeTeleopError(
                 f"{size} states, most of them of the delay, are too many",
                 where="channel.delay",
                 remedy="count unstable multipliers of one axis instead (cut_loop)",
             )
         else:
-            values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)
+            values = _find_eigenvalues_near_circle(
+                self._sparse_transition(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
+            )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
-    def _with_lines(self, size: int) -> Any:
+    def _sparse_transition(self, size: int) -> Any:
         """Return `expanded().A` as a sparse array."""
         from scipy.sparse import lil_array
 
@@ -150,7 +152,7 @@ class Linearization:
         """Return the model with each delay as a shift register among the states."""
         result = dataclasses.replace(self, loops=())
         for rows, columns, periods in self.loops:
-            result = _with_register(result, rows, columns, periods)
+            result = _add_shift_register(result, rows, columns, periods)
         return result
 
     def to_control(self) -> Any:
@@ -161,14 +163,14 @@ class Linearization:
         return control.StateSpace(
             *(system.A, system.B, system.C, system.D, system.dt),
             # python-control rejects dots in the names of inputs and outputs.
-            inputs=[_in_brackets(name) for name in system.inputs],
-            outputs=[_in_brackets(name) for name in system.outputs],
+            inputs=[_use_brackets(name) for name in system.inputs],
+            outputs=[_use_brackets(name) for name in system.outputs],
             states=list(system.states),
         )
 
     @staticmethod
     def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
-        parts = _parts(names) if isinstance(names, str) else names
+        parts = _port_parts(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
@@ -179,12 +181,12 @@ class Linearization:
         return tuple(known.index(name) for name in parts)
 
 
-def _in_brackets(name: str) -> str:
+def _use_brackets(name: str) -> str:
     port, dot, part = name.rpartition(".")
     return f"{port}[{part}]" if dot else name
 
 
-def _near_the_circle(A: Any, highest: float) -> Complex:
+def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
     """Return eigenvalues of a sparse A near the unit circle, from angle 0 to `highest` [rad].
 
     Shift and invert finds those nearest to a point of the circle; the next point is at their
@@ -197,14 +199,14 @@ def _near_the_circle(A: Any, highest: float) -> Complex:
     while angle < highest:
         # Beside the circle, so that no shift is an eigenvalue.
         shift = 1.0005 * np.exp(1j * angle)
-        values = eigs(A, _AT_ONCE, sigma=shift, v0=start, return_eigenvectors=False)
+        values = eigs(A, _EIGENVALUES_PER_SHIFT, sigma=shift, v0=start, return_eigenvectors=False)
         known = np.abs(values[:, None] - found).min(axis=1, initial=np.inf) < 1e-9
         found = np.concatenate([found, values[~known]])
         angle = max(float(np.angle(values).max()), angle + 1e-4)
     return found
 
 
-def _with_register(
+def _add_shift_register(
     system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
 ) -> Linearization:
     n, width = len(system.A), len(rows)
@@ -243,14 +245,16 @@ def linearize(
     period = _Period(scenario, load_estimate)
     x, A, C = period.rest(np.asarray(displacement, dtype=float))
     B = period.input_derivative(x)
-    acts = _acting(A, C)
-    names = tuple(name for name, kept in zip(period.states, acts, strict=True) if kept)
+    affects = _states_affecting_outputs(A, C)
+    names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
     D = np.zeros((len(C), B.shape[1]))
-    A, B, C = A[np.ix_(acts, acts)], B[acts], C[:, acts]
-    return Linearization(A, B, C, D, period.dt, names, _parts(*_INPUTS), _parts(*_OUTPUTS))
+    A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
+    return Linearization(
+        A, B, C, D, period.dt, names, _port_parts(*_INPUTS), _port_parts(*_OUTPUTS)
+    )
 
 
-def _parts(*ports: str) -> tuple[str, ...]:
+def _port_parts(*ports: str) -> tuple[str, ...]:
     return tuple(f"{port}.{axis}" for port in ports for axis in AXES)
 
 
@@ -319,14 +323,14 @@ def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) 
     return two_port(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
 
 
-def _acting(A: Array, C: Array) -> NDArray[np.bool_]:
+def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
     """Return which states affect an output, directly or through other states."""
-    acts = (C != 0.0).any(axis=0)
+    affects = (C != 0.0).any(axis=0)
     while True:
-        more = acts | (A[acts] != 0.0).any(axis=0)
-        if (more == acts).all():
-            return acts
-        acts = more
+        more = affects | (A[affects] != 0.0).any(axis=0)
+        if (more == affects).all():
+            return affects
+        affects = more
 
 
 @dataclass(frozen=True)
@@ -352,30 +356,32 @@ class _Period:
                 remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
             )
         self.dt = 1 / scenario.rates.hand_hz
-        smooth = _smooth(scenario)
+        smooth = _linear_part(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
-            _check_contact(self._diagram)
+            _check_environment(self._diagram)
             _remove_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
         # Error control would make the steps depend on the displacements.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
-        self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        self._has_ik_state = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         servo.check_is_torque("the linearisation")
         scenario.master.check_leads_the_pose("the linearisation")
-        if self._remembers:  # a speed limit would be nonlinear
+        if self._has_ik_state:  # a speed limit would be nonlinear
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
         # The arm moves only a small part of a command in one period.
-        self._command_step = min(_ANGLE, _ACCELERATION / gain)
-        touches = smooth.surroundings is not None
-        self._joint_step = min(self._command_step, _IN_CONTACT) if touches else self._command_step
+        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION / gain)
+        has_contact = smooth.surroundings is not None
+        self._joint_step = (
+            min(self._command_step, _CONTACT_STEP) if has_contact else self._command_step
+        )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._state_groups()
@@ -383,7 +389,7 @@ class _Period:
         # The sensor's memory follows from the other states; it is of order 1.
         sensed = [group.system == "wrist_sensor" for group in self._groups]
         counts = [len(group.steps) for group in self._groups]
-        self._sizes = np.where(np.repeat(sensed, counts), _OTHER, self._steps)
+        self._sizes = np.where(np.repeat(sensed, counts), _UNIT_STEP, self._steps)
         self.states = tuple(
             f"{g.system} {'' if g.group is None else g.group}[{k}]"
             for g in self._groups
@@ -415,23 +421,25 @@ class _Period:
         joints = self._context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
         # The sensor's memory contains angles, which must stay small.
-        remembered = np.full(len(self._sensor.remembered), _ANGLE)
+        remembered = np.full(len(self._sensor.remembered), _ANGLE_STEP)
         return [
-            whole("master_device", 0, np.full(axes, _ANGLE), np.full(axes, _RATE)),
-            whole("master_device", 1, np.full(7, _ANGLE)),
-            whole("master_device", 2, np.full(6, _RATE)),
+            whole("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
+            whole("master_device", 1, np.full(7, _ANGLE_STEP)),
+            whole("master_device", 2, np.full(6, _RATE_STEP)),
             # The angles for the display; its other states act only after faults.
-            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE)),
-            whole("joint_control", 0, np.full(self._joints, _OTHER)),
-            _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
+            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
+            whole("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
+            _States(
+                "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
+            ),
             _States("wrist_sensor", 0, self._sensor.remembered, remembered),
-            *self._last_command(),
+            *self._ik_state(),
         ]
 
-    def _last_command(self) -> list[_States]:
+    def _ik_state(self) -> list[_States]:
         steps = np.full(self._joints, self._command_step)
         command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
-        return [command] if self._remembers else []
+        return [command] if self._has_ik_state else []
 
     def get(self) -> Array:
         parts = []
@@ -457,7 +465,7 @@ class _Period:
     def _apply(self, u: Array) -> None:
         """Set the cut inputs to their values at the operating point plus `u` (24,)."""
         self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix("inverse_kinematics", "pose_command", _moved(self._pose, u[6:12]))
+        self._fix("inverse_kinematics", "pose_command", _displace(self._pose, u[6:12]))
         self._fix("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
@@ -471,7 +479,7 @@ class _Period:
         # At this time no event of noise or log interferes.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
-        if self._remembers:  # time of its last command
+        if self._has_ik_state:  # time of its last command
             command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
             command.get_mutable_value()[-1] = 0.0
         self._sensor.bring_up_to_date(self._context("wrist_sensor"))
@@ -487,7 +495,7 @@ class _Period:
         return np.concatenate(
             [
                 self._eval("operator", "hand_wrench_E"),
-                _difference(pose, self._pose),
+                _displacement(pose, self._pose),
                 self._eval("force_scaling", "wrench_B"),
                 self._eval("master_device", "twist_master"),
                 J @ state[self._joints :],
@@ -510,39 +518,39 @@ class _Period:
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._eval("kinematic_scaling", "pose_command")
-        ramp = round(_RAMP / self.dt) if displacement.any() else 0
-        for k in range(ramp + round(_SETTLE / self.dt)):
+        ramp = round(_RAMP_S / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_SETTLE_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
             self._apply(np.zeros(24))
             self._run()
-        return self._newton(self._balanced())
+        return self._find_equilibrium(self._balance_hand())
 
-    def _balanced(self) -> Array:
+    def _balance_hand(self) -> Array:
         self._wrench = self._eval("force_scaling", "wrench_B")
         self._apply(np.zeros(24))
         self._hand = -self._eval("force_display", "force_to_master")
         self._apply(np.zeros(24))
         return self.get()
 
-    def _newton(self, x: Array) -> tuple[Array, Array, Array]:
+    def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
         """Return the state of rest near x, A and C, by Newton's method on the slave's states.
 
         The master is at rest already; without the hand any position of it is an equilibrium.
         """
         slave = np.array([not name.startswith("master") for name in self.states])
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_NEWTON_STEPS):
             A, C = self.derivative(x)
-            free = slave & _acting(A, C)
+            free = slave & _states_affecting_outputs(A, C)
             self._set(x)
             moved = self._run() - x
-            if (np.abs(moved) < _AT_REST * self._sizes)[free].all():
+            if (np.abs(moved) < _REST_TOLERANCE * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
             self._set(x)
-            x = self._balanced()
+            x = self._balance_hand()
         raise DrakeTeleopError(
             f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
             where="displacement",
@@ -568,8 +576,10 @@ class _Period:
     def input_derivative(self, x: Array) -> Array:
         """Return B at the states x."""
         B = np.empty((len(x), 24))
-        pose, tool = np.full(6, self._command_step), np.full(6, _OTHER)
-        for k, step in enumerate(np.concatenate([_AT_THE_HAND, pose, _AT_THE_HAND, tool])):
+        pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
+        for k, step in enumerate(
+            np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
+        ):
             ends = []
             for sign in (1.0, -1.0):
                 self._set(x)
@@ -579,18 +589,18 @@ class _Period:
         return B
 
 
-def _moved(pose: Array, change: Array) -> Array:
+def _displace(pose: Array, change: Array) -> Array:
     return np.concatenate(
         [multiply(exponential(tuple(change[3:])), pose[:4]), pose[4:] + change[:3]]
     )
 
 
-def _difference(pose: Array, other: Array) -> Array:
+def _displacement(pose: Array, other: Array) -> Array:
     turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
     return np.concatenate([pose[4:] - other[4:], turn])
 
 
-def _smooth(scenario: Scenario) -> Scenario:
+def _linear_part(scenario: Scenario) -> Scenario:
     """Return the scenario without its nonlinear parts and without the cut loops."""
     parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
     return replace(
@@ -610,7 +620,7 @@ def _smooth(scenario: Scenario) -> Scenario:
     )
 
 
-def _check_contact(diagram: Diagram) -> None:
+def _check_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.beyond or sensor.moves:
         raise DrakeTeleopError(

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 RATE = "rate"
 _PARAMETERS = {entry.name for entry in fields(OneAxis)} - {"ideal_servo"} | {RATE, "low_pass_hz"}
 _HALVINGS = 10
-_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
+_DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def stability_map(
     return StabilityMap(x_name, y_name, xs, ys, unstable, felt, boundary)
 
 
-def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _BAND) -> Array:
+def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
     """Return the largest relative error of the hand's total force over a band [rad/s], (...).
 
     The total is for hand, device and displayed force; the reference has the `ideal_impedance`.

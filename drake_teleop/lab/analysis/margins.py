@@ -12,10 +12,10 @@ from drake_teleop.lab.analysis.delayed_loop import (
     Array,
     DelayedLoop,
     angle_of,
-    angle_past_minus_one,
     gain_crossings,
-    least_along,
     margin_of_delay,
+    min_without_nan,
+    phase_lag_to_minus_one,
     polynomial_roots,
     unstable_poles,
 )
@@ -46,7 +46,9 @@ def margins(loop: DelayedLoop) -> Margins:
     unstable = unstable_poles(loop)
     stable = unstable == 0
     frequency, _ = gain_crossings(loop)
-    phase, phase_frequency = least_along(np.abs(angle_past_minus_one(loop, frequency)), frequency)
+    phase, phase_frequency = min_without_nan(
+        np.abs(phase_lag_to_minus_one(loop, frequency)), frequency
+    )
     delay, delay_frequency = margin_of_delay(loop, stable)
     limits = [_gain_margin(loop[cell]) for cell in np.ndindex(loop.delay.shape)]
     gain, gain_frequency = np.moveaxis(np.reshape(limits, (*loop.delay.shape, 2)), -1, 0)
@@ -95,24 +97,24 @@ def margins_of_response(
     log_w, log_gain, angle = np.log(w), np.log(np.abs(L)), angle_of(-L)
     turn = np.unwrap(angle, axis=0)
 
-    at_one = _zero_between(log_gain)
-    w_c = np.exp(_between(log_w, at_one))
-    past = np.mod(_between(turn, at_one), 2 * np.pi)
-    phase, phase_frequency = least_along(np.minimum(past, 2 * np.pi - past), w_c, axis=0)
-    more, more_frequency = least_along(past / w_c, w_c, axis=0)
+    gain_fraction = _zero_fraction(log_gain)
+    w_c = np.exp(_interpolate(log_w, gain_fraction))
+    past = np.mod(_interpolate(turn, gain_fraction), 2 * np.pi)
+    phase, phase_frequency = min_without_nan(np.minimum(past, 2 * np.pi - past), w_c, axis=0)
+    added_delay, added_delay_frequency = min_without_nan(past / w_c, w_c, axis=0)
 
-    at_minus = np.where(np.abs(np.diff(angle, axis=0)) < np.pi, _zero_between(angle), np.nan)
-    factor = np.exp(-_between(log_gain, at_minus))
-    w_p = np.exp(_between(log_w, at_minus))
-    factor, factor_frequency = least_along(np.where(factor > 1, factor, np.nan), w_p, axis=0)
+    phase_fraction = np.where(np.abs(np.diff(angle, axis=0)) < np.pi, _zero_fraction(angle), np.nan)
+    factor = np.exp(-_interpolate(log_gain, phase_fraction))
+    w_p = np.exp(_interpolate(log_w, phase_fraction))
+    factor, factor_frequency = min_without_nan(np.where(factor > 1, factor, np.nan), w_p, axis=0)
     return Margins(
         unstable,
         np.where(stable, factor, 1.0),
         factor_frequency,
         np.where(stable, phase, 0.0),
         phase_frequency,
-        np.where(stable, more, 0.0),
-        more_frequency,
+        np.where(stable, added_delay, 0.0),
+        added_delay_frequency,
     )
 
 
@@ -193,12 +195,12 @@ def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
     return np.union1d(np.geomspace(1e-3 * slow, top, 1000), np.arange(step, top, step))
 
 
-def _zero_between(value: Array) -> Array:
+def _zero_fraction(value: Array) -> Array:
     """Return the fraction of each step at which the value is zero, else NaN."""
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _between(value: Array, fraction: Array) -> Array:
+def _interpolate(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])

@@ -60,7 +60,7 @@ class OneAxis(Axis):
     wall_damping: float = 0.0  #: N s/m
 
     @property
-    def felt_tool_mass(self) -> float:
+    def displayed_tool_mass(self) -> float:
         """Tool mass sigma m_t + (sigma - gamma) dm after the elimination [kg]."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 

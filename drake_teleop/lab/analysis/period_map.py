@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 X_M, V_M, SERVO, X_S, V_S, SAMPLE, FILTER = range(7)
 # After the states: the held inputs, and the force received where the loop is cut.
 _HAND, _ENVIRONMENT, RECEIVED = -3, -2, -1
-_MOST_EVENTS = 1000
+_MAX_EVENTS = 1000
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _schedule(
         math.gcd(*(length.denominator for length in lengths)),
     )
     times = sorted({i * length for length in lengths for i in range(int(common / length))})
-    if len(times) > _MOST_EVENTS:
+    if len(times) > _MAX_EVENTS:
         raise DrakeTeleopError(
             f"the rates take {float(common):g} hand periods to meet again",
             where="sampling",
@@ -188,12 +188,12 @@ class _Rows:
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = _held_response(0.0, axis.device_damping / mass, period)
-        pull = {
+        hand_force = {
             X_M: -axis.hand_stiffness / mass,
             V_M: -axis.hand_damping / mass,
             _HAND: 1 / mass,
         }
-        force = self._row(pull) + self._row({received: -1 / mass})
+        force = self._row(hand_force) + self._row({received: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
             ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
@@ -208,7 +208,7 @@ class _Rows:
     def sensor(self, sections: Array) -> Array:
         """Return the scaled sample after elimination, and the memory of the low-pass."""
         axis = self._axis
-        felt_mass = axis.felt_tool_mass
+        felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
         value = self._row(
             {
@@ -245,11 +245,11 @@ def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Ar
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
-    E = _exponential(M)
+    E = _matrix_exponential(M)
     return E[..., :2, 0], E[..., :2, 1], E[..., :2, 2]
 
 
-def _exponential(M: Array) -> Array:
+def _matrix_exponential(M: Array) -> Array:
     """Return e^M of (..., n, n): the Taylor series of M / 2^s, squared s times."""
     largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
     halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0

@@ -62,7 +62,7 @@ def passive_damping(
 ) -> Array:
     """Return the least device damping that makes the wall passive, exact."""
     K, B = np.asarray(stiffness, dtype=float), np.asarray(wall_damping, dtype=float)
-    return _largest(_cosines(K, B, period, delay))[0]
+    return _maximum(_cosine_coefficients(K, B, period, delay))[0]
 
 
 def passive_stiffness(
@@ -74,13 +74,13 @@ def passive_stiffness(
     )
     checked_positive(period, "period")
     K = np.maximum((b + B) / (period * (delay + 0.5)), 0.0)  # upper bound, from theta = 0
-    share = _cosines(np.ones_like(K), np.zeros_like(K), period, delay)
+    share = _cosine_coefficients(np.ones_like(K), np.zeros_like(K), period, delay)
     # The required damping is convex in K: Newton's method from above finds the largest root.
     for _ in range(50):
-        needed, angle = _largest(_cosines(K, B, period, delay))
-        slope = _sum(share, angle)
+        required, angle = _maximum(_cosine_coefficients(K, B, period, delay))
+        slope = _cosine_sum(share, angle)
         slope = np.maximum(slope, 1e-300)  # if stiffness reduces the damping, K becomes 0
-        step = np.minimum(np.maximum(needed - b, 0.0) / slope, K)
+        step = np.minimum(np.maximum(required - b, 0.0) / slope, K)
         K = K - step
         if np.all(step <= 1e-12 * K):
             break
@@ -132,24 +132,24 @@ def stable_stiffness(
     `mass`, `damping` and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
     """
     mass, damping, B, hand = np.broadcast_arrays(mass, damping, wall_damping, hand_stiffness)
-    state, held = _held_motion(mass, damping, hand, period)
-    _require_samples(delay)
+    state, held = _sampled_device(mass, damping, hand, period)
+    _require_whole_samples(delay)
     angles = np.geomspace(1e-4, np.pi, 1000 * (1 + delay // 5)).reshape(-1, *(1,) * mass.ndim)
-    closing = _closing_stiffness(state, held, B, period, delay, angles)
-    crossed = (closing.imag[1:] < 0) != (closing.imag[:-1] < 0)
+    critical = _critical_stiffness(state, held, B, period, delay, angles)
+    crossed = (critical.imag[1:] < 0) != (critical.imag[:-1] < 0)
     low = np.broadcast_to(angles[:-1], crossed.shape)[crossed]
     high = np.broadcast_to(angles[1:], crossed.shape)[crossed]
-    below = closing.imag[:-1][crossed] < 0
+    below = critical.imag[:-1][crossed] < 0
     cell = np.nonzero(crossed)[1:]
     part = (state[cell], held[cell], B[cell], period, delay)
     for _ in range(50):
         middle = (low + high) / 2
-        same = (_closing_stiffness(*part, middle).imag < 0) == below
+        same = (_critical_stiffness(*part, middle).imag < 0) == below
         low, high = np.where(same, middle, low), np.where(same, high, middle)
 
     real = np.full((len(angles), *mass.shape), np.inf)
-    real[:-1][crossed] = _closing_stiffness(*part, high).real
-    real[-1] = closing.real[-1]  # always real at z = -1
+    real[:-1][crossed] = _critical_stiffness(*part, high).real
+    real[-1] = critical.real[-1]  # always real at z = -1
     limit = np.min(np.where(real > 0, real, np.inf), axis=0)
     poles = sampled_poles(mass, damping, limit / 2, B, period, delay, hand_stiffness=hand)
     return np.where(np.max(np.abs(poles), axis=-1) < 1, limit, 0.0)
@@ -169,8 +169,8 @@ def sampled_poles(
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )
-    state, held = _held_motion(mass, damping, hand, period)
-    _require_samples(delay)
+    state, held = _sampled_device(mass, damping, hand, period)
+    _require_whole_samples(delay)
     rate = B / period
     # States: position, velocity, positions of the last d + 1 samples
     force = np.zeros((*mass.shape, 3 + delay))
@@ -185,10 +185,10 @@ def sampled_poles(
     return np.linalg.eigvals(step).astype(complex)
 
 
-def _cosines(K: Array, B: Array, period: float, delay: int) -> Array:
+def _cosine_coefficients(K: Array, B: Array, period: float, delay: int) -> Array:
     """Return the coefficients (..., d + 2) of the required damping over cos(i theta)."""
     checked_positive(period, "period")
-    _require_samples(delay)
+    _require_whole_samples(delay)
     K, B = np.broadcast_arrays(K, B)
     coefficients = np.zeros((*K.shape, delay + 2))
     coefficients[..., 0] = K * period / 2
@@ -197,12 +197,12 @@ def _cosines(K: Array, B: Array, period: float, delay: int) -> Array:
     return coefficients
 
 
-def _sum(coefficients: Array, angle: Array) -> Array:
+def _cosine_sum(coefficients: Array, angle: Array) -> Array:
     order = np.arange(coefficients.shape[-1])
     return np.sum(coefficients * np.cos(order * angle[..., None]), axis=-1)
 
 
-def _largest(coefficients: Array) -> tuple[Array, Array]:
+def _maximum(coefficients: Array) -> tuple[Array, Array]:
     """Return the largest sum of cosines and its theta: on a grid, then by Newton's method."""
     order = np.arange(coefficients.shape[-1])
     angles = np.linspace(0, np.pi, 64 * len(order) + 1)
@@ -221,12 +221,12 @@ def _largest(coefficients: Array) -> tuple[Array, Array]:
         curve = -np.sum(coefficients * order**2 * np.cos(order * angle[..., None]), axis=-1)
         move = np.where(curve < 0, -slope / np.where(curve < 0, curve, 1.0), 0.0)
         angle = np.clip(angle + move, np.maximum(start - step, 0), np.minimum(start + step, np.pi))
-    better = _sum(coefficients, angle) >= _sum(coefficients, start)
+    better = _cosine_sum(coefficients, angle) >= _cosine_sum(coefficients, start)
     angle = np.where(better, angle, start)
-    return _sum(coefficients, angle), angle
+    return _cosine_sum(coefficients, angle), angle
 
 
-def _held_motion(
+def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
     """Return Phi (..., 2, 2) and Gamma (..., 2) of position and velocity under held force."""
@@ -247,7 +247,7 @@ def _held_motion(
     return motion[..., :2, :2], motion[..., :2, 2]
 
 
-def _closing_stiffness(
+def _critical_stiffness(
     state: Array, held: Array, B: Array, period: float, delay: int, angle: Array
 ) -> Complex:
     """Return the K that puts a pole on e^(j theta); only real values are physical."""
@@ -258,6 +258,6 @@ def _closing_stiffness(
     return -(z**delay) * (z * (z - trace) + det) / answer - B / period * (1 - 1 / z)
 
 
-def _require_samples(delay: int) -> None:
+def _require_whole_samples(delay: int) -> None:
     if delay < 0 or delay != int(delay):
         raise DrakeTeleopError("the delay is not a whole number of samples from 0 on")

@@ -91,13 +91,13 @@ def task_direction(
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    moved_B = checked("displacement", displacement, 3)
+    displacement_B = checked("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
-    device_mass, device_damping = _device(scenario, moved_B, hand_B)
+    device_mass, device_damping = _device_mass_and_damping(scenario, displacement_B, hand_B)
     slave = NominalSlave(scenario.slave)
     arm = slave.arm
-    moved_W = scaling.translation_scale * R_WB @ moved_B
-    q = _slave_posture(slave, moved_W)
+    displacement_W = scaling.translation_scale * R_WB @ displacement_B
+    q = _slave_posture(slave, displacement_W)
     J, R_WS, p_WS = np.empty((6, arm.num_joints)), np.empty((3, 3)), np.empty(3)
     jacobian(arm.table, q, J)
     forward_kinematics(arm.table, q, R_WS, p_WS)
@@ -144,11 +144,13 @@ def _wall_stiffness(scenario: Scenario) -> float:
     return float(pairs[:, STIFFNESS].sum())
 
 
-def _device(scenario: Scenario, moved_B: Array, n: Array) -> tuple[float, float]:
+def _device_mass_and_damping(
+    scenario: Scenario, displacement_B: Array, n: Array
+) -> tuple[float, float]:
     """Return mass (without the hand) and damping of the device along n (6,)."""
     hand = scenario.operator.hand
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    start[4:] += moved_B
+    start[4:] += displacement_B
     device = scenario.master.device(hand.mass, hand.inertia)
     q = device.inverse_kinematics(start)
     J, M = device.jacobian(q), device.mass_matrix(q)

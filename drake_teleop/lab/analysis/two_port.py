@@ -45,15 +45,15 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
     `servo` replaces C/(Z_s + C) and 1/(Z_s + C) of the axis.
     """
-    response, give = servo or (servo_response(axis, s), servo_admittance(axis, s))
+    response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
     late = np.exp(-s * axis.delay)
-    tool = axis.felt_tool_mass * s
+    tool = axis.displayed_tool_mass * s
     slave = axis.position_scale * late * response
     return two_port(
         device_impedance(axis, s) + axis.force_scale * late * tool * slave,
-        axis.force_scale * late * (axis.gamma - tool * give),
+        axis.force_scale * late * (axis.gamma - tool * slave_admittance),
         -slave,
-        give,
+        slave_admittance,
     )
 
 
@@ -116,21 +116,21 @@ def four_channel(
 def impedance(H: Complex) -> Complex:
     """Return Z of [F_h; F_e] = Z [V_m; -V_s] (applied to Z: H); raise if h22 is 0."""
     h11, h12, h21, h22 = entries(H)
-    _must_not_vanish(h22, "impedance", "h22")
+    _require_nonzero(h22, "impedance", "h22")
     return two_port(h11 - h12 * h21 / h22, h12 / h22, -h21 / h22, 1 / h22)
 
 
 def admittance(H: Complex) -> Complex:
     """Return Y of [V_m; -V_s] = Y [F_h; F_e] (applied to Y: H); raise if h11 is 0."""
     h11, h12, h21, h22 = entries(H)
-    _must_not_vanish(h11, "admittance", "h11")
+    _require_nonzero(h11, "admittance", "h11")
     return two_port(1 / h11, -h12 / h11, h21 / h11, h22 - h12 * h21 / h11)
 
 
 def chain(H: Complex) -> Complex:
     """Return A of [F_h; V_m] = A [F_e; V_s] (in series: the product); raise if h21 is 0."""
     h11, h12, h21, h22 = entries(H)
-    _must_not_vanish(h21, "chain", "h21")
+    _require_nonzero(h21, "chain", "h21")
     return two_port(h12 - h11 * h22 / h21, -h11 / h21, -h22 / h21, -1 / h21)
 
 
@@ -188,9 +188,9 @@ def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> C
     """Return H that includes parts of the impedances of hand and environment."""
     h11, h12, h21, h22 = entries(H)
     z = np.asarray(environment)
-    give = 1 / (1 + h22 * z)
-    felt = h11 + np.asarray(hand) - h12 * h21 * z * give
-    return two_port(felt, h12 * give, h21 * give, h22 * give)
+    reduction = 1 / (1 + h22 * z)
+    felt = h11 + np.asarray(hand) - h12 * h21 * z * reduction
+    return two_port(felt, h12 * reduction, h21 * reduction, h22 * reduction)
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
@@ -210,14 +210,14 @@ def transfer_function(axis: OneAxis) -> control.TransferFunction:
     # An ideal servo has response 1 and admittance 0.
     servo = np.array([1.0]) if axis.ideal_servo else np.array([1.0, kv, kv * kp])
     response = 1.0 if axis.ideal_servo else kv * kp
-    give = np.array([0.0] if axis.ideal_servo else [1 / axis.slave_mass, 0.0])
+    slave_admittance = np.array([0.0] if axis.ideal_servo else [1 / axis.slave_mass, 0.0])
     device = np.array([axis.device_mass, axis.device_damping])
-    tool = np.array([axis.felt_tool_mass, 0.0])
+    tool = np.array([axis.displayed_tool_mass, 0.0])
     felt = axis.force_scale * axis.position_scale * response
     h11 = np.polyadd(np.polymul(device, servo), felt * tool)
-    h12 = axis.force_scale * np.polysub(axis.gamma * servo, np.polymul(tool, give))
+    h12 = axis.force_scale * np.polysub(axis.gamma * servo, np.polymul(tool, slave_admittance))
     h21 = np.array([-axis.position_scale * response])
-    return control.tf([[h11, h12], [h21, give]], [[servo, servo], [servo, servo]])
+    return control.tf([[h11, h12], [h21, slave_admittance]], [[servo, servo], [servo, servo]])
 
 
 def to_frd(H: Complex, omega: NDArray[np.float64]) -> control.FRD:
@@ -242,7 +242,7 @@ def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = No
     return response[:, 0, 0] if response.shape[1:] == (1, 1) else response
 
 
-def _must_not_vanish(entry: Complex, matrix: str, name: str) -> None:
+def _require_nonzero(entry: Complex, matrix: str, name: str) -> None:
     if not np.all(entry):
         raise DrakeTeleopError(
             f"no {matrix} matrix where {name} is zero", remedy="use another form of the two-port"

@@ -70,14 +70,14 @@ WALLS = (500.0, 5100.0, 20000.0)  #: N/m
 IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
 """(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
-_COVERED = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+_COVERING_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
 #: s; longer than the events' period, to avoid extra steps of one rounding error before them.
-_LONGEST_STEP = 2e-3
+_MAX_STEP = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
-_SLIP = 1e-3
+_SLIP_SPEED = 1e-3
 
 
 def compare_command(
@@ -104,12 +104,12 @@ def compare_command(
     Returns:
         The summary, see the top of this module.
     """
-    _check("network", networks, tuple(PRESETS))
-    _check("method", methods, METHODS)
+    _check_names("network", networks, tuple(PRESETS))
+    _check_names("method", methods, METHODS)
     make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
-        let_go = _hands_study(networks, methods, seed, jobs, stage)
+        released = _hands_study(networks, methods, seed, jobs, stage)
         runs, traces = _station_study(scenario, networks, methods, seed, jobs, stage)
         covering = _covering_study(stage)
     summary = {
@@ -118,7 +118,7 @@ def compare_command(
         "scenario": str(scenario),
         "seed": seed,
         "station": runs,
-        "hands": let_go,
+        "hands": released,
         "one_dof": limits,
         "covering": covering,
     }
@@ -165,7 +165,7 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
     """Return the scenario with the comparison's rates and steps, without environment."""
     return replace(
         LoadScenario(scenario).without_environment(),
-        simulation=Simulation(seed=seed, max_step=_LONGEST_STEP),
+        simulation=Simulation(seed=seed, max_step=_MAX_STEP),
         rates=_RATES,
         contact_detection=None,
     )
@@ -184,24 +184,24 @@ def station_run(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_SLIP)
+    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
-        result, found = _as_far_as_it_holds(station, setup, task)
+        result, found = _run_to_end_or_hold(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    own = {
+    additional = {
         "pressed_force": abs(float(shown["pressed"][held].mean())),
         "felt_share": max(1 + found.force_error, 0.0),
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
-    return row | _plain(dataclasses.asdict(found) | own) | {"error": None}, shown
+    return row | _finite_or_none(dataclasses.asdict(found) | additional) | {"error": None}, shown
 
 
-def _as_far_as_it_holds(
+def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, Figures]:
     """Return a run and its figures; the run ends after the hold if it is not at rest there."""
@@ -228,9 +228,9 @@ def _one_dof_study(
     for method in methods:
         steps_of(method)
     seeds = range(seed, seed + 2)
-    found = _each(
+    found = _run_parallel(
         longest_round_trip,
-        [(m, OneDof(wall_stiffness=wall), *how, seeds) for m, wall, how in cases],
+        [(m, OneDof(wall_stiffness=wall), *impairment, seeds) for m, wall, impairment in cases],
         jobs,
         stage("One degree of freedom"),
     )
@@ -251,7 +251,7 @@ def _hands_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
-    found = _each(
+    found = _run_parallel(
         hands,
         [(method, network, seed) for network, method in cases],
         jobs,
@@ -278,7 +278,7 @@ def _station_study(
     # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAVES, methods))
-    results = _each(
+    results = _run_parallel(
         station_run,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
@@ -300,7 +300,7 @@ def _station_study(
 
 def _covering_study(stage: Stage) -> list[dict[str, Any]]:
     progress, rows = stage("What the elimination puts in"), []
-    for done, (sigma, round_trip, wall) in enumerate(_COVERED):
+    for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         rows.append(
@@ -312,11 +312,13 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )
-        progress((done + 1) / len(_COVERED))
+        progress((done + 1) / len(_COVERING_CASES))
     return rows
 
 
-def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any) -> list[Any]:
+def _run_parallel(
+    function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
+) -> list[Any]:
     """Return the function's result for each case, in order, from several processes."""
     from joblib import Parallel, delayed
 
@@ -328,8 +330,8 @@ def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any)
     return results
 
 
-def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-    for name in wanted:
+def _check_names(what: str, requested: Sequence[str], known: Sequence[str]) -> None:
+    for name in requested:
         if name not in known:
             raise DrakeTeleopError(
                 f"there is no {what} '{name}'",
@@ -338,7 +340,7 @@ def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
             )
 
 
-def _plain(figures: dict[str, Any]) -> dict[str, Any]:
+def _finite_or_none(figures: dict[str, Any]) -> dict[str, Any]:
     return {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in figures.items()

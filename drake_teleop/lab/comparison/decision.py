@@ -17,8 +17,8 @@ from typing import Any
 
 from drake_teleop.lab.comparison.one_dof import TIP
 
-UNSTABLE, BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
-FAR, LEAST = 5e-3, 1e-3  #: m; J
+UNSTABLE, LEFT_BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
+MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
 
 @dataclass(frozen=True)
@@ -63,15 +63,15 @@ def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
 
 def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
     if not all(run["stable"] for run in runs):
-        return Cell(UNSTABLE, unrest=tuple(map(_unrest, runs)))
+        return Cell(UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
-    if max(run["left_behind"] for run in runs) > FAR:
-        return Cell(BEHIND, forces, leaked=leaked)
-    return Cell(LEAKS if leaked > LEAST else HOLDS, forces, leaked=leaked)
+    if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
+        return Cell(LEFT_BEHIND, forces, leaked=leaked)
+    return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
 
 
-def _unrest(run: Mapping[str, Any]) -> str:
+def _motion_in_hold(run: Mapping[str, Any]) -> str:
     """Return how a run moves in its hold: the larger of both at the tool's tip."""
     if run["stable"]:
         return "at rest"

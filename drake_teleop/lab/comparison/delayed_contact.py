@@ -27,12 +27,12 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-_GAP, _DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+_START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
 #: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, light enough not to oscillate.
 LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
-def task_over(round_trip: float) -> Task:
+def task_for_round_trip(round_trip: float) -> Task:
     """Return the task: one round trip [s] before the press, three to hold, two to rest."""
     return Task(
         swing=0.3,
@@ -50,7 +50,7 @@ def delayed_contact(
     base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
 ) -> tuple[Scenario, Task]:
     """Return the scenario of the task, from a base with rates, sensor, scales and grip."""
-    task = task_over(sum(line.delay for line in channel.lines()))
+    task = task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,
@@ -60,21 +60,23 @@ def delayed_contact(
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],
     )
-    reach = [0.0, 0.0, -(_GAP + _DEPTH)]
-    press, back = (
-        MinimumJerk(t_start=settle + start, duration=end - start, translation=way)
-        for start, end, way in (
+    reach = [0.0, 0.0, -(_START_GAP + _PRESS_DEPTH)]
+    press, retreat = (
+        MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
+        for start, end, translation in (
             (task.press, task.pressed, reach),
             (task.release, task.released, [-x for x in reach]),
         )
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
-    sheet = SheetSpring(position=[x, y, z - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf])
+    sheet = SheetSpring(
+        position=[x, y, z - _START_GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
+    )
     return (
         replace(
             base.without_environment(),
             simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
-            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, back]),
+            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
             channel=channel,
             passivity=passivity,
             sheet_spring=sheet,

@@ -28,8 +28,8 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.passivity.methods import PassivityConfig
 
 RATES = (1.0, 1.5)  #: of the taps [Hz]
-_TAPS, _DEEP = 8, 0.03  # number; m, amplitude about the wall's surface
-_WATCHED = 2.0  # s, evaluated after letting go
+_NUM_TAPS, _TAP_AMPLITUDE = 8, 0.03  # number; m, amplitude about the wall's surface
+_EVALUATED_S = 2.0  # s, evaluated after letting go
 
 
 @dataclass(frozen=True)
@@ -58,37 +58,46 @@ def hands(method: str, network: str, seed: int = 0) -> Hands:
             grip=grip,
         )
 
-    gone = 3.0 + 3 * round_trip
-    task = Task(0.1, 0.6, 0.7, 1.5, gone + 10.0, gone + 11.0, gone + _WATCHED, 0.1)
+    release_time = 3.0 + 3 * round_trip
+    task = Task(
+        0.1,
+        0.6,
+        0.7,
+        1.5,
+        release_time + 10.0,
+        release_time + 11.0,
+        release_time + _EVALUATED_S,
+        0.1,
+    )
     pressing = operators_intent(task)
-    last = round(gone / PERIOD)
+    release_row = round(release_time / PERIOD)
     grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
-    grip[last:] = 0.0
-    let_go = run(pressing, grip)
-    after = let_go.master[last:]
-    tapping = [run(_taps(rate, round_trip)) for rate in RATES]
+    grip[release_row:] = 0.0
+    released = run(pressing, grip)
+    after = released.master[release_row:]
+    tapping = [run(_tap_intent(rate, round_trip)) for rate in RATES]
     scale = model.force_scale * model.gamma
     return Hands(
-        release_force=float(np.abs(let_go.felt[last - 100 : last]).mean()),
+        release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),
         release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
         release_way=float(np.abs(after - after[0]).max()),
         tap_shares=tuple(
-            _share(found, scale, rate, 0.5 * round_trip)
+            _displayed_share(found, scale, rate, 0.5 * round_trip)
             for found, rate in zip(tapping, RATES, strict=True)
         ),
-        leaked=max(max(0.0, -found.least(ACTUAL)) for found in (let_go, *tapping)),
+        leaked=max(max(0.0, -found.least(ACTUAL)) for found in (released, *tapping)),
     )
 
 
-def _taps(rate: float, round_trip: float) -> NDArray[np.float64]:
+def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
     """Return (N, 2) position and velocity; at rest on the wall's surface before and after."""
-    t = np.arange(round((1.0 + _TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
-    moving = (t > 0.0) & (t < _TAPS / rate)
-    x = np.where(moving, -_DEEP * np.sin(2 * np.pi * rate * t), 0.0)
+    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
+    moving = (t > 0.0) & (t < _NUM_TAPS / rate)
+    x = np.where(moving, -_TAP_AMPLITUDE * np.sin(2 * np.pi * rate * t), 0.0)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
-def _share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
+def _displayed_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
     """Return the displayed impulse over the wall's, without the first contact.
 
     `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` one way [s].

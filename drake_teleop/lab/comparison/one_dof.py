@@ -38,13 +38,13 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 PERIOD = 1e-3  #: s, of the channel
 _SUBSTEPS = 20
 _FRICTION_SPEED = 5e-3  # m/s, regularisation of the device's Coulomb friction
-_SLAVES_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
+_SLAVE_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
-_QUIET = 0.5e-3  # m, peak to peak at rest
+_MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
 TIP = 0.2  #: m, from the wrist to the tool's tip
-_FREE, _DEPTH = -0.04, 0.02  # m, from the wall: rest, and intended depth
+_REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest, and intended depth
 
 
 @dataclass(frozen=True)
@@ -188,12 +188,14 @@ def run_one_dof(
     # The channel's command belongs to the next step; here it is used at once.
     playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
     forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD, playout=playout)
-    there, back = (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
+    forward_delays, backward_delays = (
+        (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
+    )
     lines = [
         network.parameters(line, seed, direction, PERIOD, least=1, delays=travels)
         for line, direction, travels in (
-            (forward_line, network.FORWARD, there),
-            (forward if backward is None else backward, network.BACKWARD, back),
+            (forward_line, network.FORWARD, forward_delays),
+            (forward if backward is None else backward, network.BACKWARD, backward_delays),
         )
     ]
     states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
@@ -205,9 +207,12 @@ def run_one_dof(
         model.tool_mass, model.wall_damping, scale, model.sigma, model.gamma,
         model.master_resolution, model.slave_resolution, model.wrench_noise, seed % 2**53,
     )  # fmt: skip
-    own = (model.hand_mass, model.hand_damping, model.hand_stiffness), (0.0, model.wall_stiffness)
-    given = intent, own[0] if grip is None else grip, own[1] if wall is None else wall
-    course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in given]
+    defaults = (
+        (model.hand_mass, model.hand_damping, model.hand_stiffness),
+        (0.0, model.wall_stiffness),
+    )
+    inputs = intent, defaults[0] if grip is None else grip, defaults[1] if wall is None else wall
+    course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
     # These methods use the motor's force, which is held over a period; the others interpolate the
     # command over it.
     held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
@@ -224,12 +229,12 @@ def run_one_dof(
 def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
     """Return (N, 2) intended position [m] and velocity [m/s]; the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
-    x = np.full_like(t, _FREE)
+    x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
     x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
     pressing = _ramp(t, task.press, task.pressed - task.press)
     releasing = _ramp(t, task.release, task.released - task.release)
-    x += (_DEPTH - _FREE) * (pressing - releasing)
+    x += (_DEPTH - _REST_POSITION) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
@@ -278,14 +283,14 @@ def figures_of(
 
     hold = window(task.release - task.judged, task.release)
     rest = window(task.end - task.judged, task.end)
-    hunting = max(_hunting(x[part]) for x in (master, slave) for part in (hold, rest))
+    hunting = max(_peak_to_peak(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max((_hunting(x[part]) for x in angles for part in (hold, rest)), default=0.0)
+    turning = max((_peak_to_peak(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
     return Figures(
-        stable=bool(hunting < _QUIET and turning < _QUIET / TIP),
+        stable=bool(hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP),
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),
@@ -319,7 +324,7 @@ def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
     return np.asarray(felt.real)
 
 
-def _hunting(x: NDArray[np.float64]) -> float:
+def _peak_to_peak(x: NDArray[np.float64]) -> float:
     """Return the peak to peak about the best parabola; infinite if not finite."""
     if not np.isfinite(x).all():
         return float("inf")
@@ -333,11 +338,11 @@ def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady:
     The common level avoids a negative delay for a method that displays only half of the force.
     """
     level, sign = 0.5 * abs(steady), np.sign(steady)
-    there, shown = pressed * sign > level, felt * sign > level
-    start = int(np.argmax(there))
-    if not there.any() or shown[max(start - 1, 0)] or not shown[start:].any():
+    exceeds, displayed = pressed * sign > level, felt * sign > level
+    start = int(np.argmax(exceeds))
+    if not exceeds.any() or displayed[max(start - 1, 0)] or not displayed[start:].any():
         return float("nan")
-    return float(np.argmax(shown[start:]))
+    return float(np.argmax(displayed[start:]))
 
 
 @njit(cache=True)
@@ -362,14 +367,14 @@ def _simulate(
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
         v_w = (course[following, 5] - x_w) / PERIOD
-        push = _push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
+        push = _wall_push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
         load[0] = -scale * sigma * tool_mass * a_s
         if noise > 0.0:
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
-        pose_m[4], pose_s[4] = _read(x, master_resolution), _read(x_s, slave_resolution)
+        pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
         accounts[HAND] -= felt[0] * (x - x_before)
         before, x_before = received[4], x
         # A literal False would compile the whole channel once more.
@@ -381,7 +386,7 @@ def _simulate(
         put(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
         put(rows[k], 7, ports, 4, 2)
         put(rows[k], 9, accounts, 0, 4)
-        wanted = K * (command - x_s) - D * v_s
+        servo_force = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS):
             share = (i + 0.5) / _SUBSTEPS
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
@@ -396,15 +401,15 @@ def _simulate(
                 a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
             else:
                 if not held:
-                    wanted = K * (before + share * (command - before) - x_s) - D * v_s
-                motor = motor + dt / lag * (wanted - motor) if lag > dt else wanted
+                    servo_force = K * (before + share * (command - before) - x_s) - D * v_s
+                motor = motor + dt / lag * (servo_force - motor) if lag > dt else servo_force
                 a_s = (motor - max(push, 0.0)) / slave_mass
                 if slave_friction > 0.0:
-                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVES_FRICTION_SPEED)
+                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED)
                 v_s += dt * a_s
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS * PERIOD * v_w)
-            push_then, push = push, _push(wall_stiffness, wall_damping, beyond, v_s - v_w)
+            push_then, push = push, _wall_push(wall_stiffness, wall_damping, beyond, v_s - v_w)
             work = -_mean_positive(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
             # With the mean speed, the work of all forces equals the change of kinetic energy. An
@@ -419,13 +424,13 @@ def _simulate(
 
 
 @njit(cache=True)
-def _read(x, resolution):
+def _quantise(x, resolution):
     """Return a position as the encoder measures it."""
     return np.round(x / resolution) * resolution if resolution > 0.0 else x
 
 
 @njit(cache=True)
-def _push(stiffness, damping, depth, speed):
+def _wall_push(stiffness, damping, depth, speed):
     """Return the wall's force on the slave, outwards; negative values mean no contact [N]."""
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
 from drake_teleop.common.writing import write_picture, write_text
-from drake_teleop.lab.comparison.decision import BEHIND, HOLDS, LEAKS, UNSTABLE, decide
+from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
 from drake_teleop.lab.comparison.hands import RATES
 from drake_teleop.station.channel.network import PRESETS
 
@@ -35,11 +35,11 @@ COLUMNS = (
 VERDICTS = {
     HOLDS: ("✓", "#CBE4F4", BLACK),
     LEAKS: ("⚠", "#FBEBB8", BLACK),
-    BEHIND: ("↷", "#F0B878", BLACK),
+    LEFT_BEHIND: ("↷", "#F0B878", BLACK),
     UNSTABLE: ("✗", "#565C66", "white"),
 }
 _MARKERS = "os^Dv"  # of the networks
-_MIDDLE: dict[str, Any] = {"ha": "center", "va": "center"}
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
@@ -84,17 +84,23 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
         axes = figure.subplots()
         for (method, network), cell in table.items():
             x, y = networks.index(network), methods.index(method)
-            mark, colour, ink = VERDICTS[cell.verdict]
+            mark, colour, text_colour = VERDICTS[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
             lines += cell.unrest
-            up = 0.12 * len(lines)
+            offset = 0.12 * len(lines)
             axes.text(
-                x, y - up, f"{mark} {cell.words}", color=ink, size=9.5, weight="bold", **_MIDDLE
+                x,
+                y - offset,
+                f"{mark} {cell.words}",
+                color=text_colour,
+                size=9.5,
+                weight="bold",
+                **_CENTRED,
             )
             for place, line in enumerate(lines):
-                down = y - up + 0.27 * (place + 1)
-                axes.text(x, down, line, color=ink, size=8.5, **_MIDDLE)
+                line_y = y - offset + 0.27 * (place + 1)
+                axes.text(x, line_y, line, color=text_colour, size=8.5, **_CENTRED)
         axes.set_xlim(-0.5, len(networks) - 0.5)
         axes.set_ylim(len(methods) - 0.5, -0.5)
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
@@ -147,7 +153,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
-    figure = _grid(summary, traces, draw, "force [N]")
+    figure = _draw_grid(summary, traces, draw, "force [N]")
     figure.suptitle("Felt force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
@@ -159,7 +165,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 
-    figure = _grid(summary, traces, draw, "energy [J]")
+    figure = _draw_grid(summary, traces, draw, "energy [J]")
     figure.suptitle(
         "Energy between hand and actual motion:\nbelow 0 more came out than went in or was stored",
         x=0.01,
@@ -168,7 +174,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
     return figure
 
 
-def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
+def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
     methods, networks = summary["methods"], summary["networks"]
     with house_style():
         figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))

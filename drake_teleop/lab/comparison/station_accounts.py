@@ -30,7 +30,7 @@ from drake_teleop.station.slave.forward_kinematics import pose_into
 
 Array = NDArray[np.float64]
 
-_NEEDED = ("ports", "slave_state", "joint_torque")
+_REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
@@ -44,7 +44,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     Raises:
         DrakeTeleopError: the result lacks a signal.
     """
-    if missing := [name for name in _NEEDED if name not in result]:
+    if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
             f"this result holds no {', '.join(missing)}",
             where="accounts",
@@ -52,7 +52,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         )
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
-    poses, motor = _motors(scenario, q, torque)
+    poses, motor = _motor_wrenches(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
@@ -62,14 +62,14 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
     # A row contains the torque before it.
-    known = rates.log_hz >= rates.joint_control_hz
-    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if known else np.nan
+    has_torques = rates.log_hz >= rates.joint_control_hz
+    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
     accounts[:, ACTUAL] = power * port_work(contact, poses, "mean")
     # A row contains the channel's sum of one period ago.
-    then = t - 1 / rates.hand_hz
+    channel_times = t - 1 / rates.hand_hz
     for place, first in ((HAND, 0), (COMMAND, 6)):
         for g in range(2):
-            so_far = np.interp(t, then, result["ports"][:, first + g])
+            so_far = np.interp(t, channel_times, result["ports"][:, first + g])
             accounts[:, place, g] = so_far - so_far[0]
     return accounts
 
@@ -115,18 +115,18 @@ def _motion_scale(scenario: Scenario) -> Array:
     return np.where(scales > 0.0, scales, 1.0)
 
 
-def _motors(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
+def _motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
     """Return (N, 7) X_WS and (N, 6) the motors' wrench at So in W without the weight.
 
     For a redundant arm it is the nearest one: other torques only cause null-space motion.
     """
     n = q.shape[1]
-    arm, still = slave_arm(scenario).table, np.zeros(n)
+    arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))
     for k in range(len(q)):
         pose_into(arm, q[k], poses[k])
-        inverse_dynamics(arm, q[k], still, still, weight[k])
+        inverse_dynamics(arm, q[k], zero, zero, weight[k])
         jacobian(arm, q[k], J[k])
-    to_torque, beside = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
-    wrench = np.linalg.solve(to_torque, beside) if n == 6 else np.linalg.pinv(to_torque) @ beside
+    to_torque, excess = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
+    wrench = np.linalg.solve(to_torque, excess) if n == 6 else np.linalg.pinv(to_torque) @ excess
     return poses, wrench[:, :, 0]
