@@ -30,7 +30,9 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
     monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
     monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
-    monkeypatch.setattr(study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
+    monkeypatch.setattr(
+        study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
+    )
     # With the load that the runs of the shipped scenario have identified as well.
     task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
     monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)

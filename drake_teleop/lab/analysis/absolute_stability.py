@@ -209,7 +209,7 @@ class ImpedanceRange:
             low, high = getattr(self, name)
             if not -np.inf < low <= high < np.inf:
                 raise DrakeTeleopError(
-                    f"no range from {low} to {high}", where=name, remedy="give (smallest, largest)"
+                    f"{low} to {high} is no range", where=name, remedy="give (smallest, largest)"
                 )
 
     def corners(self, omega: Real) -> Complex:

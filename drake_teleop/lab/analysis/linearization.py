@@ -351,7 +351,7 @@ class _Period:
         own_period = scenario.master.own_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
-                f"the device has a rate of its own, {1 / own_period:g} Hz, below that of the hand",
+                f"the device's own rate of {1 / own_period:g} Hz is below the hand's rate",
                 where="rates.hand_hz",
                 remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
             )
@@ -624,9 +624,9 @@ def _check_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.beyond or sensor.moves:
         raise DrakeTeleopError(
-            f"these surroundings cannot be linearised: {beyond}",
+            f"this environment cannot be linearised: {beyond}",
             where="environment",
-            remedy="leave them out, or leave a leaf, a slot, walls and boxes",
+            remedy="use only a leaf, a slot, walls and boxes, or none",
         )
 
 

@@ -215,7 +215,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
         )
         right.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         right.set_ylim(0.0, 3.0)
-        right.set_title("stable for sure below 1")
+        right.set_title("stable below 1")
         right.legend(fontsize=7.5)
         for axes in (left, right):
             axes.set_xlabel("frequency [Hz]")
@@ -304,7 +304,7 @@ def print_tables(summary: Mapping[str, Any], out: Path) -> None:
     from rich.table import Table
 
     console = Console()
-    table = Table(title="How far from the limit", title_justify="left", box=SIMPLE_HEAD)
+    table = Table(title="Stability margins", title_justify="left", box=SIMPLE_HEAD)
     for heading in ("Grip", "Wall", "Stable"):
         table.add_column(heading)
     for heading in ("Gain", "Phase", "More round trip [ms]"):

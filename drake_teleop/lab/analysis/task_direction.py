@@ -84,7 +84,7 @@ def task_direction(
     sigma, sigma_object, gamma = scenario.force_scaling.scales()
     if sigma != sigma_object:
         raise DrakeTeleopError(
-            "gripper and object are scaled differently: there is no one sigma",
+            "gripper and object have different scales; one axis needs one sigma",
             where="force_scaling.eta",
             remedy="set eta: null",
         )

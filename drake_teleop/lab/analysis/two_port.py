@@ -160,7 +160,7 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
-            "nothing is seen through a scale of 0",
+            "reference impedances need scales above 0",
             where="force_scale, translation_scale",
             remedy="set both above 0",
         )
@@ -235,7 +235,7 @@ def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = No
     if omega is None:
         omega = getattr(system, "omega", None)
     if omega is None:
-        raise DrakeTeleopError("no frequencies", where="omega", remedy="say at which to evaluate")
+        raise DrakeTeleopError("no frequencies", where="omega", remedy="pass omega [rad/s]")
     sampled = system.isdtime(strict=True)
     points = np.exp(1j * omega * system.dt) if sampled else 1j * omega
     response = np.moveaxis(system(points, squeeze=False), -1, 0)

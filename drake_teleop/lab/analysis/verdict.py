@@ -13,7 +13,7 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     if figures["method"] != "none":
         sentences += [
             f"The method {figures['method']} is not linear.",
-            "All that follows is about the station without it.",
+            "The analysis is for the station without this method.",
         ]
     if "is not analysed" in figures["wall_is"]:
         sentences.append(f"The wall is {figures['wall_is']}.")
@@ -24,9 +24,9 @@ def verdict(figures: dict[str, Any]) -> list[str]:
     worst = max(figures["two_port"]["sampled"].values())
     if worst > 0.1:
         sentences += [
-            f"Along {figures['direction']} it is not one axis: a push turns hand and tool.",
+            f"Along {figures['direction']} it is not one axis: contact rotates hand and tool.",
             f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
-            "Margins and maps are those of one axis, and rough here.",
+            "Margins and maps assume one axis and are approximate here.",
         ]
     return sentences + _wall_sentences(figures) + _transparency_sentences(figures)
 
@@ -46,11 +46,11 @@ def _stability_sentence(point: dict[str, Any], grip: str) -> str:
 def _margin_sentences(row: dict[str, Any], delay: float) -> list[str]:
     wall = f"a wall of {_stiffness_text(row['wall_N_per_m'])}"
     if not row["stable"]:
-        return [f"Before {wall} it is unstable with that grip."]
+        return [f"At {wall} it is unstable with this grip."]
     spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
     longest = "any round trip" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
     more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
-    return [f"Before {wall} it stays stable with {longest}, or with {more}."]
+    return [f"At {wall} it stays stable with {longest}, or with {more}."]
 
 
 def _wall_sentences(figures: dict[str, Any]) -> list[str]:
@@ -59,8 +59,8 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
     every = _stiffness_text(bounded["grips"])
     sentences = [
         f"The stiffest stable wall depends on the grip: {each}.",
-        f"For every hand from the lightest to the firmest grip it is {every}.",
-        "These limits are without Coulomb friction, which only takes energy.",
+        f"For all hands between the lightest and the firmest grip it is {every}.",
+        "These limits exclude Coulomb friction, which dissipates energy.",
     ]
     if absolute["absolutely_stable"]:
         return [
@@ -73,8 +73,8 @@ def _wall_sentences(figures: dict[str, Any]) -> list[str]:
         *sentences,
         "It is not absolutely stable: with some passive hand and environment it would oscillate.",
         f"{remedy} of the device would prevent that.",
-        "Position-force stations behind a servo hardly ever are absolutely stable.",
-        "For hands and walls that there are, the limits above count.",
+        "Position-force stations with a servo are rarely absolutely stable.",
+        "For realistic hands and walls, the limits above apply.",
     ]
 
 
@@ -84,9 +84,9 @@ def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
     sigma = f"σ = {figures['axis']['sigma']:g}"
     return [
         f"In free motion the hand feels {1e3 * free['felt']['mass']:.3g} g.",
-        f"With device and {sigma} alone it would be {1e3 * free['ideal']['mass']:.3g} g.",
-        f"Of a wall that should be {ideal:.3g} N/m the hand feels {felt:.3g} N/m.",
-        f"A human could not tell it from the ideal one up to {wall['unnoticed_to_Hz']:.2g} Hz.",
+        f"The ideal for device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
+        f"At the wall the hand feels {felt:.3g} N/m; the ideal is {ideal:.3g} N/m.",
+        f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
         f"The slave follows up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]
 

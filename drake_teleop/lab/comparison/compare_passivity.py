@@ -299,7 +299,7 @@ def _station_study(
 
 
 def _covering_study(stage: Stage) -> list[dict[str, Any]]:
-    progress, rows = stage("What the elimination puts in"), []
+    progress, rows = stage("Energy added by the elimination"), []
     for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))

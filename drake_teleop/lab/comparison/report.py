@@ -111,7 +111,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
         axes.grid(False)
         for side in axes.spines.values():
             side.set_visible(False)
-        figure.suptitle("What becomes of each method over each network", x=0.01, ha="left")
+        figure.suptitle("Verdict of each method over each network", x=0.01, ha="left")
     return figure
 
 
@@ -167,7 +167,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
     figure = _draw_grid(summary, traces, draw, "energy [J]")
     figure.suptitle(
-        "Energy between hand and actual motion:\nbelow 0 more came out than went in or was stored",
+        "Energy between hand and actual motion:\nbelow 0 the station is active",
         x=0.01,
         ha="left",
     )
