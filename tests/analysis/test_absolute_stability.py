@@ -410,7 +410,7 @@ def test_stiffness_limit_of_an_ideal_servo_is_that_of_its_lightest_grip():
 
 def test_a_range_is_from_its_smallest_to_its_largest():
     for bad in ((2.0, 1.0), (0.0, np.inf), (np.nan, 1.0)):
-        with pytest.raises(DrakeTeleopError, match="damping: .* is no range"):
+        with pytest.raises(DrakeTeleopError, match=r"damping: .* is no range"):
             ab.ImpedanceRange((0.0, 0.0), bad, (0.0, 1.0))
 
 

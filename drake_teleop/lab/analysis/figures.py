@@ -61,7 +61,7 @@ def diagram_figures(
 ) -> dict[str, Any]:
     """Return whether an operating point is stable, and its slowest motion.
 
-    Above `MOST_STATES` states (about a second of delay) only one axis is analysed.
+    Above `MAX_STATES` states (about a second of delay) only one axis is analysed.
     """
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)

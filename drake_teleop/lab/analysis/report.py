@@ -195,24 +195,14 @@ def draw_passive_loads(curves: Curves) -> Figure:
         left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         left.set_ylim(-1.2, 5.0)
         left.set_title("Llewellyn's parameter: absolutely stable from 1 on")
-        right.semilogx(
-            hertz,
-            absolute_stability.scattering_norm(S),
-            color=COLOURS[2],
-            label="passive: norm of S",
-        )
-        right.semilogx(
-            hertz,
-            absolute_stability.structured_singular_value(S),
-            color=COLOURS[0],
-            label="any passive hand and environment: μ",
-        )
-        right.semilogx(
-            hertz,
-            bounded,
-            color=COLOURS[3],
-            label=f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ",
-        )
+        realistic = f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ"
+        mu = absolute_stability.structured_singular_value(S)
+        for label, value, colour in (
+            ("passive: norm of S", absolute_stability.scattering_norm(S), COLOURS[2]),
+            ("any passive hand and environment: μ", mu, COLOURS[0]),
+            (realistic, bounded, COLOURS[3]),
+        ):
+            right.semilogx(hertz, value, color=colour, label=label)
         right.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         right.set_ylim(0.0, 3.0)
         right.set_title("stable below 1")
