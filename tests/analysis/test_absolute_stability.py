@@ -238,6 +238,7 @@ def test_structured_singular_value_is_the_largest_gain_of_passive_terminations()
 def roots(axis: OneAxis, hand: np.ndarray, wall: np.ndarray) -> np.ndarray:
     """Return the largest real part of the roots without delay.
 
+    hand (n, 3) is m, b, k; wall (n, 2) is b, k. The equation of motion is
     hand and device (s) x + force(s) / slave(s) x = 0 with the servo's spring in the force.
     """
     (m_h, b_h, k_h), (b_e, k_e) = hand.T, wall.T

@@ -2,8 +2,7 @@
 
 Two-ports (..., 2, 2) are on the imaginary axis; results are for each frequency, omega in rad/s.
 Stability also requires h11 and h22 without poles in the right half plane, which the station's
-servo ensures. A position-force station with delay, or with a compliant servo, is not stable for
-all passive hands and environments; `ImpedanceRange` limits them.
+servo ensures.
 """
 
 from __future__ import annotations
@@ -169,9 +168,9 @@ def _squared_abs(z: Complex) -> Real:
 
 
 class WorstLoads(NamedTuple):
-    """Reactances of the lossless loads that are closest to oscillation, each (...,) [N s/m].
+    """Reactances X of the lossless loads closest to oscillation, (...,) [N s/m].
 
-    X > 0 at a frequency w is a mass X / w, X < 0 a spring of stiffness -X w.
+    X > 0 at a frequency w is a mass X / w, X < 0 a spring -X w.
     """
 
     hand: Real
@@ -286,7 +285,7 @@ def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: floa
 def _edge_crossings(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
 ) -> tuple[Real, Real]:
-    """Return (2, ...) t and u at which hand z + t dz and wall e + u de oscillate; nan if none."""
+    """Return t and u at which hand z + t dz and wall e + u de oscillate, or nan."""
     # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u; it is zero where
     # t = -(a + c u) / (b + d u) is real.
     hand_side, environment_side = z + h11, 1 + h22 * e
@@ -306,8 +305,7 @@ def bounded_singular_value(
 ) -> Real:
     """Return mu for hands and environments of the ranges; below 1 none of them can oscillate.
 
-    Sufficient only, but graded: each rectangle is enlarged to discs of five sizes, and the best
-    pair of discs counts.
+    Sufficient only, but graded: each rectangle is enlarged to the best of five discs.
     """
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
@@ -328,7 +326,7 @@ _DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # of a disc, in half dia
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Real]:
-    """Return centres and radii (..., 5) of discs through the two corners with least damping."""
+    """Return (..., 5) discs through the two corners with least damping."""
     diagonal = corners[..., 2] - corners[..., 0]
     right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS
     middle = corners[..., 0] + 0.5j * diagonal.imag

@@ -39,21 +39,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.common.writing import make_folder, output_folder, write_json
+from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
-from drake_teleop.lab.analysis.figures import (
-    OMEGA,
-    S,
-    absolute_figures,
-    bounded_figures,
-    diagram_figures,
-    margin_rows,
-    measured_figures,
-    parameter_maps,
-    transparency_figures,
-    two_port_deviations,
-    with_grip,
-    z_width_figures,
-)
 from drake_teleop.lab.analysis.linearization import (
     AXES,
     Linearization,
@@ -142,12 +129,12 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
 
     progress = stage("Two-port, margins, transparency")
     with_hand = hybrid_along(
-        close_other_directions(free, linear, along), OMEGA, along.hand, along.tool
+        close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
     )
-    H = absorb(with_hand, hand=-S * axis.hand_mass)
-    closed_form = hybrid(axis, S)
+    H = absorb(with_hand, hand=-figures.S * axis.hand_mass)
+    closed_form = hybrid(axis, figures.S)
     progress(0.3)
-    figures: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "direction": direction,
         "grip": scenario.operator.grip,
         "method": method,
@@ -156,19 +143,19 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
         "wall_is": describe_wall(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            diagram_figures(name, close_all_loops(system, linear), one_axis, sampling)
+            figures.diagram_figures(name, close_all_loops(system, linear), one_axis, sampling)
             for name, system, one_axis in points
         ],
-        "two_port": two_port_deviations(with_hand, axis, sampling),
-        "margins": margin_rows(axis, sampling, wall[0]),
-        "absolute": absolute_figures(H, axis),
-        "bounded": bounded_figures(H, axis, sampling),
-        "transparency": transparency_figures(H, axis, wall),
-        "z_width": z_width_figures(axis, sampling),
+        "two_port": figures.two_port_deviations(with_hand, axis, sampling),
+        "margins": figures.margin_rows(axis, sampling, wall[0]),
+        "absolute": figures.absolute_figures(H, axis),
+        "bounded": figures.bounded_figures(H, axis, sampling),
+        "transparency": figures.transparency_figures(H, axis, wall),
+        "z_width": figures.z_width_figures(axis, sampling),
     }
     progress(1.0)
-    maps = parameter_maps(axis, wall, sampling, stage)
-    figures["maps"] = [
+    maps = figures.parameter_maps(axis, wall, sampling, stage)
+    summary["maps"] = [
         {
             "title": title,
             "x": shown[scenario.operator.grip].x_name,
@@ -178,20 +165,20 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
         }
         for title, shown in maps.items()
     ]
-    figures["measured"] = None
-    if figures["diagram"][0]["stable"]:
+    summary["measured"] = None
+    if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        figures["measured"] = measured_figures(
+        summary["measured"] = figures.measured_figures(
             linear, along, close_other_directions(free, linear, along)
         )
         measured(1.0)
-    figures = _plain(figures)
-    figures["verdict"] = verdict(figures)
+    summary = _plain(summary)
+    summary["verdict"] = verdict(summary)
     nyquist = {}
     for grip in GRIPS:
-        loop = cut_loop(with_grip(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, OMEGA, axis.delay)
-    return figures, Curves(axis, OMEGA, H, closed_form, wall, nyquist, maps)
+        loop = cut_loop(figures.with_grip(contact, grip), sampling)
+        nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
+    return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
 
 
 def describe_wall(scenario: Scenario, is_known: bool) -> str:

@@ -28,15 +28,12 @@ _UNIT_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 @dataclass(frozen=True)
 class CutLoop:
-    """Loop L(z) from the displayed force back to it, without the channel's delay.
-
-    An end of the range of angles with |L| > 1 counts as a crossing.
-    """
+    """Loop L(z) from displayed force to displayed force, without the channel's delay."""
 
     open: Complex  #: (..., n) multipliers of the cut loop
     closed: Complex  #: (..., n) multipliers of the loop closed without delay
     period: Array  #: of the hand [s], (...)
-    angles: Array  #: (..., 32) crossings of |L(e^(j angle))| = 1, from 0 to pi
+    angles: Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
     phases: Array  #: unwrapped phases there
     signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
@@ -89,7 +86,6 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
     """Return the number of multipliers of the closed loop outside the unit circle, (...).
 
-    Those of the cut loop minus the turns of L z^(-D) around 1, which occur only while |L| > 1.
     `delay` is one way [s], (...); it is not rounded to hand periods.
     """
     D = (2 * np.asarray(delay) / loop.period)[..., None]
@@ -114,8 +110,7 @@ def delay_margin(loop: CutLoop) -> Array:
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     """Return the largest multiplier of the closed loop with imaginary part >= 0, (...).
 
-    `unstable_multipliers` on other circles is bisected, then refined by Newton's method: no matrix
-    grows with the delay. `delay` is one way [s], (...), exact at whole hand periods.
+    No matrix grows with the delay, one way [s], (...); exact at whole hand periods.
     """
     shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
     n = loop.open.shape[-1]
@@ -165,7 +160,6 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
 
 @njit(cache=True)
 def _loop(closed, opened, angle, radius):
-    """Return L at z = radius e^(j angle)."""
     z = complex(radius * math.cos(angle), radius * math.sin(angle))
     ratio = 1.0 + 0.0j
     for i in range(opened.shape[0]):
@@ -210,7 +204,6 @@ def _find_crossings(opened, closed, levels, angles, found):
 
 @njit(cache=True)
 def _add_pole_angles(angles, poles):
-    """Return the angles and more at each pole: peaks of |L| are as narrow as 1 - |pole|."""
     more = np.empty(_PEAK_OFFSETS.shape[0] * poles.shape[0])
     count = 0
     for pole in poles:

@@ -1,11 +1,9 @@
 """A loop with a delay: its unstable poles, delay margin and windows of stable delays, exactly.
 
-The loop is cut at the force displayed to the operator (T58): L(s) = N(s) / D(s) e^(-s RTT). A pole
-can cross the imaginary axis only at roots of |N(jw)| = |D(jw)|, a polynomial in w^2, at delays
-2 pi / w apart and always in the same direction (Walton and Marshall 1987; T59).
-
-If the displayed force contains an acceleration and the servo is ideal, |L| tends to a constant rho
-at high frequency. With rho >= 1 any delay causes infinitely many unstable poles.
+The loop L(s) = N(s) / D(s) e^(-s RTT) is cut at the displayed force (T58). A pole can cross the
+imaginary axis only at roots of |N(jw)| = |D(jw)|, at delays 2 pi / w apart and always in the same
+direction (Walton and Marshall 1987; T59). With an ideal servo and a displayed inertia, |L| tends
+to a constant rho at high frequency; with rho >= 1 any delay causes infinitely many unstable poles.
 
 Parameters that are not positive, or N of higher order than D, raise DrakeTeleopError.
 """
@@ -214,7 +212,6 @@ def phase_lag_to_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
 
 
 def _first_delay(loop: DelayedLoop, frequency: Array) -> Array:
-    """Return the first delay (..., n) with a pole on the axis at these frequencies."""
     undelayed = replace(loop, delay=np.zeros_like(loop.delay))
     return np.mod(phase_lag_to_minus_one(undelayed, frequency), 2 * np.pi) / frequency
 

@@ -59,10 +59,7 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return whether an operating point is stable, and its slowest motion.
-
-    Above `MAX_STATES` states (about a second of delay) only one axis is analysed.
-    """
+    """Return stability and slowest motion; above `MAX_STATES` states only of one axis."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -88,10 +85,7 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the deviations of the Diagram's two-port from the closed and the sampled form.
-
-    The hand's mass moves with the stylus and is compared as a part of the device.
-    """
+    """Return the Diagram's deviations from closed and sampled form, hand's mass included."""
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
@@ -133,7 +127,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria for passive loads; passivity on scaled ports."""
+    """Return criteria for passive loads."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -157,7 +151,6 @@ def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, 
 
 
 def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
-    """Return the stiffness up to which walls are stable [N/m]; 0 if free motion is unstable."""
     stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
     walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)
@@ -225,10 +218,7 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Return the impedance displayed in free motion, simulated with all noise of the sensor.
-
-    Coulomb friction is left out: its effect depends on the amplitude.
-    """
+    """Return the impedance displayed in free motion, simulated with noise, without friction."""
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])

@@ -133,7 +133,6 @@ class Linearization:
         return values[np.argsort(-np.abs(values))].astype(complex)
 
     def _sparse_transition(self, size: int) -> Any:
-        """Return `expanded().A` as a sparse array."""
         from scipy.sparse import lil_array
 
         n = end = len(self.A)
@@ -187,11 +186,7 @@ def _use_brackets(name: str) -> str:
 
 
 def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
-    """Return eigenvalues of a sparse A near the unit circle, from angle 0 to `highest` [rad].
-
-    Shift and invert finds those nearest to a point of the circle; the next point is at their
-    largest angle.
-    """
+    """Return eigenvalues of a sparse A, by shift and invert along the unit circle."""
     from scipy.sparse.linalg import eigs
 
     start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
@@ -324,7 +319,6 @@ def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) 
 
 
 def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
-    """Return which states affect an output, directly or through other states."""
     affects = (C != 0.0).any(axis=0)
     while True:
         more = affects | (A[affects] != 0.0).any(axis=0)
@@ -335,7 +329,7 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _States:
-    """States of one block: `part` of its discrete `group`, or of the continuous state."""
+    """States of one block: `part` of a discrete `group` or of the continuous state."""
 
     system: str
     group: int | None
@@ -344,8 +338,6 @@ class _States:
 
 
 class _Period:
-    """One period of the Diagram as a function of its states and the cut inputs."""
-
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
         own_period = scenario.master.own_period(scenario.rates.hand_hz)
@@ -463,7 +455,7 @@ class _Period:
         self._sensor.bring_up_to_date(self._context("wrist_sensor"))
 
     def _apply(self, u: Array) -> None:
-        """Set the cut inputs to their values at the operating point plus `u` (24,)."""
+        """Set the cut inputs to those of the operating point plus `u` (24,)."""
         self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
         self._fix("inverse_kinematics", "pose_command", _displace(self._pose, u[6:12]))
         self._fix("force_display", "wrench_command", self._wrench + u[12:18])
@@ -535,10 +527,7 @@ class _Period:
         return self.get()
 
     def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the state of rest near x, A and C, by Newton's method on the slave's states.
-
-        The master is at rest already; without the hand any position of it is an equilibrium.
-        """
+        """Return the slave's state of rest, A and C, by Newton's method; the master is at rest."""
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_NEWTON_STEPS):
             A, C = self.derivative(x)
@@ -558,7 +547,6 @@ class _Period:
         )
 
     def derivative(self, x: Array) -> tuple[Array, Array]:
-        """Return A and C at the states x."""
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
         self._apply(np.zeros(24))
         for k, step in enumerate(self._steps):
@@ -574,7 +562,6 @@ class _Period:
         return A, C
 
     def input_derivative(self, x: Array) -> Array:
-        """Return B at the states x."""
         B = np.empty((len(x), 24))
         pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
         for k, step in enumerate(
@@ -601,7 +588,6 @@ def _displacement(pose: Array, other: Array) -> Array:
 
 
 def _linear_part(scenario: Scenario) -> Scenario:
-    """Return the scenario without its nonlinear parts and without the cut loops."""
     parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
     return replace(
         scenario,

@@ -196,7 +196,6 @@ def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
 
 
 def _zero_fraction(value: Array) -> Array:
-    """Return the fraction of each step at which the value is zero, else NaN."""
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)

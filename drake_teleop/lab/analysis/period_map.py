@@ -109,7 +109,7 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
 
 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """Return the hand periods in the common period; each event's time to the next and updates."""
+    """Return the hand periods in the common period; each event's duration and updates."""
     hand = np.asarray(sampling.hand_hz, dtype=float)
     ratios = []
     for name in ("joint_control_hz", "sensor_hz"):
@@ -129,7 +129,6 @@ def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, b
 def _schedule(
     servo: Fraction, sensor: Fraction
 ) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """Return `_events` for rates of servo and sensor relative to the hand's."""
     lengths = [Fraction(1), 1 / servo, 1 / sensor]
     common = Fraction(
         math.lcm(*(length.numerator for length in lengths)),
@@ -150,7 +149,6 @@ def _schedule(
 
 
 def _sections(sampling: Sampling) -> Array:
-    """Return the sections (..., 2, 5) of the sensor's low-pass, (0, 5) if ideal."""
     if sampling.low_pass_hz is None:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
@@ -184,7 +182,6 @@ class _Rows:
         return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
 
     def hand(self, period: Array, received: int) -> Array:
-        """Return x_m and v_m a hand period later."""
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = _held_response(0.0, axis.device_damping / mass, period)
@@ -200,13 +197,12 @@ class _Rows:
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
     def servo(self, command: int) -> Array:
-        """Return the acceleration k_v (k_p (l_p x_command - x_s) - v_s)."""
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
         row = self._row({command: kv * kp * self._axis.position_scale})
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor(self, sections: Array) -> Array:
-        """Return the scaled sample after elimination, and the memory of the low-pass."""
+        """Return the scaled sample after elimination, and the filter's memory."""
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
@@ -227,7 +223,6 @@ class _Rows:
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
 
     def slave(self, time: Array) -> Array:
-        """Return x_s and v_s after `time` [s], on the wall."""
         axis = self._axis
         mass = axis.slave_mass
         x, v, push = _held_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
@@ -250,7 +245,7 @@ def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Ar
 
 
 def _matrix_exponential(M: Array) -> Array:
-    """Return e^M of (..., n, n): the Taylor series of M / 2^s, squared s times."""
+    """Return e^M by the Taylor series of M / 2^s, squared s times."""
     largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
     halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0
     term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)

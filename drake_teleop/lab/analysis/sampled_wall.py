@@ -127,9 +127,8 @@ def stable_stiffness(
 ) -> Array:
     """Return the K at which the loop with one hand becomes unstable; 0 if any K is unstable.
 
-    A pole reaches the unit circle at e^(j theta) where the K that closes the loop there,
-    -z^d / P(z) - B (z - 1) / (Ts z), is real. P is the device between two samples under held force.
-    `mass`, `damping` and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
+    A pole reaches the unit circle where the K that closes the loop there is real. `mass`, `damping`
+    and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
     """
     mass, damping, B, hand = np.broadcast_arrays(mass, damping, wall_damping, hand_stiffness)
     state, held = _sampled_device(mass, damping, hand, period)
@@ -186,7 +185,7 @@ def sampled_poles(
 
 
 def _cosine_coefficients(K: Array, B: Array, period: float, delay: int) -> Array:
-    """Return the coefficients (..., d + 2) of the required damping over cos(i theta)."""
+    """Return the required damping's coefficients over cos(i theta)."""
     checked_positive(period, "period")
     _require_whole_samples(delay)
     K, B = np.broadcast_arrays(K, B)
@@ -203,7 +202,7 @@ def _cosine_sum(coefficients: Array, angle: Array) -> Array:
 
 
 def _maximum(coefficients: Array) -> tuple[Array, Array]:
-    """Return the largest sum of cosines and its theta: on a grid, then by Newton's method."""
+    """Return the largest sum of cosines and its theta."""
     order = np.arange(coefficients.shape[-1])
     angles = np.linspace(0, np.pi, 64 * len(order) + 1)
     step = angles[1]
@@ -229,7 +228,7 @@ def _maximum(coefficients: Array) -> tuple[Array, Array]:
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return Phi (..., 2, 2) and Gamma (..., 2) of position and velocity under held force."""
+    """Return Phi (..., 2, 2) and Gamma (..., 2) of the device under held force."""
     from scipy.linalg import expm
 
     m, b = (
@@ -250,7 +249,7 @@ def _sampled_device(
 def _critical_stiffness(
     state: Array, held: Array, B: Array, period: float, delay: int, angle: Array
 ) -> Complex:
-    """Return the K that puts a pole on e^(j theta); only real values are physical."""
+    """Return the K that puts a pole on e^(j theta), if real."""
     z = np.exp(1j * angle)
     trace = state[..., 0, 0] + state[..., 1, 1]
     det = state[..., 0, 0] * state[..., 1, 1] - state[..., 0, 1] * state[..., 1, 0]

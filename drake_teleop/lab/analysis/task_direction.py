@@ -134,7 +134,7 @@ def task_direction(
 
 
 def _wall_stiffness(scenario: Scenario) -> float:
-    """Return that of the leaf, or of wall and tool ball in series [N/m]; else 0."""
+    """Return that of the leaf, or of wall and tool ball in series; else 0."""
     if scenario.leaf is not None:
         return float(scenario.leaf.stiffness)
     wall = scenario.surroundings
@@ -147,7 +147,6 @@ def _wall_stiffness(scenario: Scenario) -> float:
 def _device_mass_and_damping(
     scenario: Scenario, displacement_B: Array, n: Array
 ) -> tuple[float, float]:
-    """Return mass (without the hand) and damping of the device along n (6,)."""
     hand = scenario.operator.hand
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     start[4:] += displacement_B

@@ -204,7 +204,7 @@ def station_run(
 def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, Figures]:
-    """Return a run and its figures; the run ends after the hold if it is not at rest there."""
+    """Return run and figures; end it after the hold if it is not at rest there."""
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
@@ -319,7 +319,6 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
 def _run_parallel(
     function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
 ) -> list[Any]:
-    """Return the function's result for each case, in order, from several processes."""
     from joblib import Parallel, delayed
 
     results = []

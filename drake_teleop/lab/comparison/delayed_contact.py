@@ -130,7 +130,7 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
 def _slave_motion(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (N,) height of So [m] and (N, 3) rotation vector from the first row [rad]."""
+    """Return height of So [m] and (N, 3) rotation vector from the start [rad]."""
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
     poses = _poses(arm.table, q)
@@ -140,7 +140,6 @@ def _slave_motion(
 
 @njit(cache=True)
 def _poses(arm, q):
-    """Return (N, 7) X_WS at each row of q."""
     R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
     for k in range(q.shape[0]):
         forward_kinematics(arm, q[k], R, p)

@@ -90,7 +90,6 @@ def hands(method: str, network: str, seed: int = 0) -> Hands:
 
 
 def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
-    """Return (N, 2) position and velocity; at rest on the wall's surface before and after."""
     t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
     moving = (t > 0.0) & (t < _NUM_TAPS / rate)
     x = np.where(moving, -_TAP_AMPLITUDE * np.sin(2 * np.pi * rate * t), 0.0)

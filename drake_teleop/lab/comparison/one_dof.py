@@ -1,12 +1,9 @@
-"""One degree of freedom of the station (long: its plant, task, figures): thousands of runs.
+"""One degree of freedom of the station: plant, task and figures, for thousands of runs.
 
-Hand and device are one mass on the hand's spring and damper; the slave is a mass behind a position
-servo; the environment is a stiff wall (equations: `OneDof`). The station's own channel,
-`drake_teleop.station.channel.channel.channel_step`, connects them along x at 1 kHz. Its forces are
-held for a period; the masses take 20 integration steps in it.
-
-The operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a given
-intent. `OneDofRun.accounts` has the energy balances.
+The equations are those of `OneDof`. The station's own `channel_step` connects hand and slave along
+x at 1 kHz. Its forces are held for a period; the masses take 20 integration steps in it. The
+operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a given
+intent.
 """
 
 from __future__ import annotations
@@ -304,15 +301,11 @@ def figures_of(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the least device damping that makes it passive with delay and slave [N s/m] (T43).
-
-    Without elimination (sigma > 0) the delayed inertia is active at high frequency.
-    """
+    """Return the least device damping that makes it passive with delay and slave [N s/m] (T43)."""
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 
 def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
-    """Return Re Z at `_FREQUENCIES` [N s/m]."""
     s = 1j * _FREQUENCIES
     D, K = model.servo_damping, model.servo_stiffness
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
@@ -333,10 +326,7 @@ def _peak_to_peak(x: NDArray[np.float64]) -> float:
 
 
 def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
-    """Return the samples from `pressed` to `felt`, both beyond half of `steady`; NaN if undefined.
-
-    The common level avoids a negative delay for a method that displays only half of the force.
-    """
+    """Return the samples from `pressed` to `felt`, both beyond half of `steady`, or NaN."""
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))
@@ -425,19 +415,17 @@ def _simulate(
 
 @njit(cache=True)
 def _quantise(x, resolution):
-    """Return a position as the encoder measures it."""
     return np.round(x / resolution) * resolution if resolution > 0.0 else x
 
 
 @njit(cache=True)
 def _wall_push(stiffness, damping, depth, speed):
-    """Return the wall's force on the slave, outwards; negative values mean no contact [N]."""
+    """Return the wall's outward force; negative: no contact."""
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 
 
 @njit(cache=True)
 def _mean_positive(a, b):
-    """Return the mean of max(., 0) on the line from a to b."""
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:
