@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drake_teleop.lab.comparison.decision import decide
-from drake_teleop.lab.comparison.hands import hands
+from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_runs
 
 
@@ -63,12 +63,15 @@ def test_unstable_cell_has_leaf_and_motion(figures, words):
 
 
 def test_letting_go_accelerates_the_device_without_a_method():
-    none, ledger = hands("none", "internet"), hands("ledger", "internet")
+    none, ledger = (
+        simulate_release_and_taps("none", "internet"),
+        simulate_release_and_taps("ledger", "internet"),
+    )
     assert none.release_speed > 1.0 and none.leaked > 1.0 and none.release_way > 1.0
     assert ledger.release_speed < 0.3 and ledger.leaked <= 1e-6
     assert ledger.release_force > 2.5 and ledger.release_way < 0.1
     # Without a method every impulse arrives, also with a delay of half a tap.
-    for shown in (none, hands("none", "geostationary")):
+    for shown in (none, simulate_release_and_taps("none", "geostationary")):
         assert shown.tap_shares == pytest.approx((1.0, 1.0), abs=0.02)
     assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
 

@@ -1,8 +1,8 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
 Three studies use the same channel: the whole station presses on leaves (`delayed_contact`); in one
-degree of freedom the hand lets go and taps (`hands`); there, the longest stable round trip for
-walls of three stiffnesses (`one_dof`). `summary.json` contains
+degree of freedom the hand lets go and taps (`release_and_taps`); there, the longest stable round
+trip for walls of three stiffnesses (`one_dof`). `summary.json` contains
 
 ========= ======================================================================================
 decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
@@ -11,7 +11,7 @@ station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with
           hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
           left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
           (left_behind and drift are null); `error` says why a run ended early (others are null)
-hands     list: method, network, fields of `hands.Hands`
+hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
 one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
           grid_s were stable (0: none)
 covering  list: sigma, round_trip_s, wall_N_per_m; injected_J, energy created in one run without
@@ -42,7 +42,6 @@ from drake_teleop.lab.comparison.delayed_contact import (
     station_figures,
     vertical_traces,
 )
-from drake_teleop.lab.comparison.hands import hands
 from drake_teleop.lab.comparison.one_dof import (
     ACTUAL,
     Figures,
@@ -52,6 +51,7 @@ from drake_teleop.lab.comparison.one_dof import (
     figures,
     run_one_dof,
 )
+from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
@@ -252,7 +252,7 @@ def _hands_study(
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
     found = _run_parallel(
-        hands,
+        simulate_release_and_taps,
         [(method, network, seed) for network, method in cases],
         jobs,
         stage("Let go, and taps"),

@@ -1,6 +1,6 @@
 """Decision table: one verdict for each method and network.
 
-The first that applies, of the whole station on all leaves (energy: also of the `hands` runs)::
+The first that applies, of the whole station on all leaves (energy: also of `release_and_taps`)::
 
     unstable      it does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact

@@ -15,7 +15,7 @@ from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
 from drake_teleop.common.writing import write_picture, write_text
 from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
-from drake_teleop.lab.comparison.hands import RATES
+from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
@@ -120,8 +120,16 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
-        (f"felt of taps at {RATES[0]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][0]),
-        (f"felt of taps at {RATES[1]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][1]),
+        (
+            f"felt of taps at {TAP_RATES[0]:g} Hz [%]",
+            "linear",
+            lambda row: 100 * row["tap_shares"][0],
+        ),
+        (
+            f"felt of taps at {TAP_RATES[1]:g} Hz [%]",
+            "linear",
+            lambda row: 100 * row["tap_shares"][1],
+        ),
     )
     with house_style():
         figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
