@@ -145,10 +145,10 @@ def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
             to_open, to_closed = z[..., None] - opened, z[..., None] - closed
-            P, M, late = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
-            slope = P * (1 / to_open).sum(axis=-1) * (1 - late)
-            slope += (M * (1 / to_closed).sum(axis=-1) + (P - M) * D / z) * late
-            value = P * (1 - late) + M * late
+            P, M, delay_factor = to_open.prod(axis=-1), to_closed.prod(axis=-1), z**-D
+            slope = P * (1 / to_open).sum(axis=-1) * (1 - delay_factor)
+            slope += (M * (1 / to_closed).sum(axis=-1) + (P - M) * D / z) * delay_factor
+            value = P * (1 - delay_factor) + M * delay_factor
             step = np.where(value == 0, 0.0, value / slope)
             # Roots that are found stay: at a root of P or M itself the slope is not valid.
             z = np.where(found | ~np.isfinite(step), z, z - step)

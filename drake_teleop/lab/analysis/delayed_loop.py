@@ -156,8 +156,8 @@ def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
 def unstable_poles(loop: DelayedLoop) -> Array:
     """Return the number of closed-loop poles in the right half plane (...), or inf."""
     frequency, direction = gain_crossings(loop)
-    late = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
-    crossed = np.ceil(np.clip(np.nan_to_num(late), 0, None))
+    excess_turns = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
+    crossed = np.ceil(np.clip(np.nan_to_num(excess_turns), 0, None))
     count = _unstable_without_delay(loop) + 2 * np.sum(direction * crossed, axis=-1)
     endless = (loop.delay > 0) & (loop.high_frequency_gain >= 1)
     return np.where(endless, np.inf, count)

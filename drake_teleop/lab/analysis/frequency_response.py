@@ -203,12 +203,12 @@ def predict_frequency_response(
         return (pushed[:, row : row + 6] @ direction)[None]
 
     _, backward = delays(scenario)
-    late = np.exp(-1j * np.asarray(omega) * system.dt * backward)
+    delay_factor = np.exp(-1j * np.asarray(omega) * system.dt * backward)
     spectra = {
         # Unit force in place of the intent, plus the operator's reaction.
         "hand_force": 1 + along("operator_wrench", task.hand),
         "hand_velocity": along("twist_master", task.hand),
-        "felt_force": late * along("wrench_B", task.hand),
+        "felt_force": delay_factor * along("wrench_B", task.hand),
         "tool_velocity": along("twist_slave", task.tool),
     }
     return StationResponse(omega, spectra, scenario.force_scaling.force_scale)

@@ -107,7 +107,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     n, period = M.shape[-1] - 3, 1 / sampling.hand_hz
     w = np.atleast_1d(np.asarray(frequency, dtype=float))
     z = np.exp(1j * w * period)
-    late = z ** -delay_steps(axis, sampling)
+    delay_factor = z ** -delay_steps(axis, sampling)
     # Responses without delay to a force on the device, and to one of the environment.
     C = np.eye(n)[[V_M, V_S, SAMPLE]]
     response = _resolvent(M[:n, :n], M[:n, n : n + 2], C, z)
@@ -115,8 +115,8 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
     hold = -np.expm1(-1j * w * period) / (1j * w * period)
     H = np.array(
         [
-            [hold * (1 + late**2 * felt) / v_m, late * felt_e],
-            [-late * v_s / v_m, -give / hold],
+            [hold * (1 + delay_factor**2 * felt) / v_m, delay_factor * felt_e],
+            [-delay_factor * v_s / v_m, -give / hold],
         ]
     )
     return np.moveaxis(H, 2, 0)

@@ -46,12 +46,12 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
     `servo` replaces C/(Z_s + C) and 1/(Z_s + C) of the axis.
     """
     response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
-    late = np.exp(-s * axis.delay)
+    delay_factor = np.exp(-s * axis.delay)
     tool = axis.displayed_tool_mass * s
-    slave = axis.position_scale * late * response
+    slave = axis.position_scale * delay_factor * response
     return two_port(
-        device_impedance(axis, s) + axis.force_scale * late * tool * slave,
-        axis.force_scale * late * (axis.gamma - tool * slave_admittance),
+        device_impedance(axis, s) + axis.force_scale * delay_factor * tool * slave,
+        axis.force_scale * delay_factor * (axis.gamma - tool * slave_admittance),
         -slave,
         slave_admittance,
     )
@@ -59,14 +59,15 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
 def force_velocity_exchange(s: Complex, delay: ArrayLike) -> Complex:
     """Return H of a line that delays force and velocity (T53)."""
-    late = np.exp(-s * np.asarray(delay))
-    return two_port(0.0, late, -late, 0.0)
+    delay_factor = np.exp(-s * np.asarray(delay))
+    return two_port(0.0, delay_factor, -delay_factor, 0.0)
 
 
 def wave_line(s: Complex, delay: ArrayLike, impedance: ArrayLike) -> Complex:
     """Return H of a delay line with wave variables (T53)."""
-    late = np.exp(-s * np.asarray(delay))
-    tanh, sech = (1 - late**2) / (1 + late**2), 2 * late / (1 + late**2)
+    delay_factor = np.exp(-s * np.asarray(delay))
+    tanh = (1 - delay_factor**2) / (1 + delay_factor**2)
+    sech = 2 * delay_factor / (1 + delay_factor**2)
     b = np.asarray(impedance)
     return two_port(b * tanh, sech, -sech, tanh / b)
 
@@ -98,8 +99,8 @@ def four_channel(
     s: Complex, master: Complex, slave: Complex, channels: Channels, delay: ArrayLike = 0.0
 ) -> Complex:
     """Return H of the four-channel station with delayed C1 to C4 (T39)."""
-    late = np.exp(-s * np.asarray(delay))
-    c1, c2, c3, c4 = (late * np.asarray(c) for c in channels[:4])
+    delay_factor = np.exp(-s * np.asarray(delay))
+    c1, c2, c3, c4 = (delay_factor * np.asarray(c) for c in channels[:4])
     at_slave, at_master = 1 + np.asarray(channels.c5), 1 + np.asarray(channels.c6)
     determinant = at_master * slave - c3 * c4
     return (

@@ -32,23 +32,23 @@ def verdict(figures: dict[str, Any]) -> list[str]:
 
 
 def _stability_sentence(point: dict[str, Any], grip: str) -> str:
-    pace, hertz = point["decay_1_per_s"], point["frequency_Hz"]
-    if pace is None:
+    decay, hertz = point["decay_1_per_s"], point["frequency_Hz"]
+    if decay is None:
         stable = "stable" if point["stable"] else "unstable"
         return f"In the state '{point['point']}' one axis of the station is {stable}."
     state = f"In the state '{point['point']}', {grip} grip, it is"
     motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
     if point["stable"]:
-        return f"{state} stable: motion halves every {1e3 * np.log(2) / pace:.3g} ms, {motion}."
-    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / pace:.3g} ms, {motion}."
+        return f"{state} stable: motion halves every {1e3 * np.log(2) / decay:.3g} ms, {motion}."
+    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / decay:.3g} ms, {motion}."
 
 
 def _margin_sentences(row: dict[str, Any], delay: float) -> list[str]:
     wall = f"a wall of {_stiffness_text(row['wall_N_per_m'])}"
     if not row["stable"]:
         return [f"At {wall} it is unstable with this grip."]
-    spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
-    longest = "any round trip" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
+    reserve = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
+    longest = "any round trip" if reserve is None else f"{1e3 * reserve:.3g} ms more round trip"
     more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
     return [f"At {wall} it stays stable with {longest}, or with {more}."]
 

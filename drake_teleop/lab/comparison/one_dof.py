@@ -311,9 +311,10 @@ def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
     slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
     closed_loop = 1.0 if model.ideal_servo else K / slave
     # The command's interpolation and the held force add 1.5 periods.
-    late = np.exp(-s * (round_trip + 1.5 * PERIOD))
+    delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD))
     contact = model.gamma * model.wall_stiffness / s
-    felt = model.force_scale * (contact + model.sigma * model.tool_mass * s) * closed_loop * late
+    inertia = model.sigma * model.tool_mass * s
+    felt = model.force_scale * (contact + inertia) * closed_loop * delay_factor
     return np.asarray(felt.real)
 
 
