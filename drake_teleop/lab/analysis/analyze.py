@@ -6,7 +6,7 @@ The two-port between hand and environment is that of the linearised Diagram. `su
 scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (of its
              leaf or wall, otherwise the paper's 5.1 kN/m), wall_is (source of this value)
 axis         fields of `analysis.one_axis.OneAxis`, and tool_coupling
-diagram      list: operating point, states, stable, decay_1_per_s (of the slowest motion),
+diagram      list: point, states, stable, decay_1_per_s (of the slowest motion),
              frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
 two_port     largest deviation of the Diagram's H, hand's mass included, up to 30 Hz, from the
              closed_form and the sampled model of one axis
@@ -15,10 +15,11 @@ absolute     absolutely_stable, least_parameter (>= 1 is stable) and at_Hz,
              lacking_damping_Ns_per_m, passive, scattering_norm
 bounded      grips: stiffest wall [N/m] for every hand between the lightest and the firmest grip;
              each: for each grip alone; null: no limit
-transparency free and wall: mass_kg, damping_Ns_per_m, stiffness_N_per_m, displayed and ideal;
+transparency free and wall: felt and ideal, each mass [kg], damping [N s/m], stiffness [N/m]; and
              unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades; smallest_stiffness_N_per_m
-z_width      device's damping and rate; list: wall_damping, passive_N_per_m, stable_N_per_m
-maps         list: x, y, stable (fraction of the map), boundary (points)
+z_width      device_damping_Ns_per_m, rate_Hz; walls: list: wall_damping_Ns_per_m, passive_N_per_m,
+             passive_in_the_hand_N_per_m, stable_in_the_hand_N_per_m
+maps         list: title, x, y; for each grip: stable (fraction of the map), boundary (points)
 measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
              felt_im, coherence, greatest_error and greatest_error_deg against the linearisation;
              null if free motion is unstable
