@@ -30,9 +30,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inverse_kinematics import described
 from stations import ARMS
 
-from drake_teleop.lab.analysis.analyze import DIRECTIONS, closed, held_elsewhere, sampling_of
+from drake_teleop.lab.analysis.analyze import (
+    DIRECTIONS,
+    close_all_loops,
+    close_other_directions,
+    sampling_of,
+)
 from drake_teleop.lab.analysis.cut_loop import cut_loop, dominant_multiplier
-from drake_teleop.lab.analysis.figures import OMEGA, bounded_figures, held_by
+from drake_teleop.lab.analysis.figures import OMEGA, bounded_figures, with_grip
 from drake_teleop.lab.analysis.linearization import Linearization, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
@@ -99,7 +104,9 @@ def figures(scenario: Scenario) -> dict[str, Any]:
     estimate = np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
     along, sampling = task_direction(scenario, DIRECTIONS["z"]), sampling_of(scenario)
     free = linearize(scenario, load_estimate=estimate)
-    with_hand = hybrid_along(held_elsewhere(free, scenario, along), OMEGA, along.hand, along.tool)
+    with_hand = hybrid_along(
+        close_other_directions(free, scenario, along), OMEGA, along.hand, along.tool
+    )
     axis = along.axis
     H = absorb(with_hand, hand=-1j * OMEGA * axis.hand_mass)
     limits = bounded_figures(H, axis, sampling)["each"]
@@ -110,12 +117,12 @@ def figures(scenario: Scenario) -> dict[str, Any]:
         "motion later over earlier, and as predicted": {
             f"{grip}, {share:g} of it": (
                 pressed(scenario, grip, limit, share),
-                predicted(held_by(axis, grip), limit, share, sampling),
+                predicted(with_grip(axis, grip), limit, share, sampling),
             )
             for grip, limit in limits.items()
             for share in (0.9, 1.1)
         },
-        "slowest motion": slowest(scenario, closed(free, scenario)),
+        "slowest motion": slowest(scenario, close_all_loops(free, scenario)),
     }
 
 

@@ -1,4 +1,4 @@
-"""docs/analysis.md: its scripts run, its tables are what they print or what the Diagram says."""
+"""docs/analysis.md: its scripts run, its tables equal their output or the Diagram's values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from drake_teleop.lab.analysis.absolute_stability import (
     worst_loads,
 )
 from drake_teleop.lab.analysis.cut_loop import cut_loop, unstable_multipliers
-from drake_teleop.lab.analysis.delay_limits import delay_independent_mass, tolerated_mass_error
 from drake_teleop.lab.analysis.delayed_loop import held_device
 from drake_teleop.lab.analysis.linearization import AXES, hybrid_along, linearize
 from drake_teleop.lab.analysis.one_axis import OneAxis
@@ -35,7 +34,7 @@ UP = (0.0, 0.0, 1.0)
 
 
 def rows(heading: str) -> list[list[str]]:
-    """Cells of the table whose heading begins so."""
+    """Return the cells of the table with this heading."""
     _, table = TEXT.split(f"| {heading} |", 1)
     lines = table.split("\n\n", 1)[0].splitlines()[2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
@@ -47,14 +46,14 @@ def axis_of(grip: str) -> OneAxis:
     return OneAxisFromScenario(scenario, UP)
 
 
-def test_the_table_of_margins_is_what_its_script_prints(capsys):
+def test_table_of_margins_equals_output_of_its_script(capsys):
     exec(compile(MARGINS, "analysis.md", "exec"), {})
     printed = capsys.readouterr().out.splitlines()
     assert [line for line in TEXT.splitlines() if line in printed] == printed
     assert len(rows("grip | wall, kN/m")) == len(printed) == 12
 
 
-def test_the_functions_work_as_shown():
+def test_functions_work_as_shown():
     names: dict = {}
     exec(compile(IN_PYTHON, "analysis.md", "exec"), names)
     assert not names["is_robust"]
@@ -65,12 +64,12 @@ def test_the_functions_work_as_shown():
 
 
 @pytest.mark.slow
-def test_the_diagram_works_as_shown():
-    # The estimate that the script takes some seconds to identify.
+def test_diagram_works_as_shown():
+    # The script identifies this estimate, which takes some seconds.
     shown = 'dt.identify_load(dt.LoadScenario("identification")).estimate'
     assert shown in DIAGRAM
     true = np.concatenate([np.zeros(6), slave_arm(LoadScenario("free_motion_force")).phi_load])
-    true.flags.writeable = False  # as that is
+    true.flags.writeable = False  # as the identified estimate
     names: dict = {"true": true}
     exec(compile(DIAGRAM.replace(shown, "true"), "analysis.md", "exec"), names)
     assert abs(names["closed"].multipliers[0]) < 1
@@ -79,7 +78,7 @@ def test_the_diagram_works_as_shown():
 
 @pytest.fixture(scope="module")
 def diagrams():
-    """Sensor -> (omega, H of the Diagram with the hand's mass, its axis, its rates)."""
+    """Return sensor -> (omega, H of the Diagram with the hand's mass, its axis, its rates)."""
     omega, found = 2 * np.pi * np.geomspace(0.1, 300.0, 500), {}
     for sensor, name in (("real", "contact_transition"), ("ideal", "ideal_sensor")):
         scenario = with_values(LoadScenario(name), sheet_spring=None, force_scaling__sigma=0.0)
@@ -100,7 +99,7 @@ def diagrams():
 
 
 @pytest.mark.slow
-def test_how_far_the_models_are_from_the_diagram(diagrams):
+def test_deviations_of_the_models_from_the_diagram(diagrams):
     for model, sensor, *said in rows("model | sensor"):
         omega, H, axis, sampling = diagrams[sensor]
         band = omega <= 2 * np.pi * 30
@@ -116,7 +115,7 @@ def test_how_far_the_models_are_from_the_diagram(diagrams):
 
 
 @pytest.mark.slow
-def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
+def test_lacking_damping_and_stiffness_limit_of_the_grips(diagrams):
     omega, H, axis, _ = diagrams["real"]
     H = absorb(H, hand=-1j * omega * axis.hand_mass)
     (damping,) = re.findall(r"lacks (\d+) N s/m", TEXT)
@@ -134,16 +133,16 @@ def test_what_llewellyn_lacks_and_what_the_grips_bear(diagrams):
 
 
 @pytest.mark.slow
-def test_errors_of_the_load():
+def test_bounds_on_mass_errors():
     error, sampling = np.arange(0.0, 14.0, 0.01), Sampling(low_pass_hz=500.0)
     for grip, *said in rows("grip | bound, kg"):
         axis = axis_of(grip)
-        device = held_device(axis)
+        m, b, k = held_device(axis)
         wrong = replace(axis, wall_stiffness=0.0, wall_damping=0.0, mass_error=error)
         unstable = unstable_multipliers(cut_loop(wrong, sampling), 0.0) > 0
         found = [
-            tolerated_mass_error(device[0], axis.force_scale, axis.position_scale),
+            m / (axis.force_scale * axis.position_scale),
             error[np.argmax(unstable)],
-            delay_independent_mass(*device) / axis.force_scale,
+            b * np.sqrt(m / k - b**2 / (4 * k**2)) / axis.force_scale,
         ]
         np.testing.assert_allclose(found, [float(x) for x in said], atol=0.06)

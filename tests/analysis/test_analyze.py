@@ -21,15 +21,15 @@ PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 
 @pytest.fixture(autouse=True, scope="module")
 def coarse_maps():
-    """Maps of few pixels: they are tested by themselves."""
+    """Use coarse maps: test_maps.py tests them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(of_summary, "_PIXELS", 12)
+        patch.setattr(of_summary, "_MAP_POINTS", 12)
         yield
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """The command on the paper's contact: its summary and its folder."""
+    """Return summary and folder of the command on the paper's contact."""
     folder = tmp_path_factory.mktemp("analyze")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -39,7 +39,7 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_it_writes_a_page_with_all_of_its_pictures(run):
+def test_page_contains_all_pictures(run):
     summary, out = run
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png") == len(PICTURES)
@@ -50,21 +50,21 @@ def test_it_writes_a_page_with_all_of_its_pictures(run):
 
 
 @pytest.mark.slow
-def test_the_diagram_is_the_sampled_model_of_one_axis(run):
-    """The hand holds all other directions; what couples with them is left in h11."""
+def test_diagram_equals_sampled_model_of_one_axis(run):
+    """The hand holds all other directions; h11 contains their coupling."""
     assert max(run[0]["two_port"]["sampled"].values()) < 1e-4
 
 
 @pytest.mark.slow
-def test_what_dies_last_dies_as_on_one_axis(run):
-    """Of this scenario it is the vertical motion, which the wrist's coupling changes by 1 %."""
+def test_slowest_motion_agrees_with_one_axis(run):
+    """It is the vertical motion, which the wrist's coupling changes by 1 %."""
     for point in run[0]["diagram"]:
         for name in ("decay_1_per_s", "frequency_Hz"):
             assert point[name] == pytest.approx(point["one_axis"][name], rel=0.02)
 
 
 @pytest.mark.slow
-def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
+def test_nonlinear_simulation_agrees_with_linearised_diagram(run):
     measured = run[0]["measured"]
     assert max(measured["frequency_Hz"]) > 29.9
     assert measured["greatest_error"] < 0.02 and measured["greatest_error_deg"] < 2.0
@@ -72,7 +72,7 @@ def test_the_nonlinear_simulation_feels_as_the_linearised_diagram(run):
 
 
 @pytest.mark.slow
-def test_what_is_said_of_stability_is_one_story(run):
+def test_all_stability_figures_are_consistent(run):
     """The linearised Diagram, the margins, the stiffest walls and the maps agree."""
     summary, _ = run
     assert all(point["stable"] for point in summary["diagram"])
@@ -80,7 +80,7 @@ def test_what_is_said_of_stability_is_one_story(run):
         limit = summary["bounded"]["each"][row["grip"]]
         assert row["stable"] == (limit is None or row["wall_N_per_m"] < limit)
         assert row["stable"] or (row["gain"], row["round_trip_s"]) == (1.0, 0.0)
-    # A range of hands holds no stiffer a wall than the worst of its members.
+    # The limit of a range is not above that of its worst member.
     assert summary["bounded"]["grips"] <= 1.02 * min(summary["bounded"]["each"].values())
     (walls,) = (m for m in summary["maps"] if m["x"] == "delay" and m["y"] == "wall_stiffness")
     for grip, limit in summary["bounded"]["each"].items():
@@ -89,7 +89,7 @@ def test_what_is_said_of_stability_is_one_story(run):
 
 
 @pytest.mark.slow
-def test_the_terminal_has_units_and_a_list(run, capsys):
+def test_printed_tables_have_units_and_verdict(run, capsys):
     print_tables(run[0], run[1])
     printed = " ".join(capsys.readouterr().out.split())
     assert "[ms]" in printed
@@ -112,7 +112,7 @@ def figures(scenario: Scenario, direction: str = "z"):
 
 
 @pytest.mark.slow
-def test_delay_and_a_light_grip_make_it_unstable_and_that_is_said():
+def test_verdict_reports_instability_with_delay_and_light_grip():
     """sigma = 1 is unstable in free motion at round trips between 190 and 339 ms."""
     scenario = replace(
         LoadScenario("free_motion_force"),
@@ -125,25 +125,25 @@ def test_delay_and_a_light_grip_make_it_unstable_and_that_is_said():
     assert not free["stable"] and free["decay_1_per_s"] < 0
     assert any("unstable: it doubles every" in sentence for sentence in found["verdict"])
     assert found["bounded"]["each"]["light"] == 0.0
-    # With the tool's inertia eliminated there is nothing that comes back late.
+    # Without the tool's inertia no delayed force exists.
     (sigmas,) = (m for m in found["maps"] if m["title"] == "Delay and σ, in free motion")
     assert min(sigma for _, sigma in sigmas["boundary"]["light"]) > 0.3
 
 
 @pytest.mark.slow
-def test_another_direction_and_a_method_that_is_not_linear():
+def test_verdict_reports_coupled_direction_and_nonlinear_method():
     scenario = replace(
         LoadScenario("free_motion_force"), passivity__method="tdpa", channel__delay=0.01
     )
     found = figures(scenario, "x")
     assert "tdpa is not linear" in found["verdict"][0]
     assert found["direction"] == "x" and found["delay_s"] == 0.01
-    # Sideways, a push turns the tool; that one axis does not know it is said.
+    # Sideways, contact rotates the tool; the verdict reports that one axis is not valid.
     assert found["two_port"]["sampled"]["h22"] > 0.1
     assert any("is not one axis" in sentence for sentence in found["verdict"])
 
 
-def test_eta_has_no_single_sigma():
+def test_eta_raises_because_of_two_sigmas():
     scenario = replace(
         LoadScenario("free_motion_force"),
         force_scaling__sigma=0.0,
@@ -155,8 +155,7 @@ def test_eta_has_no_single_sigma():
 
 
 @pytest.mark.slow
-def test_maps_are_of_the_scenario(run):
-    """A map's share of stable cells is what a map made anew says."""
+def test_maps_agree_with_new_map_of_the_scenario(run):
     scenario = LoadScenario("contact_transition")
     found = run[0]["maps"][-1]
     axis = task_direction(scenario, (0.0, 0.0, 1.0)).axis

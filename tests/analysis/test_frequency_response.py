@@ -22,7 +22,7 @@ EXCITATION = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def station(sigma: float, coulomb: float) -> Scenario:
-    """In free motion, with all the sensor's noise, quantisation and offsets."""
+    """Return free motion with noise, quantisation and offsets of the sensor."""
     scenario = LoadScenario("free_motion_force")
     friction = scenario.master.friction
     friction = dataclasses.replace(friction, coulomb=[coulomb * c for c in friction.coulomb])
@@ -53,7 +53,7 @@ def assert_agrees(
 
 
 @pytest.mark.slow
-def test_station_with_the_tool_felt():
+def test_station_with_displayed_tool_agrees_with_linearisation():
     response, predicted = measured(station(sigma=1.0, coulomb=0.0))
     assert response.omega[-1] >= 2 * np.pi * 29.99
     assert_agrees(response, predicted, "hand_velocity", "hand_force")
@@ -66,8 +66,7 @@ def test_station_with_the_tool_felt():
 
 
 @pytest.mark.slow
-def test_station_without_the_tool_and_with_friction():
-    """What is felt is next to nothing; friction, which is not linear, changes only the device."""
+def test_friction_without_displayed_tool_changes_only_the_device():
     response, predicted = measured(station(sigma=0.0, coulomb=1.0))
     assert_agrees(response, predicted, "tool_velocity", "hand_velocity")
     assert response.apparent_mass() == pytest.approx(0.0, abs=0.02)
@@ -76,7 +75,7 @@ def test_station_without_the_tool_and_with_friction():
     assert drag.real.mean() > 0.2  # N s/m
 
 
-def test_multisine():
+def test_multisine_has_odd_multiples_and_low_peak():
     lines = EXCITATION.multiples()
     assert (lines % 2 == 1).all() and (np.diff(lines) > 0).all()
     direction = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
@@ -92,7 +91,7 @@ def test_multisine():
     assert np.abs(velocity).max() / velocity.std() < 2.2
 
 
-def test_what_cannot_be_measured_is_said():
+def test_unsuitable_multisine_raises():
     scenario = station(sigma=1.0, coulomb=0.0)
     task = task_direction(scenario, UP)
     with pytest.raises(DrakeTeleopError, match=r"MultiSine\.period"):

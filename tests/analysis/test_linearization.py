@@ -1,4 +1,4 @@
-"""The linearised Diagram against models on paper, and against what it simulates."""
+"""The linearised Diagram against analytical models and simulations."""
 
 from dataclasses import replace as changed
 
@@ -43,7 +43,7 @@ DEADBEAT = {
 
 
 def true_load(scenario: Scenario):
-    """(16,) as `load_estimate`: analysis may know it."""
+    """Return the true load, (16,) as `load_estimate`."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
@@ -57,7 +57,7 @@ def wired(cut: Linearization) -> Linearization:
 
 
 def stale_weight(scenario: Scenario, direction):
-    """How motion, of a command and of a push, changes the arm's weight while its torque is held.
+    """Return the change of the arm's weight by a command and by a force, at held torque.
 
     Acceleration over displacement [1/s^2] along the direction at So: of a command, of a push; and
     of the tool's centre of mass.
@@ -89,7 +89,7 @@ def stale_weight(scenario: Scenario, direction):
 
 
 def exact_two_port(scenario: Scenario, omega):
-    """H of one axis with the ideal sensor, with stale weight and a tool that a push turns.
+    """Return H of one axis with ideal sensor, delayed weight and a tool that a force rotates.
 
     The slave's motion is that of the command plus that of the push; the sensor feels the tool's
     mass times the acceleration of its centre, 125 us before the end of each period.
@@ -118,7 +118,7 @@ def exact_two_port(scenario: Scenario, omega):
             A[x] += slope * (moved[0] * T**3 / 6 + moved[1] * T**4 / 24)
             A[x + 1] = V + a * T + slope * (moved[0] * T**2 / 2 + moved[1] * T**3 / 6)
         felt = a + slope * (moved[0] * late + moved[1] * late**2 / 2)
-        A[10] -= axis.force_scale * axis.felt_tool_mass * felt
+        A[10] -= axis.force_scale * axis.displayed_tool_mass * felt
     A[10, 12] += axis.force_scale * axis.gamma
     C = np.zeros((2, 11))
     C[0, 1] = C[1, 3] = C[1, 7] = 1.0
@@ -131,14 +131,14 @@ def exact_two_port(scenario: Scenario, omega):
 
 
 def difference(H, other):
-    """Largest relative difference of each entry."""
+    """Return the largest relative difference of each entry."""
     return np.abs(H / other - 1).max(axis=0)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
 @pytest.mark.parametrize("servo", [{}, DEADBEAT], ids=["servo", "ideal servo"])
-def test_one_direction_equals_the_model_on_paper(servo, sigma):
+def test_one_direction_equals_the_analytical_model(servo, sigma):
     scenario = replace(
         LoadScenario("ideal_sensor"),
         master__position=DECOUPLED,
@@ -153,8 +153,8 @@ def test_one_direction_equals_the_model_on_paper(servo, sigma):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
-def test_real_station_within_one_percent_to_30_hz(sigma):
-    """Dry friction is left out."""
+def test_station_agrees_with_sampled_model_within_1_percent_up_to_30_hz(sigma):
+    """Coulomb friction is left out."""
     scenario = replace(
         LoadScenario("free_motion_force"), force_scaling__sigma=sigma, slave__friction=[0.2]
     )
@@ -168,7 +168,7 @@ def test_real_station_within_one_percent_to_30_hz(sigma):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
-def test_continuous_closed_form_with_the_delays_of_holds_and_filter(sigma):
+def test_closed_form_with_delays_of_holds_and_filter_agrees(sigma):
     """Half a period in the servo's loop; a period and the low-pass's delay on the force's way.
 
     An input of the model that is held acts on the sensor 1.5 of its samples sooner than a smooth
@@ -194,8 +194,8 @@ def test_continuous_closed_form_with_the_delays_of_holds_and_filter(sigma):
 
 
 @pytest.mark.slow
-def test_tool_that_turns_when_it_is_pushed():
-    """Sideways the tool's centre of mass moves 0.61 times as much as So, or as the tip."""
+def test_sideways_force_rotates_the_tool():
+    """The tool's centre of mass moves 0.61 times as much as So, or as the tip."""
     scenario = replace(LoadScenario("ideal_sensor"), force_scaling__sigma=1.0)
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     cut = linearize(scenario, load_estimate=true_load(scenario))
@@ -212,8 +212,8 @@ def test_tool_that_turns_when_it_is_pushed():
 
 
 @pytest.mark.slow
-def test_sideways_the_tip_gives_way_through_the_hands_wrist():
-    """A push at the tip is a torque at the hand, whose turn the tool follows: 130 times as soft."""
+def test_sideways_tip_compliance_includes_the_hands_wrist():
+    """A force at the tip is a torque at the hand; the tool turns: 130 times softer."""
     scenario = replace(LoadScenario("ideal_sensor"), operator=OperatorConfig(grip="medium"))
     task = task_direction(scenario, (1.0, 0.0, 0.0))
     system = wired(linearize(scenario, load_estimate=true_load(scenario)))
@@ -231,14 +231,14 @@ def test_sideways_the_tip_gives_way_through_the_hands_wrist():
 
 
 def leaf(scenario: Scenario) -> Scenario:
-    """With a leaf 30 mm under the tip."""
+    """Return a scenario with a leaf 30 mm under the tip."""
     position = [0.55, 0.0, 0.45 - 0.2 - 0.03]
     sheet = SheetSpring(position=position, length=0.12, width=0.05, thickness=0.0015)
     return replace(scenario, sheet_spring=sheet)
 
 
 @pytest.mark.slow
-def test_stiffness_felt_through_the_station():
+def test_displayed_stiffness_is_that_of_leaf_and_bodies_in_series():
     scenario = leaf(LoadScenario("free_motion_force"))
     task = task_direction(scenario, UP, displacement=(0.0, 0.0, -0.04))
     estimate, pressing = true_load(scenario), (0.0, 0.0, -0.04)
@@ -254,7 +254,7 @@ def test_stiffness_felt_through_the_station():
 
 
 def fitted_rate(y, about: complex) -> complex:
-    """s of the oscillation Re(e^(s t)), sampled with the period, by linear prediction."""
+    """Return s of the sampled oscillation Re(e^(s t)), by linear prediction."""
     lag = round(np.pi / 2 / abs(about.imag) / PERIOD)
     past = np.column_stack([y[lag:-lag], y[: -2 * lag], np.ones(len(y) - 2 * lag)])
     a, b, _ = np.linalg.lstsq(past, y[2 * lag :], rcond=None)[0]
@@ -269,7 +269,7 @@ def frictionless(scenario: Scenario) -> Scenario:
 
 
 def vertical_mode(system: Linearization) -> complex:
-    """Of the oscillations that last, the one that a vertical push of the hand excites most."""
+    """Return the slow oscillation that a vertical force of the hand excites most."""
     system = system.expanded()
     z, modes = np.linalg.eig(system.A)
     push = np.linalg.solve(modes, system.B[:, system.inputs.index("hand_wrench.z")])
@@ -298,7 +298,7 @@ def test_multipliers_predict_a_slow_decay():
 
 @pytest.mark.slow
 def test_multipliers_predict_growth_over_a_network():
-    """Pressing on the leaf 20 ms away swings itself up."""
+    """Pressing on the leaf over 20 ms is unstable."""
     scenario = replace(
         leaf(frictionless(LoadScenario("ideal_sensor"))),
         operator=OperatorConfig(grip="medium"),
@@ -319,7 +319,7 @@ def test_multipliers_predict_growth_over_a_network():
     simulator.Initialize()
     simulator.AdvanceTo(2.6)
     height = read_log(simulator, 2.0)["pose_master"][:, 6]
-    assert np.ptp(height) < 2 * depth  # it never leaves the leaf
+    assert np.ptp(height) < 2 * depth  # permanent contact
     assert_same_rate(fitted_rate(height, predicted), predicted)
 
 
@@ -337,7 +337,7 @@ def small_system() -> Linearization:
 
 
 @pytest.mark.parametrize("periods", [0, 1, 7])
-def test_loops_with_delay(periods):
+def test_closing_with_delay_agrees_with_shift_registers(periods):
     import control
 
     system = small_system().close(["felt"], ["wrench"], periods)
@@ -346,26 +346,26 @@ def test_loops_with_delay(periods):
     assert system.expanded().frequency_response(omega) == pytest.approx(G, rel=1e-9)
     response = control.frequency_response(system.to_control(), omega)
     assert np.moveaxis(response.frdata, -1, 0) == pytest.approx(G, rel=1e-9)
-    # A multiplier of the closed loop makes the return difference singular.
+    # At a multiplier of the closed loop the return difference is singular.
     z = system.multipliers[0]
     g = small_system()
     loop = (g.C @ np.linalg.solve(z * np.eye(4) - g.A, g.B.astype(complex)))[1, 1]
     assert loop * z**-periods == pytest.approx(1.0, rel=1e-8)
 
 
-def test_ports_have_names_in_control_too():
+def test_control_object_has_the_names_of_ports():
     parts = {"inputs": ("hand_wrench.x", "hand_wrench.rx"), "outputs": ("twist_master.x", "felt")}
     system = changed(small_system(), **parts).to_control()
     assert system.input_labels == ["hand_wrench[x]", "hand_wrench[rx]"]
     assert system.output_labels == ["twist_master[x]", "felt"]
 
 
-def test_a_port_that_is_not_there_is_said():
+def test_unknown_port_raises():
     with pytest.raises(DrakeTeleopError, match=r"there is no pose\.x; name one of"):
         small_system().close("pose", "wrench")
 
 
-def test_many_states_still_give_the_largest_multipliers():
+def test_sparse_search_finds_the_largest_multipliers():
     few = small_system().close(["felt"], ["wrench"], 40)
     padded = few.expanded()
     idle = 800
@@ -377,7 +377,7 @@ def test_many_states_still_give_the_largest_multipliers():
     assert np.abs(large.multipliers[:4]) == pytest.approx(np.abs(few.multipliers[:4]), rel=1e-9)
 
 
-def test_what_cannot_be_linearised_is_said():
+def test_rates_method_and_direction_without_linear_model_raise():
     scenario = LoadScenario("free_motion_force")
     with pytest.raises(DrakeTeleopError, match=r"rates.*joint_control_hz"):
         linearize(replace(scenario, rates__joint_control_hz=10000.0))

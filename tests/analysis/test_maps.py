@@ -1,4 +1,4 @@
-"""Maps: each cell and each piece of boundary against eigenvalues, and what the maps must show."""
+"""Stability maps: cells and boundaries against eigenvalues, and known features."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[OneAxis, Sampling, StabilityM
 
 
 def grows(axis: OneAxis, sampling: Sampling, **values: float) -> bool:
-    """By the eigenvalues of the closed loop with all its registers."""
+    """Return stability by eigenvalues of the closed loop with all registers."""
     rate = values.pop("rate", sampling.hand_hz)
     factor = rate / sampling.hand_hz
     faster = replace(
@@ -69,7 +69,7 @@ def grows(axis: OneAxis, sampling: Sampling, **values: float) -> bool:
 
 
 @pytest.mark.slow
-def test_cells_are_what_eigenvalues_say(drawn) -> None:
+def test_cells_agree_with_eigenvalues(drawn) -> None:
     axis, sampling, found = drawn
     assert 0 < found.stable.sum() < found.stable.size
     rng = np.random.default_rng(1)
@@ -79,8 +79,8 @@ def test_cells_are_what_eigenvalues_say(drawn) -> None:
 
 
 @pytest.mark.slow
-def test_one_percent_beside_the_boundary_it_is_stable_and_unstable(drawn) -> None:
-    """Along the parameter that is not the delay, where the delay is a whole number of periods."""
+def test_stability_changes_within_1_percent_of_the_boundary(drawn) -> None:
+    """Along the parameter other than delay, at whole periods of delay."""
     axis, sampling, found = drawn
     x, y = found.boundary.T
     moved, fixed = (found.y_name, found.x) if found.x_name != "sigma" else (found.x_name, found.y)
@@ -99,13 +99,13 @@ def test_one_percent_beside_the_boundary_it_is_stable_and_unstable(drawn) -> Non
 
 
 @pytest.mark.parametrize("hertz, rate, within", [(12.0, 2e3, 20.0), (480.0, 1.28e5, 1.0)])
-def test_in_free_motion_the_felt_tool_opens_windows_of_instability(
+def test_displayed_tool_causes_windows_of_instability_in_free_motion(
     hertz: float, rate: float, within: float
 ) -> None:
-    """Light grip; of a slave that follows at once, m s^2 + b s + k + mu s^2 e^(-s RTT) = 0."""
+    """Light grip, ideal servo: m s^2 + b s + k + mu s^2 e^(-s RTT) = 0."""
     m, b, k = LIGHT.hand_mass + LIGHT.device_mass, LIGHT.hand_damping, LIGHT.hand_stiffness
     b, mu = b + LIGHT.device_damping, LIGHT.force_scale * LIGHT.tool_mass
-    # |k - m w^2 + j b w| = mu w^2, then the delay of that phase, and turns more of it.
+    # |k - m w^2 + j b w| = mu w^2; the delays follow from the phase, with whole turns.
     w = np.sqrt(np.roots([m**2 - mu**2, b**2 - 2 * k * m, k**2]).real)
     phase = np.angle(mu * w**2 / (k - m * w**2 + 1j * b * w))
     windows = np.sort(1e3 * (phase + 2 * np.pi * np.array([[1], [2]])) / w)
@@ -121,7 +121,7 @@ def test_in_free_motion_the_felt_tool_opens_windows_of_instability(
     np.testing.assert_allclose(edges.reshape(2, 2), windows, atol=within)
 
 
-def test_in_contact_the_felt_tool_lengthens_the_margin() -> None:
+def test_displayed_tool_increases_the_delay_margin_in_contact() -> None:
     found = stability_map(
         MEDIUM, Sampling(), "delay", np.linspace(0, 0.05, 60), "sigma", np.array([0, 0.25, 0.5, 1])
     )
@@ -174,6 +174,8 @@ def test_distortion_is_that_of_the_continuous_station_at_high_rates() -> None:
         ("delay", [], "do not increase"),
     ],
 )
-def test_what_no_map_can_be_drawn_of_is_said(name: str, values: list[float], words: str) -> None:
+def test_unknown_parameter_or_decreasing_values_raise(
+    name: str, values: list[float], words: str
+) -> None:
     with pytest.raises(DrakeTeleopError, match=words):
         stability_map(MEDIUM, Sampling(), name, values, "sigma", [0.0, 1.0])

@@ -29,9 +29,9 @@ from drake_teleop.lab.analysis.sampled_loop import (
     growth_rate,
     multipliers,
     sampled_loop,
-    sampled_response,
     sampled_two_port,
 )
+from drake_teleop.lab.analysis.two_port import from_control
 from drake_teleop.station.operator.operator import GRIPS
 
 STATION = Sampling()
@@ -40,7 +40,7 @@ JR3 = Sampling(low_pass_hz=500.0)
 
 @pytest.fixture(scope="module")
 def bench() -> ModuleType:
-    """The benchmark, for its simulation, which knows nothing of the analysis."""
+    """Return the benchmark, whose simulation is independent of the analysis."""
     path = Path(__file__).parents[2] / "benchmarks/analysis.py"
     spec = importlib.util.spec_from_file_location("bench_analysis", path)
     assert spec is not None and spec.loader is not None
@@ -83,7 +83,7 @@ axes = st.builds(
         Sampling(1e3, 1.5e3, 3e3, 300.0),
     ],
 )
-def test_a_simulation_with_small_steps_takes_the_same_path(
+def test_loop_agrees_with_a_simulation_with_small_steps(
     bench: ModuleType, sampling: Sampling, steps: int
 ) -> None:
     axis = OneAxis(
@@ -112,7 +112,7 @@ def _rates(factor: float) -> Sampling:
 
 
 def _without_first_order(at_rate, factor: float):
-    """The limit of short periods, from two of them."""
+    """Return the limit of short periods, from two of them."""
     return 2 * at_rate(_rates(2 * factor)) - at_rate(_rates(factor))
 
 
@@ -121,7 +121,7 @@ def test_short_periods_give_the_continuous_loop(stiffness: float) -> None:
     axis = OneAxis(sigma=0.6, mass_error=0.3, wall_stiffness=stiffness, position_scale=1.2)
     w = 2 * np.pi * np.geomspace(0.1, 50.0, 30)
     s = 1j * w
-    # m x'' = m k_v (k_p (l_p x_m - x) - x') - k_e x, and what the elimination leaves of it.
+    # m x'' = m k_v (k_p (l_p x_m - x) - x') - k_e x, and the eliminated force.
     gain = axis.velocity_gain * axis.position_gain
     slave = axis.slave_mass * (s**2 + axis.velocity_gain * s + gain) + stiffness
     position = axis.slave_mass * gain * axis.position_scale / slave
@@ -136,11 +136,11 @@ def test_short_periods_give_the_continuous_loop(stiffness: float) -> None:
 
     coarse = np.abs(at_rate(_rates(4.0)) / expected - 1).max()
     fine = np.abs(at_rate(_rates(8.0)) / expected - 1).max()
-    assert 0.45 < fine / coarse < 0.55  # of first order: holds are half a period late
+    assert 0.45 < fine / coarse < 0.55  # first order: holds delay by half a period
     np.testing.assert_allclose(_without_first_order(at_rate, 8.0) / expected, 1.0, atol=2e-4)
 
 
-def test_short_periods_give_the_continuous_two_port() -> None:
+def test_two_port_tends_to_the_continuous_one_for_short_periods() -> None:
     axis = OneAxis(sigma=0.6, mass_error=0.3, delay=5e-3)
     w = 2 * np.pi * np.geomspace(0.1, 30.0, 20)
     s, kv = 1j * w, axis.velocity_gain
@@ -160,20 +160,18 @@ def test_short_periods_give_the_continuous_two_port() -> None:
 @pytest.mark.parametrize(
     ("delay", "steps"), [(0.0, 0), (1e-6, 1), (2e-4, 1), (7e-4, 1), (8e-4, 2), (1e-2, 20)]
 )
-def test_a_delay_is_whole_periods_of_the_hand_and_at_least_one(delay: float, steps: int) -> None:
+def test_delay_is_rounded_to_hand_periods_and_at_least_one(delay: float, steps: int) -> None:
     assert delay_steps(OneAxis(delay=delay), STATION) == steps
 
 
 @pytest.mark.parametrize("sampling", [STATION, JR3])
 @pytest.mark.parametrize("delay", [0.0, 4e-3])
-def test_the_two_port_is_that_of_the_closed_loop_without_hand_and_wall(
-    sampling: Sampling, delay: float
-) -> None:
+def test_two_port_agrees_with_loop_without_hand_and_wall(sampling: Sampling, delay: float) -> None:
     axis = OneAxis(sigma=0.6, mass_error=0.3, delay=delay, position_scale=2.0)
     w = 2 * np.pi * np.geomspace(1.0, 900.0, 20)
     H = sampled_two_port(axis, sampling, w)
     bare = replace(axis, hand_mass=0.0, hand_damping=0.0, hand_stiffness=0.0, wall_stiffness=0.0)
-    response = sampled_response(sampled_loop(bare, sampling), w)
+    response = from_control(sampled_loop(bare, sampling).to_control(), w)
     hold = (1 - np.exp(-1j * w / 2e3)) / (1j * w / 2e3)
     for force in range(2):
         v_m, v_s = response[:, 1, force] / hold, response[:, 3, force] / hold
@@ -184,13 +182,13 @@ def test_the_two_port_is_that_of_the_closed_loop_without_hand_and_wall(
 
 @settings(max_examples=60, deadline=None)
 @given(axis=axes, steps=st.integers(0, 30), low_pass=st.booleans())
-def test_the_argument_principle_counts_what_eigenvalues_say(
+def test_argument_principle_agrees_with_eigenvalues(
     axis: OneAxis, steps: int, low_pass: bool
 ) -> None:
     sampling = JR3 if low_pass else STATION
     delay = steps / sampling.hand_hz
     size = np.abs(multipliers(sampled_loop(replace(axis, delay=delay), sampling)))
-    if np.abs(size - 1).min() > 1e-9:  # on the circle itself there is nothing to count
+    if np.abs(size - 1).min() > 1e-9:  # a multiplier on the circle has no count
         count = unstable_multipliers(cut_loop(axis, sampling), delay)
         assert count == (size > 1).sum()
 
@@ -204,7 +202,7 @@ def test_the_dominant_multiplier_is_the_largest_eigenvalue(
     delay = steps / sampling.hand_hz
     values = multipliers(sampled_loop(replace(axis, delay=delay), sampling))
     largest = np.abs(values).max()
-    # Of several that are equally large it may be any; a double one has but half the digits.
+    # Any of several equally large ones is valid; a double one has half the digits.
     alike = values[np.abs(values) > largest - 1e-7]
     found = dominant_multiplier(cut_loop(axis, sampling), delay)
     assert abs(found) == pytest.approx(largest, abs=1e-8)
@@ -212,7 +210,7 @@ def test_the_dominant_multiplier_is_the_largest_eigenvalue(
 
 
 def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
-    """Two seconds one way would be 8000 registers; the loop still returns to itself."""
+    """Two seconds one way would be 8000 registers; the multiplier still closes the loop."""
     loop = cut_loop(replace(OneAxis(), sigma=np.array([0.0, 1.0])), STATION)
     delay = np.array([[0.02], [2.0]])
     found = dominant_multiplier(loop, delay)
@@ -230,10 +228,10 @@ def test_the_dominant_multiplier_of_long_delays_and_arrays() -> None:
     numerator=st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=2),
     D=st.integers(0, 12),
 )
-def test_the_count_holds_for_any_loop_and_at_both_ends_of_the_circle(
+def test_count_agrees_with_roots_also_at_both_ends_of_the_circle(
     poles: list[float], numerator: list[float], D: int
 ) -> None:
-    """|L| > 1 at z = 1 or -1, either sign, unstable cut loops; against the roots themselves."""
+    """|L| > 1 at z = 1 or -1, either sign, and unstable cut loops."""
     p, q = np.poly(poles), np.array(numerator)
     loop = CutLoop.of(np.array(poles, complex), np.roots(np.polysub(p, q)).astype(complex), 1.0)
     size = np.abs(np.roots(np.polysub(np.append(p, np.zeros(D)), q)))
@@ -256,9 +254,7 @@ def test_the_count_holds_for_any_loop_and_at_both_ends_of_the_circle(
         held("firm", wall_stiffness=2e4),
     ],
 )
-def test_the_first_multiplier_leaves_the_circle_at_the_margin(
-    axis: OneAxis, sampling: Sampling
-) -> None:
+def test_a_multiplier_leaves_the_circle_at_the_margin(axis: OneAxis, sampling: Sampling) -> None:
     margin = float(delay_margin(cut_loop(axis, sampling)))
     steps = int(margin / 2 * sampling.hand_hz)
     assert 5 < steps < 250
@@ -269,7 +265,7 @@ def test_the_first_multiplier_leaves_the_circle_at_the_margin(
     assert before < 0 < after
 
 
-def test_unstable_without_delay_and_stable_for_any() -> None:
+def test_delay_margin_is_0_if_unstable_and_infinite_without_limit() -> None:
     assert delay_margin(cut_loop(held("light", wall_stiffness=5.1e3), STATION)) == 0.0
     firm = cut_loop(held("firm", wall_stiffness=5.1e3), STATION)
     assert delay_margin(firm) == np.inf
@@ -293,7 +289,7 @@ def test_multipliers_predict_how_a_perturbation_grows(bench: ModuleType, delay: 
     assert growth_rate(sampled_loop(axis, STATION)) == pytest.approx(simulated, rel=0.02)
 
 
-def test_control_state_spaces_in_and_out() -> None:
+def test_control_state_space_has_the_same_response() -> None:
     loop = sampled_loop(OneAxis(delay=2e-3, wall_damping=5.0), STATION)
     system = loop.to_control()
     assert isinstance(system, control.StateSpace) and system.dt == 5e-4
@@ -301,15 +297,12 @@ def test_control_state_spaces_in_and_out() -> None:
     np.testing.assert_array_equal(multipliers(system), multipliers(loop))
     assert growth_rate(system) == growth_rate(loop)
     w = np.array([1.0, 30.0, 500.0])
-    np.testing.assert_allclose(
-        np.moveaxis(system.frequency_response(w).frdata, 2, 0),
-        sampled_response(loop, w),
-        rtol=1e-9,
-    )
-    np.testing.assert_array_equal(sampled_response(system, w), sampled_response(loop, w))
+    inner = np.exp(1j * w * loop.period)[:, None, None] * np.eye(len(loop.A)) - loop.A
+    response = loop.C @ np.linalg.solve(inner, np.broadcast_to(loop.B, (3, *loop.B.shape))) + loop.D
+    np.testing.assert_allclose(from_control(system, w), response, rtol=1e-9)
 
 
-def test_arrays_of_parameters_give_what_each_gives() -> None:
+def test_arrays_of_parameters_equal_single_loops() -> None:
     k, sigma = np.array([[0.0], [5.1e3], [2e4]]), np.array([0.0, 1.0])
     both = cut_loop(replace(OneAxis(), wall_stiffness=k, sigma=sigma), JR3)
     assert both.open.shape == (3, 2, 10)
@@ -333,14 +326,14 @@ def test_arrays_of_parameters_give_what_each_gives() -> None:
         (lambda: cut_loop(OneAxis(), Sampling(joint_control_hz=1e3)), "whole number of times"),
     ],
 )
-def test_what_has_no_such_form_is_said(call, words: str) -> None:
+def test_ideal_servo_and_incompatible_rates_raise(call, words: str) -> None:
     with pytest.raises(DrakeTeleopError, match=words):
         call()
 
 
 @pytest.mark.parametrize("turns", [0.01, 1.0, 50.0])
-def test_what_is_held_on_a_stiff_wall_swings_as_on_paper(turns):
-    """x'' = u - w^2 x from x, v and u: cosines and sines, however many periods one step holds."""
+def test_held_response_on_a_stiff_wall_equals_closed_form(turns):
+    """x'' = u - w^2 x: cosines and sines, for any number of oscillations in a step."""
     w, t = 300.0, turns * 2 * np.pi / 300.0 + 1e-3
     c, s = np.cos(w * t), np.sin(w * t)
     for found, exact in zip(

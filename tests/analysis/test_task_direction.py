@@ -1,10 +1,10 @@
-"""The one-axis numbers of a scenario against its models."""
+"""One-axis parameters of a scenario against its models."""
 
 import numpy as np
 import pytest
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.lab.analysis.analyze import wall_is
+from drake_teleop.lab.analysis.analyze import describe_wall
 from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_direction
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
@@ -16,15 +16,15 @@ from drake_teleop.station.master import phantom
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 
-def test_device_whose_inner_link_alone_moves():
-    """Upright force at q = 0: M22 over the link's length squared, wrist and reflected motor too."""
+def test_device_mass_if_only_the_inner_link_moves():
+    """Vertical force at q = 0: M22 over the link's length squared, with wrist and motor."""
     scenario = replace(Scenario(), master__position=[0.215, 0.0, -0.17])
     axis = OneAxisFromScenario(scenario, (0, 0, 2.0))
     assert axis.device_mass == pytest.approx(phantom.mass_matrix(np.zeros(6))[1, 1] / 0.215**2)
     assert axis.device_damping == pytest.approx(scenario.master.friction.viscous[1] / 0.215**2)
 
 
-def test_what_the_scenario_says():
+def test_axis_has_the_parameters_of_the_scenario():
     scenario = replace(
         Scenario(),
         channel=Channel(delay=0.02, backward=NetworkConfig(delay=0.04)),
@@ -54,16 +54,16 @@ def test_what_the_scenario_says():
         ([Wall(), Block()], 0.0, "the paper's, because a wall and block is not analysed"),
     ],
 )
-def test_the_wall_is_a_leaf_or_a_wall_by_itself_or_said_to_be_none(things, stiffness, what):
+def test_wall_stiffness_and_description_of_environments(things, stiffness, what):
     scenario = replace(Scenario(), environment=things)
     found = OneAxisFromScenario(scenario, (0, 0, 1)).wall_stiffness
     assert found == pytest.approx(stiffness)
-    assert wall_is(scenario, found > 0.0) == what
+    assert describe_wall(scenario, found > 0.0) == what
 
 
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, -2, 0.5)])
-def test_slave_is_lighter_where_the_push_can_turn_it(direction):
-    """A free arm is lighter than one that is guided; along the tool a push turns it little."""
+def test_free_slave_is_lighter_than_a_guided_one(direction):
+    """Along the tool a force causes little rotation."""
     task = task_direction(LoadScenario("free_motion_force"), direction)
     assert np.linalg.norm(task.tool[:3]) == pytest.approx(1.0)
     assert np.linalg.norm(task.tool[3:]) <= 0.2 + 1e-12
@@ -72,13 +72,13 @@ def test_slave_is_lighter_where_the_push_can_turn_it(direction):
         assert task.tool_coupling == pytest.approx(1.0, abs=1e-3)
 
 
-def test_aligned_master():
+def test_master_direction_follows_the_alignment():
     turned = replace(Scenario(), kinematic_scaling__alignment=[0.0, 0.0, np.pi / 2])
     task = task_direction(turned, (0, 1, 0))
     assert task.hand[:3] == pytest.approx([1, 0, 0], abs=1e-12)
 
 
-def test_what_makes_no_axis_is_said():
+def test_invalid_direction_or_pose_raises():
     with pytest.raises(DrakeTeleopError, match="cannot follow"):
         far = replace(Scenario(), kinematic_scaling__translation_scale=20.0)
         task_direction(far, (0, 0, 1), displacement=(0.05, 0, 0.05))

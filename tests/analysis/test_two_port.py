@@ -34,14 +34,14 @@ def random_axis(rng: np.random.Generator, **fixed: float) -> OneAxis:
 
 
 def solved(axis: OneAxis, s: complex, drive: np.ndarray, servo=None) -> np.ndarray:
-    """[F_h, -V_s] for drive = [V_m, F_e], wire by wire through the station's block diagram."""
+    """Return [F_h, -V_s] for drive = [V_m, F_e] from the station's block diagram."""
     spring, damper = axis.slave_mass * axis.velocity_gain * axis.position_gain, 0.0
     brake, mass = axis.slave_mass * axis.velocity_gain, axis.slave_mass
     if servo:
         mass, spring, damper, brake = servo
     late = np.exp(-s * axis.delay)
     estimate = axis.tool_mass + axis.mass_error
-    # Unknown: F_h, V_s, acceleration a, wrist's force F, what is sent F', the command's velocity.
+    # Unknown: F_h, V_s, acceleration a, wrist's force F, sent force F', the command's velocity.
     A = np.zeros((6, 6), dtype=complex)
     b = np.zeros(6, dtype=complex)
     v_m, f_e = drive
@@ -64,7 +64,7 @@ def solved_matrix(axis: OneAxis, s: np.ndarray, servo=None) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_hybrid_is_the_block_diagram(seed):
+def test_hybrid_equals_the_block_diagram(seed):
     axis = random_axis(np.random.default_rng(seed))
     H, truth = tp.hybrid(axis, S[::20]), solved_matrix(axis, S[::20])
     np.testing.assert_allclose(H, truth, rtol=1e-9)
@@ -77,7 +77,7 @@ def test_hybrid_is_the_block_diagram(seed):
         assert abs(f - F_h) <= 1e-9 * abs(F_h)
 
 
-def test_hybrid_of_another_servo():
+def test_hybrid_with_a_user_supplied_servo():
     axis = random_axis(np.random.default_rng(1))
     m, k, d = 3.13, 9000.0, 300.0
     Z_s, C = m * S[::20], d + k / S[::20]
@@ -85,7 +85,7 @@ def test_hybrid_of_another_servo():
     np.testing.assert_allclose(H, solved_matrix(axis, S[::20], (m, k, d, 0.0)), rtol=1e-9)
 
 
-def test_ideal_servo_without_delay_feels_the_scaled_environment_and_tool():
+def test_ideal_servo_without_delay_displays_scaled_environment_and_tool():
     axis = random_axis(np.random.default_rng(2), delay=0.0, mass_error=0.0, ideal_servo=True)
     Z_e = 40.0 + 5100.0 / S
     felt = tp.transmitted_impedance(tp.hybrid(axis, S), Z_e)
@@ -97,7 +97,7 @@ def test_ideal_servo_without_delay_feels_the_scaled_environment_and_tool():
     np.testing.assert_allclose(felt, F_h, rtol=1e-12)
 
 
-def test_a_stiff_servo_tends_to_the_ideal_one():
+def test_stiff_servo_tends_to_the_ideal_one():
     slow = S[OMEGA < 200]
     axis = random_axis(np.random.default_rng(3))
     values = {**axis.__dict__, "position_gain": 1e9, "velocity_gain": 1e12}
@@ -107,7 +107,7 @@ def test_a_stiff_servo_tends_to_the_ideal_one():
 
 
 @pytest.mark.parametrize("scale", [0.3, 1.0, 1.7])
-def test_equal_scales_do_not_depend_on_the_estimate(scale):
+def test_estimate_has_no_effect_if_sigma_equals_gamma(scale):
     rng = np.random.default_rng(4)
     H = [
         tp.hybrid(
@@ -118,7 +118,7 @@ def test_equal_scales_do_not_depend_on_the_estimate(scale):
     np.testing.assert_allclose(H[1:], np.broadcast_to(H[0], (4, *H[0].shape)), rtol=1e-12)
 
 
-def test_an_over_estimated_mass_is_felt_as_negative_mass():
+def test_overestimated_mass_is_displayed_as_negative_mass():
     axis = random_axis(np.random.default_rng(5), sigma=0.0, gamma=1.0, delay=0.0, mass_error=0.3)
     values = {**axis.__dict__, "ideal_servo": True}
     free = tp.transmitted_impedance(tp.hybrid(OneAxis(**values), S), 0.0)
@@ -134,7 +134,12 @@ def test_parameters_may_be_arrays():
         assert np.array_equal(together[:, i], tp.hybrid(OneAxis(delay=one, sigma=0.5), S))
 
 
-def test_wave_line_is_the_delay_of_the_waves():
+def hybrid_of_chain(A: np.ndarray) -> np.ndarray:
+    a11, a12, a21, a22 = tp.entries(A)
+    return tp.two_port(a12 / a22, a11 - a12 * a21 / a22, -1 / a22, a21 / a22)
+
+
+def test_wave_line_delays_the_waves():
     b, delay = 3.7, 0.023
     for s, H in zip(S[::20], tp.wave_line(S, delay, b)[::20], strict=True):
         late = np.exp(-s * delay)
@@ -149,9 +154,9 @@ def test_wave_line_is_the_delay_of_the_waves():
         np.testing.assert_allclose(H, truth, rtol=1e-9, atol=1e-9)
 
 
-def test_what_is_felt_through_a_wave_line():
+def test_impedance_displayed_through_a_wave_line():
     b, delay = 3.7, 0.01
-    s = S + 0.3  # Off the imaginary axis too: tanh and coth have their poles on it.
+    s = S + 0.3  # Off the imaginary axis, which has poles of tanh and coth.
     H = tp.wave_line(s, delay, b)
     np.testing.assert_allclose(tp.transmitted_impedance(H, b), b, rtol=1e-12)
     np.testing.assert_allclose(tp.transmitted_impedance(H, 0.0), b * np.tanh(s * delay), rtol=1e-12)
@@ -165,7 +170,7 @@ def test_what_is_felt_through_a_wave_line():
     assert -hard[0].imag * 1e-3 == pytest.approx(b / delay, rel=1e-9)
 
 
-def test_lawrence_is_ideal_without_delay():
+def test_transparent_channels_are_ideal_without_delay():
     rng = np.random.default_rng(6)
     for c5, c6 in rng.uniform(-0.9, 2.0, (10, 2)):
         m, k, d = rng.uniform(0.1, 5.0), rng.uniform(10.0, 1e4), rng.uniform(1.0, 300.0)
@@ -178,7 +183,7 @@ def test_lawrence_is_ideal_without_delay():
         np.testing.assert_allclose(tp.transmitted_impedance(H, Z_e), Z_e, rtol=1e-11)
 
 
-def test_four_channels_are_their_block_diagram():
+def test_four_channel_equals_its_block_diagram():
     rng = np.random.default_rng(7)
     for s in S[::25]:
         c = rng.normal(size=6) + 1j * rng.normal(size=6)
@@ -219,24 +224,24 @@ def test_conversions_relate_the_same_forces_and_velocities():
     for there, back in (
         (tp.impedance, tp.impedance),
         (tp.admittance, tp.admittance),
-        (tp.chain, tp.hybrid_of_chain),
+        (tp.chain, hybrid_of_chain),
     ):
         np.testing.assert_allclose(back(there(H)), H, rtol=1e-9)
 
 
-def test_absorbed_impedances_are_what_hand_and_environment_were():
+def test_absorbed_impedances_replace_hand_and_environment():
     H = random_two_ports(200)
     hand, here, there = 0.3 + 0.1j, 1.1 - 0.4j, 0.6 + 2j
     whole = tp.transmitted_impedance(H, here + there) + hand
     inside = tp.absorb(H, hand=hand, environment=here)
     np.testing.assert_allclose(tp.transmitted_impedance(inside, there), whole, rtol=1e-9)
-    # A delay line behind a device is their chain.
+    # The chain of device and delay line.
     line, device = tp.wave_line(S, 0.01, 2.0), tp.two_port(0.15 * S + 0.5, 1.0, -1.0, 0.0)
-    chained = tp.hybrid_of_chain(tp.chain(device) @ tp.chain(line))
+    chained = hybrid_of_chain(tp.chain(device) @ tp.chain(line))
     np.testing.assert_allclose(chained, tp.absorb(line, hand=0.15 * S + 0.5), rtol=1e-9, atol=1e-9)
 
 
-def test_control_objects_in_and_out():
+def test_control_objects_have_the_same_response():
     axis = random_axis(np.random.default_rng(9), delay=0.0)
     H = tp.hybrid(axis, S)
     for one in (axis, OneAxis(**{**axis.__dict__, "ideal_servo": True})):
@@ -253,7 +258,7 @@ def test_control_objects_in_and_out():
     np.testing.assert_allclose(tp.from_control(servo, OMEGA), H[:, 1, 1], rtol=1e-9)
 
 
-def test_bad_input_names_itself():
+def test_invalid_input_raises():
     ideal = tp.hybrid(OneAxis(ideal_servo=True), S)
     with pytest.raises(DrakeTeleopError, match="impedance matrix where h22"):
         tp.impedance(ideal)

@@ -1,4 +1,4 @@
-"""The comparison as a whole, small: its table, its page, and that it can tell stable from not."""
+"""The whole comparison on a small set: table, page and verdicts."""
 
 from __future__ import annotations
 
@@ -25,18 +25,20 @@ from drake_teleop.station.scenario import LoadScenario
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
+def test_comparison_writes_table_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(study, "WALLS", (5100.0,))
     monkeypatch.setattr(study, "IMPAIRMENTS", ((0.0, 0.0),))
     monkeypatch.setattr(study, "LEAVES", {"contact": study.LEAVES["contact"]})
     monkeypatch.setattr(study, "ROUND_TRIPS", (0.01, 0.02, 0.03, 0.1))
-    monkeypatch.setattr(study, "_COVERED", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3))))
-    # With the load that the runs of the shipped scenario have identified as well.
+    monkeypatch.setattr(
+        study, "_COVERING_CASES", tuple(itertools.product((0.0, 1.0), (0.1,), (0.0, 5e3)))
+    )
+    # Use the load of the shipped scenario, which other tests have identified.
     task = Task(0.1, 1.1, press=1.2, pressed=2.0, release=3.0, released=3.8, end=4.8, judged=0.6)
-    monkeypatch.setattr(delayed_contact, "task_over", lambda round_trip: task)
+    monkeypatch.setattr(delayed_contact, "task_for_round_trip", lambda round_trip: task)
     shipped = LoadScenario("contact_transition")
     monkeypatch.setattr(study, "identified_load", lambda base, stage: identified_load(shipped))
-    compare = study.compare_command  # in this process, which has what was set above
+    compare = study.compare_command  # in this process, which has the settings above
     monkeypatch.setattr(
         study, "compare_command", lambda out, **options: compare(out, **(options | {"jobs": 1}))
     )
@@ -45,7 +47,7 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
     out = tmp_path / "out" / "passivity"
     summary = json.loads((out / "summary.json").read_text())
     runs = {row["method"]: row for row in summary["station"]}
-    # Without a method the wrist keeps turning to and fro before the leaf.
+    # Without a method the wrist oscillates on the leaf.
     assert {name: row["stable"] for name, row in runs.items()} == {"none": False, "tdpa": True}
     assert runs["none"]["turning"] > 2.5e-3 > 10 * runs["tdpa"]["turning"]
     for row in runs.values():
@@ -56,11 +58,11 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
         assert row["rise_delay"] is None or row["rise_delay"] >= 0.0
         assert row["leaked"] == max(-row["least_energy"], 0.0)
     assert 0.0 <= runs["tdpa"]["left_behind"] == abs(runs["tdpa"]["drift"]) < 0.5e-3
-    # What is not at rest in its hold ends there.
+    # A run that is not at rest in its hold ends there.
     assert runs["none"]["left_behind"] is None is runs["none"]["drift"]
     assert cells(runs["none"])[[key for key, *_ in COLUMNS].index("left_behind")] == "–"
     assert runs["none"]["leaked"] > 0.3 > 100 * runs["tdpa"]["leaked"]
-    # The press alone leaks nothing worth the word; taps do.
+    # Taps leak, the press does not.
     assert [cell["verdict"] for cell in summary["decision"]] == ["unstable", "leaks"]
     limits = {row["method"]: row["longest_s"] for row in summary["one_dof"]}
     assert limits["none"] == 0.02 < limits["tdpa"]
@@ -92,13 +94,13 @@ def test_the_comparison_writes_its_table_and_its_page(tmp_path, monkeypatch):
         ({"methods": ["magic"]}, r"methods.*no method 'magic'.*tdpa"),
     ],
 )
-def test_unknown_names_are_one_clear_error(tmp_path, arguments, message):
+def test_unknown_names_raise(tmp_path, arguments, message):
     with pytest.raises(DrakeTeleopError, match=message):
         study.compare_command(tmp_path, **arguments)
 
 
-def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
-    """With its tool and its grip; at the study's rates, and with nothing but the study's leaves."""
+def test_comparison_of_a_custom_scenario(monkeypatch, tmp_path):
+    """It keeps tool and grip, and gets the study's rates and leaves."""
     mine = tmp_path / "mine.yaml"
     mine.write_text(
         "{slave: {payload: {mass: 0.3}}, sheet_spring: {}, contact_detection: {},"
@@ -107,18 +109,18 @@ def test_the_station_may_be_ones_own(monkeypatch, tmp_path):
     bases = []
     monkeypatch.setattr(study, "identified_load", lambda base, stage: SimpleNamespace(estimate=0))
     monkeypatch.setattr(
-        study, "_each", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
+        study, "_run_parallel", lambda run, cases, *_: bases.extend(c[0] for c in cases) or []
     )
     study._station_study(mine, ["lan"], ["none"], 3, 1, lambda name: None)
     base = bases[0]
     assert (base.slave.payload.mass, base.simulation.seed, base.rates) == (0.3, 3, study._RATES)
     assert base.surroundings is None and base.contact_detection is None
-    # Its events cut the steps: those that a step of their period leaves over by rounding cost 20 %.
+    # Steps longer than the events' period avoid extra steps by rounding.
     assert base.simulation.integrator == "runge_kutta3"
     assert base.simulation.max_step > 1.5 / base.rates.hand_hz
 
 
-def test_a_tip_rubs_on_the_leaf_as_on_all_other_surroundings(monkeypatch):
+def test_slip_speed_at_the_leaf_is_the_default(monkeypatch):
     """A tenth of that slip takes seven times the steps in a hold."""
     asked = []
 
@@ -133,7 +135,7 @@ def test_a_tip_rubs_on_the_leaf_as_on_all_other_surroundings(monkeypatch):
     assert (row["stable"], shown) == (False, {}) and "no" in row["error"]
 
 
-def test_presets_reach_around_the_earth_and_to_the_moon():
+def test_preset_networks_have_the_known_delays():
     assert {name: round(2e3 * PRESETS[name].delay) for name in study.NETWORKS} == {
         "lan": 1,
         "wan": 30,
@@ -144,6 +146,6 @@ def test_presets_reach_around_the_earth_and_to_the_moon():
 
 
 @pytest.mark.slow
-def test_the_longest_round_trip_ends_at_the_first_that_is_not_stable():
+def test_longest_round_trip_is_below_the_first_unstable_one():
     assert study.longest_round_trip("none", OneDof(wall_stiffness=500.0), 0.0, 0.0, [0]) == 1.0
     assert study.longest_round_trip("none", OneDof(wall_stiffness=20000.0), 0.0, 0.0, [0]) == 0.0

@@ -1,16 +1,16 @@
-"""The words of the decision table, and what a hand that lets go or taps finds of a method."""
+"""Verdicts of the decision table, and runs with letting go and taps."""
 
 from __future__ import annotations
 
 import pytest
 
 from drake_teleop.lab.comparison.decision import decide
-from drake_teleop.lab.comparison.hands import hands
+from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.comparison.report import draw_decision, draw_energy, draw_runs
 
 
 def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, object]:
-    """One method over one network before two leaves, good but for what is said of the second."""
+    """Return a good result of one method on two leaves, with changes to the second."""
     good = {"method": "tdpa", "network": "lan", "stable": True, "felt_force": 3.9}
     good |= {"pressed_force": 4.0, "left_behind": 1e-3, "leaked": 0.0}
     good |= {"hunting": 1e-5, "turning": 1e-4}
@@ -41,7 +41,7 @@ def summary(hands_leaked: float = 0.0, **second_leaf: object) -> dict[str, objec
         ),
     ],
 )
-def test_a_cell_says_the_first_that_is_so(changes, words, share):
+def test_cell_has_the_first_verdict_that_applies(changes, words, share):
     (cell,) = decide(summary(**changes)).values()
     assert (cell.words, cell.share) == (words, share)
     (axes,) = draw_decision(summary(**changes)).axes
@@ -57,25 +57,27 @@ def test_a_cell_says_the_first_that_is_so(changes, words, share):
         ({"hunting": None, "turning": None}, "ended early"),
     ],
 )
-def test_what_is_unstable_says_before_which_leaf_and_how(figures, words):
+def test_unstable_cell_has_leaf_and_motion(figures, words):
     (axes,) = draw_decision(summary(stable=False, **figures)).axes
     assert [text.get_text() for text in axes.texts][1:] == ["at rest", words]
 
 
-def test_a_hand_that_lets_go_is_thrown_without_a_method_and_taps_are_felt():
-    none, ledger = hands("none", "internet"), hands("ledger", "internet")
+def test_letting_go_accelerates_the_device_without_a_method():
+    none, ledger = (
+        simulate_release_and_taps("none", "internet"),
+        simulate_release_and_taps("ledger", "internet"),
+    )
     assert none.release_speed > 1.0 and none.leaked > 1.0 and none.release_way > 1.0
     assert ledger.release_speed < 0.3 and ledger.leaked <= 1e-6
     assert ledger.release_force > 2.5 and ledger.release_way < 0.1
-    # Without a method every impulse arrives, as much later as the network takes, here and where
-    # that is half of a tap.
-    for shown in (none, hands("none", "geostationary")):
+    # Without a method every impulse arrives, also with a delay of half a tap.
+    for shown in (none, simulate_release_and_taps("none", "geostationary")):
         assert shown.tap_shares == pytest.approx((1.0, 1.0), abs=0.02)
     assert ledger.tap_shares == pytest.approx((1.0, 1.0), abs=0.25)
 
 
 @pytest.mark.parametrize("draw", [draw_runs, draw_energy])
-def test_the_words_above_the_runs_of_one_network_are_not_cut_off(draw):
+def test_title_of_a_figure_with_one_network_fits(draw):
     figure = draw({"methods": ["none"], "networks": ["lan"]}, {})
     figure.draw_without_rendering()
     (title,) = [text for text in figure.texts if text.get_text() == figure.get_suptitle()]

@@ -1,4 +1,4 @@
-"""The one-degree-of-freedom reference against closed forms of the theory of delay."""
+"""One degree of freedom against closed forms of the theory of delay."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DEVICE_MASS, DEVICE_DAMPING = 0.15, 0.5
 
 
 def held(grip: str, **changes: float) -> OneDof:
-    """A hand on a device without friction, in front of a slave that is where it is told to be."""
+    """Return a hand on a device without friction, and an ideal servo."""
     hand = GRIPS[grip]
     return OneDof(
         hand_mass=hand.mass,
@@ -49,7 +49,7 @@ def held(grip: str, **changes: float) -> OneDof:
 
 
 def grows(model: OneDof, round_trip: int, rest: float) -> bool:
-    """Whether a small push grows around `rest` [m], for a round trip of so many periods."""
+    """Return whether a small disturbance grows around `rest` [m], for a round trip in periods."""
     steps = 12000
     intent = np.full((steps, 2), 0.0)
     intent[:, 0] = rest * np.minimum(np.arange(steps) / 1000, 1.0)
@@ -69,7 +69,7 @@ def grows(model: OneDof, round_trip: int, rest: float) -> bool:
 
 
 def longest_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
-    """The largest round trip in periods at which nothing grows, which starts below `high`."""
+    """Return the largest stable round trip in periods, below `high`."""
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (low, middle) if grows(model, middle, rest) else (middle, high)
@@ -77,7 +77,7 @@ def longest_round_trip(model: OneDof, rest: float, low: int, high: int) -> int:
 
 
 def contact_limit(grip: str, wall: float) -> float:
-    """RTT at which m s^2 + b s + k + K e^(-s RTT) has its first root on the imaginary axis [s]."""
+    """Return the least RTT [s] with an imaginary root of m s^2 + b s + k + K e^(-s RTT)."""
     hand = GRIPS[grip]
     m, b, k, K = hand.mass + DEVICE_MASS, hand.damping + DEVICE_DAMPING, hand.stiffness, wall / 17.5
 
@@ -91,16 +91,16 @@ def contact_limit(grip: str, wall: float) -> float:
 @pytest.mark.parametrize(
     ("grip", "wall"), [("light", 5100.0), ("medium", 5100.0), ("light", 1000.0), ("firm", 20000.0)]
 )
-def test_the_longest_delay_in_contact_is_that_of_the_closed_form(grip, wall):
+def test_longest_delay_in_contact_equals_closed_form(grip, wall):
     model = held(grip, wall_stiffness=wall)
-    # The command is interpolated over a period, the force held for one.
+    # Interpolation and hold add a delay.
     expected = contact_limit(grip, wall) / PERIOD - 1.5
     found = longest_round_trip(model, 0.02, 1, round(2 * expected) + 4)
     assert found == pytest.approx(expected, abs=1.0)
 
 
 def free_windows(grip: str) -> list[float]:
-    """RTT at which m s^2 + b s + k + mu s^2 e^(-s RTT) has roots on the imaginary axis [s]."""
+    """Return RTT [s] with imaginary roots of m s^2 + b s + k + mu s^2 e^(-s RTT)."""
     hand = GRIPS[grip]
     m, b, k, mu = (
         hand.mass + DEVICE_MASS,
@@ -123,12 +123,12 @@ def free_windows(grip: str) -> list[float]:
     return sorted(edges)
 
 
-def test_the_light_hand_meets_its_unstable_window_in_free_motion():
-    """With the whole inertia fed back: unstable between 190 and 339 ms, and not without it."""
+def test_light_hand_has_an_unstable_window_in_free_motion():
+    """With sigma = 1 it is unstable between 190 and 339 ms."""
     first, last = (edge / PERIOD for edge in free_windows("light"))
     assert (first, last) == (pytest.approx(190, abs=1), pytest.approx(339, abs=1))
     model = held("light", sigma=1.0)
-    # The second difference of the interpolated command is 2 periods late, the force is held.
+    # The second difference of the interpolated command is 2 periods late; the force is held.
     below, above = (round(edge - 2.5) for edge in (first, last))
     assert [grows(model, below + step, -0.5) for step in (-4, 4)] == [False, True]
     assert [grows(model, above + step, -0.5) for step in (-7, 7)] == [True, False]
@@ -136,7 +136,7 @@ def test_the_light_hand_meets_its_unstable_window_in_free_motion():
     assert not any(grows(without, delay, -0.5) for delay in (190, 260, 330))
 
 
-def test_hand_and_servo_are_those_of_the_station_unless_they_are_of_the_reference():
+def test_default_hand_and_servo_are_those_of_the_station():
     hand, servo, model = GRIPS["medium"], JointControlConfig(), OneDof()
     assert (model.hand_mass, model.hand_damping) == (hand.mass, hand.damping)
     assert model.hand_stiffness == hand.stiffness
@@ -163,7 +163,7 @@ def test_hand_and_servo_are_those_of_the_station_unless_they_are_of_the_referenc
 
 
 @pytest.mark.parametrize(("model", "longest"), [(OneDof(), 0.028), (REFERENCE, 0.008)])
-def test_how_long_a_round_trip_is_borne_without_a_method(model, longest):
+def test_longest_round_trip_without_a_method(model, longest):
     none, found = PassivityConfig(), {}
     for round_trip in (0.002, longest, longest + 0.002, 0.05):
         run = run_one_dof(model, none, NetworkConfig(delay=round_trip / 2))
@@ -174,7 +174,7 @@ def test_how_long_a_round_trip_is_borne_without_a_method(model, longest):
 
 
 @pytest.mark.parametrize("model", [OneDof(), REFERENCE])
-def test_simulation_and_linear_analysis_are_of_one_model(model):
+def test_simulation_and_linear_analysis_agree(model):
     shared = {entry.name: getattr(model, entry.name) for entry in dataclasses.fields(Axis)}
     margin = float(delay_margin(station_loop(OneAxis(**shared, device_damping=DEVICE_DAMPING))))
     damped = dataclasses.replace(
@@ -185,7 +185,7 @@ def test_simulation_and_linear_analysis_are_of_one_model(model):
     assert found == pytest.approx(expected, abs=1.0)
 
 
-def test_the_same_seed_gives_the_same_run():
+def test_same_seed_gives_same_run():
     network = NetworkConfig(delay=0.05, jitter=0.5, loss=0.3)
     first, again, other = (
         run_one_dof(OneDof(), PassivityConfig(), network, seed=seed).felt for seed in (1, 1, 2)
@@ -194,17 +194,17 @@ def test_the_same_seed_gives_the_same_run():
     assert np.abs(first - other).max() > 0
 
 
-def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
+def test_energy_balances_agree_with_spring_and_inertia():
     task = Task(swing=0.1, swung=0.7, press=0.7, pressed=1.0, release=1.3, released=1.5, end=2.0)
     model, intent, ahead = dataclasses.replace(REFERENCE, gamma=0.8), operators_intent(task), 10
     scale = model.gamma * model.force_scale
     run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=0.01), intent=intent)
     spring = 0.5 * scale * model.wall_stiffness * np.maximum(run.slave, 0.0) ** 2
     hand, command, motor, actual = run.accounts.T
-    # A spring gives back what it has taken, to rounding; so it is not the wall that is active.
+    # A spring returns its energy, to rounding: the wall is not active.
     np.testing.assert_allclose(actual, -spring, rtol=0.0, atol=1e-14)
     assert spring.max() > 0.01 and run.least(ACTUAL) < -0.01 and run.start_energy == 0.0
-    # The motor has given what the wall holds and what moves; v is half a step of 50 us late.
+    # Motor energy equals wall and kinetic energy; v is half a step of 50 us late.
     speed = np.gradient(run.slave, PERIOD)
     moving = 0.5 * scale * model.slave_mass * speed**2
     assert moving.max() > 0.1
@@ -213,13 +213,13 @@ def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
     np.testing.assert_allclose(motor[still], actual[still], rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(hand, run.energy[:, 0])
     assert run.least(HAND) == hand.min()
-    # By parts: the command's account has what the servo's lag holds besides.
+    # The command's balance also contains the energy in the servo's lag.
     wrench, lag = scale * run.wall, run.command - run.slave
     sampled = np.cumsum(wrench * np.diff(run.slave, prepend=run.slave[0]))
     held = wrench * lag - np.cumsum(np.roll(lag, 1) * np.diff(wrench, prepend=0.0))
     np.testing.assert_allclose(command, sampled + held, rtol=0.0, atol=1e-12)
     assert (command - actual).max() > 1e-3
-    # The packets of a network one by one, the same in a hand and before a wall that do not change.
+    # Explicit packet delays, constant hand and wall give the same run.
     given = run_one_dof(
         model,
         PassivityConfig(),
@@ -232,7 +232,7 @@ def test_the_accounts_are_those_of_spring_inertia_and_of_each_other():
     np.testing.assert_array_equal(given.accounts, run.accounts)
 
 
-def test_what_changes_in_a_run_and_what_is_not_ideal():
+def test_changing_hand_wall_and_imperfections():
     steps = 900
     intent, grip, wall = np.zeros((steps, 2)), np.zeros((steps, 3)), np.zeros((steps, 2))
     intent[:, 0], grip[:600] = 0.019, (0.2, 5.0, 300.0)
@@ -259,8 +259,7 @@ def test_what_changes_in_a_run_and_what_is_not_ideal():
         delays=(lost, lost),
         timeout=0.05,
     )
-    # At rest before the wall; it comes nearer by 15 mm, pushes slave and free device away,
-    # is gone again; at last nobody hears anything.
+    # The wall moves by 15 mm, pushes slave and free device away and returns; then packets stop.
     assert run.wall[:599].min() == 0.0 == run.wall[750:].min() and run.wall[600:750].min() < -20.0
     assert run.accounts[749, ACTUAL] == run.accounts[-1, ACTUAL]
     noise = run.felt[50:590] / model.force_scale
@@ -270,7 +269,7 @@ def test_what_changes_in_a_run_and_what_is_not_ideal():
     np.testing.assert_allclose(run.command[600:800], steps_of, atol=1e-15)
 
 
-def test_the_adversary_repeats_itself_finds_a_leak_and_tells_a_cycle_from_a_creep(
+def test_adversary_is_reproducible_and_finds_leaks_and_cycles(
     monkeypatch,
 ):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
@@ -294,15 +293,15 @@ def test_the_adversary_repeats_itself_finds_a_leak_and_tells_a_cycle_from_a_cree
     ("share", "late", "drag", "expected"),
     [
         (1.0, 0.1, 0.0, 0.1),
-        # Half of the force, at once: not before it is there.
+        # Half of the force, without delay: not earlier than the contact.
         (0.5, 0.0, 0.0, 0.0),
-        # A drag hides the rise if it is as strong; a weaker one, on top, makes it 0.08 s sooner.
+        # A drag of equal size hides the rise; a smaller one makes it 0.08 s earlier.
         (1.0, 0.1, 0.8, math.nan),
         (1.0, 0.1, 0.2, 0.02),
         (1.0, 0.1, -0.8, 0.1),
     ],
 )
-def test_the_force_felt_never_rises_before_that_of_the_wall(share, late, drag, expected):
+def test_rise_delay_is_never_negative(share, late, drag, expected):
     task, t = Task(), np.arange(round(Task().end / PERIOD)) * PERIOD
     middle = 0.5 * (task.press + task.pressed)
 

@@ -1,4 +1,4 @@
-"""What the environment has put into a station, of a log that is written down here."""
+"""Energy balances of a station, from constructed logs and one run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SCENARIO = replace(
 
 
 def logged(wrench_at_S) -> tuple[SimulationResult, np.ndarray]:
-    """A log of 21 rows in which every joint turns, and X_WS; the wrench is a function of p_WS."""
+    """Return a log of 21 rows with moving joints, and X_WS; the wrench is a function of p_WS."""
     t, arm = np.arange(21) * 1e-3, slave_arm(SCENARIO)
     q = np.array([0.1, -0.4, 0.9, 0.2, 0.7, -0.3]) + 4.0 * t[:, np.newaxis] * np.arange(1, 7)
     poses = np.empty((len(t), 7))
@@ -48,7 +48,7 @@ def logged(wrench_at_S) -> tuple[SimulationResult, np.ndarray]:
     return SimulationResult(t, signals, [SIGNALS[name] for name in signals]), poses
 
 
-def test_a_spring_at_the_tool_gets_back_what_it_gave():
+def test_spring_at_the_tool_returns_its_energy():
     middle, stiffness = np.array([0.1, 0.2, 0.3]), np.diag([1e3, 2e3, 4e3])
     result, poses = logged(lambda p: np.hstack([-stiffness @ (p - middle), np.zeros(3)]))
     offset = poses[:, 4:] - middle
@@ -60,18 +60,18 @@ def test_a_spring_at_the_tool_gets_back_what_it_gave():
     np.testing.assert_allclose(actual[:, 1], 0.0, atol=1e-12)
 
 
-def test_a_torque_at_the_tool_works_along_its_turns_alone():
+def test_torque_at_the_tool_works_only_along_rotation():
     result, _ = logged(lambda p: np.array([0.0, 0.0, 0.0, 0.3, -0.2, 0.1]))
     accounts = station_accounts(result, SCENARIO)
     np.testing.assert_allclose(accounts[:, ACTUAL, 0], 0.0, atol=1e-12)
     assert abs(accounts[-1, ACTUAL, 1]) > 1e-3
-    # What the channel had summed up a period of 0.5 ms ago, from the first row on.
+    # The channel's sum of one period (0.5 ms) ago, relative to the first row.
     np.testing.assert_allclose(accounts[:-1, HAND, 1], 2.0 * np.arange(20.0), atol=1e-9)
     assert np.isnan(accounts[:, MOTOR]).all()
 
 
-def test_a_load_gets_back_what_it_gave_in_weight_and_motion():
-    """Of T + U, by mass, m c and inertia about So, as written here; half of it is felt."""
+def test_load_work_equals_potential_and_kinetic_energy():
+    """Half of T + U by mass, m c and inertia about So is displayed."""
     t, scenario = np.arange(400) * 1e-3, replace(SCENARIO, force_scaling__sigma=0.5)
     scenario = replace(scenario, kinematic_scaling=KinematicScalingConfig(2.0, 2.0))
     arm, rates = slave_arm(scenario), np.arange(1, 7)
@@ -94,7 +94,7 @@ def test_a_load_gets_back_what_it_gave_in_weight_and_motion():
     assert np.ptp(expected) > 0.02 and np.ptp(given[:, 1]) > 1e-3
 
 
-def test_what_the_stores_hold_at_the_start_is_that_of_both_ends():
+def test_start_energy_is_the_sum_of_both_ends():
     scenario = replace(SCENARIO, passivity=PassivityConfig(method="two_layer"))
     np.testing.assert_allclose(
         start_energy(scenario), 2 * np.array(scenario.passivity.two_layer.initial)
@@ -102,7 +102,7 @@ def test_what_the_stores_hold_at_the_start_is_that_of_both_ends():
     np.testing.assert_array_equal(start_energy(SCENARIO), 0.0)
 
 
-def test_a_station_without_a_channel_has_no_accounts():
+def test_station_without_channel_raises():
     result, _ = logged(lambda p: np.zeros(6))
     kept = [name for name in result if name != "ports"]
     less = SimulationResult(result.t, {n: result[n] for n in kept}, [SIGNALS[n] for n in kept])
@@ -111,8 +111,8 @@ def test_a_station_without_a_channel_has_no_accounts():
 
 
 @pytest.mark.parametrize("sigma", [0.0, pytest.param(1.0, marks=pytest.mark.slow)])
-def test_the_whole_station_with_ledger_creates_no_energy(sigma):
-    """A hand that strikes a leaf over a lossy network, of which the slave hears 50 ms later.
+def test_station_with_ledger_creates_no_energy(sigma):
+    """A hand strikes a leaf over a lossy network with 50 ms of delay.
 
     With `none` hand and leaf get 0.45 J and, by rotation, 0.30 J out of this. Where the load is
     felt it is part of what may get no more than was put in.

@@ -1,29 +1,28 @@
-"""`drake-teleop analyze`: is a station stable, for whom, and how transparent is it?
+"""`drake-teleop analyze`: stability and transparency of a station at rest, along one direction.
 
-Along one direction of the task, at rest. The two-port between hand and environment is that of the
-Diagram itself, linearised; the closed form of one axis stands beside it. `summary.json` holds
+The two-port between hand and environment is that of the linearised Diagram. `summary.json` contains
 
 ============ ==================================================================================
-scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (its
-             leaf or wall, or else the paper's 5.1 kN/m), wall_is (which of them)
-axis         the numbers of `analysis.one_axis.OneAxis`, and tool_coupling
-diagram      list: operating point, states, stable, decay_1_per_s (of what dies last),
+scenario     its name, direction, grip, passivity method, delay_s (one way), wall_N_per_m (of its
+             leaf or wall, otherwise the paper's 5.1 kN/m), wall_is (source of this value)
+axis         fields of `analysis.one_axis.OneAxis`, and tool_coupling
+diagram      list: point, states, stable, decay_1_per_s (of the slowest motion),
              frequency_Hz (of its oscillation); one_axis: the same of the sampled one-axis model
-two_port     greatest deviation of the Diagram's H, hand's mass included, up to 30 Hz: closed_form
-             with the exact delay, sampled with the station's rates as well
-margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: without bound)
+two_port     largest deviation of the Diagram's H, hand's mass included, up to 30 Hz, from the
+             closed_form and the sampled model of one axis
+margins      list: grip, wall_N_per_m, stable, gain, phase_deg, round_trip_s (null: no limit)
 absolute     absolutely_stable, least_parameter (>= 1 is stable) and at_Hz,
              lacking_damping_Ns_per_m, passive, scattering_norm
 bounded      grips: stiffest wall [N/m] for every hand between the lightest and the firmest grip;
-             each: for each grip alone, as it is; null: no wall is too stiff
-transparency free and wall: mass_kg, damping_Ns_per_m, stiffness_N_per_m of what is felt and of the
-             ideal; unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades;
-             smallest_stiffness_N_per_m
-z_width      device's damping and rate; list: wall_damping, passive_N_per_m, stable_N_per_m
-maps         list: x, y, stable (share of the map), boundary (places)
+             each: for each grip alone; null: no limit
+transparency free and wall: felt and ideal, each mass [kg], damping [N s/m], stiffness [N/m]; and
+             unnoticed_to_Hz; tracking_bandwidth_Hz; width_decades; smallest_stiffness_N_per_m
+z_width      device_damping_Ns_per_m, rate_Hz; walls: list: wall_damping_Ns_per_m, passive_N_per_m,
+             passive_in_the_hand_N_per_m, stable_in_the_hand_N_per_m
+maps         list: title, x, y; for each grip: stable (fraction of the map), boundary (points)
 measured     in free motion, by multi-sine in the nonlinear simulation: frequency_Hz, felt_re,
-             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation
-             (hand's mass included); null if free motion is unstable
+             felt_im, coherence, greatest_error and greatest_error_deg against the linearisation;
+             null if free motion is unstable
 verdict      list of short sentences
 ============ ==================================================================================
 """
@@ -41,25 +40,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.common.writing import make_folder, output_folder, write_json
+from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
-from drake_teleop.lab.analysis.figures import (
-    OMEGA,
-    S,
-    absolute_figures,
-    bounded_figures,
-    deviations,
-    diagram_figures,
-    held_by,
-    margin_rows,
-    measured_figures,
-    parameter_maps,
-    transparency_figures,
-    z_width_figures,
-)
 from drake_teleop.lab.analysis.linearization import (
     AXES,
     Linearization,
-    delays,
+    close_network,
     hybrid_along,
     linearize,
 )
@@ -75,7 +61,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_PRESSED = 5e-3  # m, how deep the hand presses into the leaf
+_LEAF_DEPTH = 5e-3  # m, depth in the leaf
 
 
 def analyze_command(
@@ -86,23 +72,19 @@ def analyze_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Analyses a scenario; writes summary.json, report.html and its pictures.
+    """Analyse a scenario; write summary.json, report.html and its pictures into `out`.
 
     Args:
         scenario: the name of a shipped one, or a YAML file.
-        out: the folder.
         direction: x, y or z of the world.
         quiet: no progress bars and no tables.
-        progress: False for no progress bars alone.
+        progress: False hides only the progress bars.
 
     Returns:
         The summary, see the top of this module.
-
-    Raises:
-        DrakeTeleopError: for a scenario that cannot be, or cannot be linearised.
     """
     setup = LoadScenario(scenario)
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # before the work, so that a bad path fails early
     summary, curves = analyze(setup, direction, progress and not quiet)
     summary = {"scenario": str(scenario), **summary}
     with output_folder(out):
@@ -116,17 +98,9 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """The figures of a scenario along x, y or z of the world, and its curves.
+    """Return the figures of a scenario along x, y or z of the world, and its curves.
 
-    A method of passivity in the channel is not linear: then the station is analysed without it.
-
-    Args:
-        scenario: of the station.
-        direction: x, y or z.
-        progress: whether bars are shown, or where: see `pages/progress.py`.
-
-    Raises:
-        DrakeTeleopError: see `analyze_command`.
+    A passivity method, which is not linear, is left out. `progress`: whether or where to show it.
     """
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
@@ -150,37 +124,39 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
     points = [("free motion", free, axis)]
     if scenario.leaf is not None:
         alone = replace(linear.without_environment(), sheet_spring=scenario.leaf)
-        pressed = linearize(alone, load_estimate=estimate, displacement=pressing(alone))
+        pressed = linearize(alone, load_estimate=estimate, displacement=leaf_displacement(alone))
         points.append(("on the leaf", pressed, contact))
     progress(1.0)
 
     progress = stage("Two-port, margins, transparency")
-    with_hand = hybrid_along(held_elsewhere(free, linear, along), OMEGA, along.hand, along.tool)
-    H = absorb(with_hand, hand=-S * axis.hand_mass)
-    closed_form = hybrid(axis, S)
+    with_hand = hybrid_along(
+        close_other_directions(free, linear, along), figures.OMEGA, along.hand, along.tool
+    )
+    H = absorb(with_hand, hand=-figures.S * axis.hand_mass)
+    closed_form = hybrid(axis, figures.S)
     progress(0.3)
-    figures: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "direction": direction,
         "grip": scenario.operator.grip,
         "method": method,
         "delay_s": axis.delay,
         "wall_N_per_m": wall[0],
-        "wall_is": wall_is(scenario, along.axis.wall_stiffness > 0.0),
+        "wall_is": describe_wall(scenario, along.axis.wall_stiffness > 0.0),
         "axis": dataclasses.asdict(axis) | {"tool_coupling": along.tool_coupling},
         "diagram": [
-            diagram_figures(name, closed(system, linear), on_paper, sampling)
-            for name, system, on_paper in points
+            figures.diagram_figures(name, close_all_loops(system, linear), one_axis, sampling)
+            for name, system, one_axis in points
         ],
-        "two_port": deviations(with_hand, axis, sampling),
-        "margins": margin_rows(axis, sampling, wall[0]),
-        "absolute": absolute_figures(H, axis),
-        "bounded": bounded_figures(H, axis, sampling),
-        "transparency": transparency_figures(H, axis, wall),
-        "z_width": z_width_figures(axis, sampling),
+        "two_port": figures.two_port_deviations(with_hand, axis, sampling),
+        "margins": figures.margin_rows(axis, sampling, wall[0]),
+        "absolute": figures.absolute_figures(H, axis),
+        "bounded": figures.bounded_figures(H, axis, sampling),
+        "transparency": figures.transparency_figures(H, axis, wall),
+        "z_width": figures.z_width_figures(axis, sampling),
     }
     progress(1.0)
-    maps = parameter_maps(axis, wall, sampling, stage)
-    figures["maps"] = [
+    maps = figures.parameter_maps(axis, wall, sampling, stage)
+    summary["maps"] = [
         {
             "title": title,
             "x": shown[scenario.operator.grip].x_name,
@@ -190,27 +166,24 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
         }
         for title, shown in maps.items()
     ]
-    figures["measured"] = None
-    if figures["diagram"][0]["stable"]:
+    summary["measured"] = None
+    if summary["diagram"][0]["stable"]:
         measured = stage("Multi-sine in the nonlinear simulation")
-        figures["measured"] = measured_figures(linear, along, held_elsewhere(free, linear, along))
+        summary["measured"] = figures.measured_figures(
+            linear, along, close_other_directions(free, linear, along)
+        )
         measured(1.0)
-    figures = _plain(figures)
-    figures["verdict"] = verdict(figures)
+    summary = _plain(summary)
+    summary["verdict"] = verdict(summary)
     nyquist = {}
     for grip in GRIPS:
-        loop = cut_loop(held_by(contact, grip), sampling)
-        nyquist[grip] = -loop_response(loop, OMEGA, axis.delay)
-    return figures, Curves(axis, OMEGA, H, closed_form, wall, nyquist, maps)
+        loop = cut_loop(figures.with_grip(contact, grip), sampling)
+        nyquist[grip] = -loop_response(loop, figures.OMEGA, axis.delay)
+    return summary, Curves(axis, figures.OMEGA, H, closed_form, wall, nyquist, maps)
 
 
-def wall_is(scenario: Scenario, is_known: bool) -> str:
-    """What the wall of the closed forms is: only leaf and wall have a stiffness along one line.
-
-    Args:
-        scenario: with or without something to touch.
-        is_known: whether that has a stiffness.
-    """
+def describe_wall(scenario: Scenario, is_known: bool) -> str:
+    """Return the report's description of the wall."""
     if scenario.leaf is not None:
         return "the leaf"
     surroundings = scenario.surroundings
@@ -222,7 +195,7 @@ def wall_is(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """The rates of a scenario."""
+    """Return the rates of a scenario."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -232,12 +205,8 @@ def sampling_of(scenario: Scenario) -> Sampling:
     )
 
 
-def pressing(scenario: Scenario) -> list[float]:
-    """Displacement of the master [m], in B, at which the tip is 5 mm deep in the leaf.
-
-    Raises:
-        DrakeTeleopError: if the motion is not scaled to anything.
-    """
+def leaf_displacement(scenario: Scenario) -> list[float]:
+    """Return the displacement of the master [m], in B, that presses the tip 5 mm into the leaf."""
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -247,21 +216,24 @@ def pressing(scenario: Scenario) -> list[float]:
             remedy="choose a scale above 0, or leave the sheet_spring out",
         )
     tip = NominalSlave(scenario.slave).start_tip
-    way = np.array(scenario.leaf.position) - [0.0, 0.0, _PRESSED] - tip
+    displacement = np.array(scenario.leaf.position) - [0.0, 0.0, _LEAF_DEPTH] - tip
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    return list(R_WB.T @ way / scaling.translation_scale)
+    return list(R_WB.T @ displacement / scaling.translation_scale)
 
 
-def closed(system: Linearization, scenario: Scenario) -> Linearization:
-    """All loops closed: the operator holds the stylus over the network."""
-    return _network(system, scenario).close("operator_wrench", "hand_wrench")
+def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
+    """Return the system with all loops closed."""
+    return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
-def held_elsewhere(
+def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Closed but for the hand's grip along the direction, if that is an axis of B; else let go."""
-    system = _network(system, scenario)
+    """Return the system with all loops closed except the hand's along the direction.
+
+    If the direction is no axis of B, the hand's loop remains open.
+    """
+    system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)
     others = [axis for k, axis in enumerate(AXES) if len(aligned) and k != aligned[0]]
     return system.close(
@@ -269,14 +241,7 @@ def held_elsewhere(
     )
 
 
-def _network(system: Linearization, scenario: Scenario) -> Linearization:
-    forward, backward = delays(scenario)
-    system = system.close("pose_command", "pose_received", forward)
-    return system.close("wrench_B", "wrench_received", backward)
-
-
 def _plain(value: Any) -> Any:
-    """What JSON can say: no numpy, and None for what is not finite."""
     if isinstance(value, dict):
         return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

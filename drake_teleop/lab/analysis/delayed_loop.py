@@ -1,25 +1,16 @@
 """A loop with a delay: its unstable poles, delay margin and windows of stable delays, exactly.
 
-The loop is broken at the force that the operator feels. Hand and device, Z_h + Z_m, move under it;
-what comes back is the felt impedance:
+The loop L(s) = N(s) / D(s) e^(-s RTT) is cut at the displayed force (T58). A pole can cross the
+imaginary axis only at roots of |N(jw)| = |D(jw)|, at delays 2 pi / w apart and always in the same
+direction (Walton and Marshall 1987; T59). With an ideal servo and a displayed inertia, |L| tends
+to a constant rho at high frequency; with rho >= 1 any delay causes infinitely many unstable poles.
 
-    L(s) = Z_felt / (Z_h + Z_m) = N(s) / D(s) e^(-s RTT),    Z_felt = Z_to - Z_m,
-
-so that the closed loop's poles are the roots of D(s) + N(s) e^(-s RTT). The delay is exact. Such a
-loop needs no search: |N(jw)| = |D(jw)| is a polynomial in w^2, and only at its roots can a pole
-cross the imaginary axis, at delays 2 pi / w apart and always in the same direction (Walton and
-Marshall 1987). That gives the number of unstable poles, the delay margin and the windows of stable
-delays for whole grids of parameters.
-
-Where the felt force contains the load's acceleration in free motion and the slave follows ideally,
-|L| tends to a constant rho at high frequency (a neutral equation). With rho >= 1 any delay however
-small leaves infinitely many unstable poles; with rho < 1 the count is finite, as for other loops.
+Parameters that are not positive, or N of higher order than D, raise DrakeTeleopError.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,32 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
-from drake_teleop.lab.analysis.polynomials import (
-    Array,
-    multiply,
-    roots_of,
-    squared_magnitude,
-    stack,
-    value_at,
-)
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class DelayedLoop:
-    """L(s) = N(s) / D(s) e^(-s delay), or a grid of such loops.
+    """Loop L(s) = N(s) / D(s) e^(-s delay), or a grid of such loops."""
 
-    Args:
-        numerator, denominator: coefficients (..., n + 1), highest power first; leading dimensions
-            are those of the grid and broadcast.
-        delay: (...) [s].
-
-    Raises:
-        DrakeTeleopError: the delay is negative, or N is of higher order than D.
-    """
-
-    numerator: Array
-    denominator: Array
-    delay: Array
+    numerator: Array  #: coefficients (..., n + 1), highest power first
+    denominator: Array  #: likewise, at least of the same order
+    delay: Array  #: (...) [s], not negative
 
     def __post_init__(self) -> None:
         numerator = np.atleast_1d(np.asarray(self.numerator, dtype=float))
@@ -76,12 +52,7 @@ class DelayedLoop:
 
     @classmethod
     def from_control(cls, system: Any, delay: ArrayLike = 0.0) -> DelayedLoop:
-        """The loop of a continuous control.TransferFunction or StateSpace, one input, one output.
-
-        Raises:
-            DrakeTeleopError: more inputs or outputs, or sampled (take its frequency response to
-                `margins_of_response` instead).
-        """
+        """Return the loop of a continuous control.TransferFunction or StateSpace."""
         import control
 
         if system.ninputs != 1 or system.noutputs != 1 or not system.isctime():
@@ -97,179 +68,162 @@ class DelayedLoop:
         )
 
     def to_control(self, omega: ArrayLike) -> Any:
-        """A single loop with its delay as control.FrequencyResponseData at omega (n,) [rad/s]."""
+        """Return a single loop as control.FRD at omega (n,) [rad/s]."""
         import control
 
         omega = np.asarray(omega, dtype=float)
         return control.frd(self(1j * omega), omega)
 
     def __call__(self, s: ArrayLike) -> Complex:
-        """L at s [rad/s], (n,): (n, *grid)."""
+        """Return L (n, *grid) at s (n,) [rad/s]."""
         s = np.asarray(s, dtype=complex)
         return self._at(s.reshape(s.shape + (1,) * self.delay.ndim))
 
     def __getitem__(self, cell: Any) -> DelayedLoop:
-        """Part of the grid."""
         return DelayedLoop(self.numerator[cell], self.denominator[cell], self.delay[cell])
 
     @property
     def high_frequency_gain(self) -> Array:
-        """rho = lim |L(jw)| as w grows."""
+        """Limit rho of |L(jw)| for large w."""
         return np.abs(self.numerator[..., 0] / self.denominator[..., 0])
 
     def _at(self, s: Any) -> Complex:
-        """L at s that broadcasts with the grid."""
-        ratio = value_at(self.numerator, s) / value_at(self.denominator, s)
+        ratio = polynomial_value(self.numerator, s) / polynomial_value(self.denominator, s)
         return ratio * np.exp(-s * self.delay)
 
 
 def held_device(axis: OneAxis) -> tuple[Array, Array, Array]:
-    """Mass, damping and stiffness [kg, N s/m, N/m] of hand and device together.
-
-    Raises:
-        DrakeTeleopError: the mass or the damping is not positive, or the stiffness negative.
-    """
-    return checked_held(
-        np.asarray(axis.hand_mass) + axis.device_mass,
-        np.asarray(axis.hand_damping) + axis.device_damping,
-        axis.hand_stiffness,
+    """Return mass, damping and stiffness of hand and device together."""
+    mass = checked_positive(
+        np.asarray(axis.hand_mass) + axis.device_mass, "mass of hand and device"
     )
+    damping = checked_positive(
+        np.asarray(axis.hand_damping) + axis.device_damping, "damping of hand and device"
+    )
+    stiffness = np.asarray(axis.hand_stiffness, dtype=float)
+    if not np.all(stiffness >= 0):
+        raise DrakeTeleopError("the stiffness of the hand is negative")
+    return mass, damping, stiffness
 
 
 def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
-    """The loop of a station at the felt force, in contact with its wall or in free motion.
+    """Return the loop of a station at the displayed force, on its wall or in free motion.
 
     L = k_f l_p G (gamma (b_e s + k_e) + M s^2) / (m s^2 + b s + k) e^(-2 s T), with
     G = g / (s^2 + k_v s + g + (b_e s + k_e) / m_s), g = k_v k_p, or 1 for an ideal servo;
-    m, b, k of hand and device. Fields of the axis may be arrays that broadcast: that is the grid.
-
-    Raises:
-        DrakeTeleopError: no mass or damping of hand and device together, or no slave mass.
+    m, b, k of hand and device. Fields of the axis may be arrays: the grid.
     """
     if not contact:
         axis = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
     scale = axis.force_scale * axis.position_scale
-    numerator = stack(
-        scale * axis.felt_tool_mass,
+    numerator = stack_coefficients(
+        scale * axis.displayed_tool_mass,
         scale * axis.gamma * axis.wall_damping,
         scale * axis.gamma * axis.wall_stiffness,
     )
-    denominator = stack(*held_device(axis))
+    denominator = stack_coefficients(*held_device(axis))
     if not axis.ideal_servo:
         slave_mass = checked_positive(axis.slave_mass, "mass of the slave")
         gain = axis.velocity_gain * axis.position_gain
-        servo = stack(
+        servo = stack_coefficients(
             1.0,
             axis.velocity_gain + axis.wall_damping / slave_mass,
             gain + axis.wall_stiffness / slave_mass,
         )
         numerator = numerator * np.asarray(gain)[..., None]
-        denominator = multiply(servo, denominator)
+        denominator = multiply_polynomials(servo, denominator)
     return DelayedLoop(numerator, denominator, np.asarray(2 * axis.delay))
 
 
 def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
-    """Where |L(jw)| = 1, and which way closed-loop poles cross there as the delay grows.
+    """Return where |L(jw)| = 1, and the direction in which poles cross there as the delay grows.
 
     Returns:
-        frequency (..., n) [rad/s], NaN where there are fewer than n; direction (..., n): 1 into
-        the right half plane (|L| falls), -1 out of it (|L| rises), 0 where there is none.
+        frequency (..., n) [rad/s], NaN if unused; direction (..., n): 1 into the right half plane
+        (|L| falls), -1 out of it, 0 if unused.
     """
     excess = squared_magnitude(loop.denominator) - squared_magnitude(loop.numerator)
     slope = excess[..., :-1] * np.arange(excess.shape[-1] - 1, 0, -1)
-    roots = roots_of(excess)
+    roots = polynomial_roots(excess)
     x = np.where((roots.imag == 0) & (roots.real > 0), roots.real, np.nan)
-    for _ in range(2):  # the eigenvalues' last digits
-        step = value_at(excess[..., None, :], x) / value_at(slope[..., None, :], x)
+    for _ in range(2):  # refine the eigenvalues
+        step = polynomial_value(excess[..., None, :], x) / polynomial_value(slope[..., None, :], x)
         x = np.where(np.abs(step) < 1e-3 * x, x - step, x)
-    direction = np.nan_to_num(np.sign(value_at(slope[..., None, :], x)))
+    direction = np.nan_to_num(np.sign(polynomial_value(slope[..., None, :], x)))
     return np.sqrt(x), direction
 
 
 def unstable_poles(loop: DelayedLoop) -> Array:
-    """Closed-loop poles in the right half plane (...), exact; inf if there is no end of them."""
+    """Return the number of closed-loop poles in the right half plane (...), or inf."""
     frequency, direction = gain_crossings(loop)
-    late = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
-    crossed = np.ceil(np.clip(np.nan_to_num(late), 0, None))
-    count = _undelayed_count(loop) + 2 * np.sum(direction * crossed, axis=-1)
+    excess_turns = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
+    crossed = np.ceil(np.clip(np.nan_to_num(excess_turns), 0, None))
+    count = _unstable_without_delay(loop) + 2 * np.sum(direction * crossed, axis=-1)
     endless = (loop.delay > 0) & (loop.high_frequency_gain >= 1)
     return np.where(endless, np.inf, count)
 
 
 def delay_margin(loop: DelayedLoop) -> Array:
-    """What may be added to the delay before a pole reaches the imaginary axis (...) [s].
+    """Return the delay that may be added before the loop becomes unstable (...) [s].
 
-    inf if any delay may be added, 0 if the loop is unstable as it is.
+    inf for any delay, 0 if it is unstable already.
     """
     return margin_of_delay(loop, unstable_poles(loop) == 0)[0]
 
 
 def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]]:
-    """Windows of delay in [0, longest] where a single loop is stable; its own delay is not used.
-
-    Raises:
-        DrakeTeleopError: a grid of loops.
-    """
+    """Return the windows of delay in [0, longest] in which a single loop is stable."""
     if loop.delay.ndim:
         raise DrakeTeleopError("windows of stable delays are those of a single loop")
     if loop.high_frequency_gain >= 1:
         return []
     frequency, direction = gain_crossings(loop)
-    changes = [(0.0, int(_undelayed_count(loop)))]
+    changes = [(0.0, int(_unstable_without_delay(loop))), (longest, 0)]
     for w, sign, first in zip(frequency, direction, _first_delay(loop, frequency), strict=True):
         if sign:
             changes += [(float(t), 2 * int(sign)) for t in np.arange(first, longest, 2 * np.pi / w)]
-    return joined_windows(changes, longest, inside=lambda count: count == 0)
-
-
-def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Margin and its frequency: the first pole to arrive does so from the left, wherever it is."""
-    frequency, _ = gain_crossings(loop)
-    past = np.mod(angle_past_minus_one(loop, frequency), 2 * np.pi)
-    margin, at = least_along(past / frequency, frequency)
-    neutral = loop.high_frequency_gain >= 1
-    return np.where(stable & ~neutral, margin, 0.0), at
-
-
-def angle_past_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
-    """Angle of -L at frequencies (..., n) of each loop: the lag that would put L on -1."""
-    along = DelayedLoop(
-        loop.numerator[..., None, :], loop.denominator[..., None, :], loop.delay[..., None]
-    )
-    with np.errstate(invalid="ignore"):  # NaN where there is no crossing
-        return angle_of(-along._at(1j * frequency))
-
-
-def _first_delay(loop: DelayedLoop, frequency: Array) -> Array:
-    """The first delay (..., n) at which a pole is on the imaginary axis at these frequencies."""
-    undelayed = replace(loop, delay=np.zeros_like(loop.delay))
-    return np.mod(angle_past_minus_one(undelayed, frequency), 2 * np.pi) / frequency
-
-
-def _undelayed_count(loop: DelayedLoop) -> Array:
-    roots = roots_of(loop.numerator + loop.denominator)
-    size = np.max(np.abs(roots), axis=-1, initial=0.0, keepdims=True)
-    return np.sum(roots.real > 1e-9 * size, axis=-1).astype(float)
-
-
-def joined_windows(
-    changes: list[tuple[float, int]], longest: float, inside: Callable[[int], bool]
-) -> list[tuple[float, float]]:
-    """Intervals of [0, longest] where the sum of the changes so far is inside, joined."""
     windows: list[tuple[float, float]] = []
-    changes = sorted([*changes, (longest, 0)])
-    count = 0
-    for (start, change), (end, _) in itertools.pairwise(changes):
-        count += change
-        if inside(count) and end > start:
+    unstable = 0
+    for (start, change), (end, _) in itertools.pairwise(sorted(changes)):
+        unstable += change
+        if unstable == 0 and end > start:
             if windows and windows[-1][1] == start:
                 start = windows.pop()[0]
             windows.append((start, end))
     return windows
 
 
-def least_along(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
-    """The least value along the axis, NaN left out (inf if there is none), and where it is."""
+def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return the delay margin and the frequency at which a pole reaches the axis."""
+    frequency, _ = gain_crossings(loop)
+    past = np.mod(phase_lag_to_minus_one(loop, frequency), 2 * np.pi)
+    margin, at = min_without_nan(past / frequency, frequency)
+    neutral = loop.high_frequency_gain >= 1
+    return np.where(stable & ~neutral, margin, 0.0), at
+
+
+def phase_lag_to_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
+    """Return the phase lag of each loop to -1 at frequencies (..., n)."""
+    along = DelayedLoop(
+        loop.numerator[..., None, :], loop.denominator[..., None, :], loop.delay[..., None]
+    )
+    with np.errstate(invalid="ignore"):  # NaN without a crossing
+        return angle_of(-along._at(1j * frequency))
+
+
+def _first_delay(loop: DelayedLoop, frequency: Array) -> Array:
+    undelayed = replace(loop, delay=np.zeros_like(loop.delay))
+    return np.mod(phase_lag_to_minus_one(undelayed, frequency), 2 * np.pi) / frequency
+
+
+def _unstable_without_delay(loop: DelayedLoop) -> Array:
+    roots = polynomial_roots(loop.numerator + loop.denominator)
+    size = np.max(np.abs(roots), axis=-1, initial=0.0, keepdims=True)
+    return np.sum(roots.real > 1e-9 * size, axis=-1).astype(float)
+
+
+def min_without_nan(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
+    """Return the least value along the axis without NaN, or inf, and its place."""
     value = np.where(np.isnan(value), np.inf, value)
     if not value.shape[axis]:
         shape = np.delete(value.shape, axis)
@@ -281,25 +235,55 @@ def least_along(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
 
 
 def angle_of(value: Complex) -> Array:
-    """(...) of complex numbers [rad], from -pi to pi."""
+    """Return the angle of complex numbers [rad]."""
     return np.arctan2(value.imag, value.real)
 
 
-def checked_held(
-    mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike
-) -> tuple[Array, Array, Array]:
-    """Mass, damping and stiffness of hand and device as arrays; an error for what cannot be."""
-    m = checked_positive(mass, "mass of hand and device")
-    b = checked_positive(damping, "damping of hand and device")
-    k = np.asarray(stiffness, dtype=float)
-    if not np.all(k >= 0):
-        raise DrakeTeleopError("the stiffness of the hand is negative")
-    return m, b, k
-
-
 def checked_positive(value: ArrayLike, what: str) -> Array:
-    """The value as an array; a DrakeTeleopError that says `what` it is, if it is not positive."""
+    """Return the value as an array; raise if it is not positive."""
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive")
     return value
+
+
+def stack_coefficients(*coefficients: Any) -> Array:
+    """Return broadcast coefficients along the last axis."""
+    return np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in coefficients)), axis=-1)
+
+
+def multiply_polynomials(p: Array, q: Array) -> Array:
+    """Return the product of polynomials."""
+    n = q.shape[-1]
+    grid = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
+    product = np.zeros((*grid, p.shape[-1] + n - 1))
+    for i in range(p.shape[-1]):
+        product[..., i : i + n] += p[..., i : i + 1] * q
+    return product
+
+
+def squared_magnitude(p: Array) -> Array:
+    """Return |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
+    powers = np.arange(p.shape[-1] - 1, -1, -1)
+    return multiply_polynomials(p, p * (-1.0) ** powers)[..., ::2] * (-1.0) ** powers
+
+
+def polynomial_value(p: Array, x: Any) -> Any:
+    """Return p(x) by Horner's method."""
+    value = p[..., 0] + 0 * x
+    for i in range(1, p.shape[-1]):
+        value = value * x + p[..., i]
+    return value
+
+
+def polynomial_roots(p: Array) -> Complex:
+    """Return the roots (..., n); a leading zero gives a very large root."""
+    order = p.shape[-1] - 1
+    if order == 0:
+        return np.zeros((*p.shape[:-1], 0), dtype=complex)
+    far = 1e-30 * np.max(np.abs(p), axis=-1)
+    lead = np.where(p[..., 0] == 0, np.where(far == 0, 1.0, far), p[..., 0])
+    companion = np.zeros((*p.shape[:-1], order, order))
+    companion[..., np.arange(1, order), np.arange(order - 1)] = 1
+    companion[..., 0, :] = -p[..., 1:] / lead[..., None]
+    return np.linalg.eigvals(companion).astype(complex)

@@ -1,4 +1,4 @@
-"""The figures of `drake-teleop analyze`, a function for each part of its summary."""
+"""Figures of `drake-teleop analyze`, one function for each part of its summary."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drake_teleop.lab.analysis.cut_loop import (
     unstable_multipliers,
 )
 from drake_teleop.lab.analysis.frequency_response import MultiSine, measure_frequency_response
-from drake_teleop.lab.analysis.linearization import MOST_STATES, Linearization, hybrid_along
+from drake_teleop.lab.analysis.linearization import MAX_STATES, Linearization, hybrid_along
 from drake_teleop.lab.analysis.maps import RATE, StabilityMap, stability_map
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis
 from drake_teleop.lab.analysis.period_map import Sampling
@@ -37,19 +37,19 @@ from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.scenario import Scenario, replace
 
 Array = NDArray[np.float64]
-#: N/m, before which the margins are taken; the scenario's own leaf comes on top of them.
+#: N/m, walls of the table of margins, in addition to the scenario's own.
 WALLS = (0.0, 1000.0, 5100.0, 20000.0)
-BAND = 2 * np.pi * 30.0  #: rad/s, up to which models are compared
+COMPARISON_BAND = 2 * np.pi * 30.0  #: rad/s, limit of the comparison of models
 OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S: Complex = 1j * OMEGA.astype(complex)
-_FELT_BAND = 2 * np.pi * 5.0  # rad/s, up to which mass, damping and stiffness are fitted
-_NOTHING = 1e-9  # a loop that is nowhere larger than this is none
-_PIXELS = 80  # of a map, each way
+_FIT_BAND = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
+_MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
+_MAP_POINTS = 80  # of a map, in each direction
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
-def held_by(axis: OneAxis, grip: str) -> OneAxis:
-    """The axis with another grip of the hand."""
+def with_grip(axis: OneAxis, grip: str) -> OneAxis:
+    """Return the axis with another grip of the hand."""
     hand = GRIPS[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
@@ -59,13 +59,10 @@ def held_by(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Whether an operating point is stable, and what of it dies last.
-
-    Beyond a second or so of delay the Diagram's multipliers are too many; then one axis says it.
-    """
+    """Return stability and slowest motion; above `MAX_STATES` states only of one axis."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
-    one_axis = _dying(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
+    one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
     figures: dict[str, Any] = {
         "point": name,
         "states": len(system.A) + lines,
@@ -74,12 +71,12 @@ def diagram_figures(
         "frequency_Hz": None,
         "one_axis": one_axis,
     }
-    if figures["states"] <= MOST_STATES:
-        figures |= _dying(system.multipliers[0], system.dt)
+    if figures["states"] <= MAX_STATES:
+        figures |= _slowest_motion(system.multipliers[0], system.dt)
     return figures
 
 
-def _dying(multiplier: complex, period: float) -> dict[str, Any]:
+def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
     return {
         "stable": bool(abs(multiplier) < 1),
         "decay_1_per_s": float(-np.log(abs(multiplier)) / period),
@@ -87,36 +84,33 @@ def _dying(multiplier: complex, period: float) -> dict[str, Any]:
     }
 
 
-def deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """How far the Diagram's two-port is from the closed form, and from the sampled one.
-
-    The hand's mass moves with the stylus and is compared as a part of the device.
-    """
-    compared = OMEGA <= BAND
-    heavy = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
+def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
+    """Return the Diagram's deviations from closed and sampled form, hand's mass included."""
+    compared = OMEGA <= COMPARISON_BAND
+    with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
     def greatest(other: Complex) -> dict[str, float]:
         found = np.abs(with_hand[compared] - other).max(axis=0) / np.abs(other).max(axis=0)
         return {f"h{i + 1}{j + 1}": float(found[i, j]) for i in range(2) for j in range(2)}
 
     return {
-        "closed_form": greatest(hybrid(heavy, S[compared])),
-        "sampled": greatest(sampled_two_port(heavy, sampling, OMEGA[compared])),
+        "closed_form": greatest(hybrid(with_hand_mass, S[compared])),
+        "sampled": greatest(sampled_two_port(with_hand_mass, sampling, OMEGA[compared])),
     }
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Gain, phase and round trip of the sampled loop, for each grip before each wall."""
+    """Return the margins of the sampled loop for each grip and wall."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIPS:
         for wall in sorted({*WALLS, own_wall}):
-            held = dataclasses.replace(held_by(axis, grip), wall_stiffness=wall)
+            held = dataclasses.replace(with_grip(axis, grip), wall_stiffness=wall)
             loop = cut_loop(held, sampling)
             response = -loop_response(loop, omega, axis.delay)
             stable = bool(unstable_multipliers(loop, axis.delay) == 0)
             gain, phase = (np.inf, np.inf) if stable else (1.0, 0.0)
-            if stable and np.abs(response).max() > _NOTHING:
+            if stable and np.abs(response).max() > _MIN_LOOP_GAIN:
                 found = margins.margins_of_response(omega, response, sampled=True)
                 gain, phase = float(found.gain), float(np.degrees(found.phase))
             rows.append(
@@ -133,7 +127,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """For anything passive at either end: Llewellyn; Raisbeck and scattering on scaled ports."""
+    """Return criteria for passive loads."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -149,25 +143,24 @@ def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
 
 
 def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """The stiffest wall before which hands are stable: all between two grips, and each alone."""
+    """Return the stiffest stable wall for all hands between two grips, and for each grip."""
     hands = absolute_stability.range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
-    each = {grip: _stiffest(held_by(axis, grip), sampling) for grip in GRIPS}
+    each = {grip: _stiffest_stable_wall(with_grip(axis, grip), sampling) for grip in GRIPS}
     return {"grips": limit if min(each.values()) > 0 else 0.0, "each": each}
 
 
-def _stiffest(axis: OneAxis, sampling: Sampling) -> float:
-    """[N/m] up to which every wall is stable; 0 if free motion is not; inf beyond the grid."""
-    tried = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
-    walls: Any = {"wall_stiffness": tried, "wall_damping": 0.0}
+def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
+    stiffness = np.concatenate([[0.0], np.geomspace(10.0, 1e7, 1000)])
+    walls: Any = {"wall_stiffness": stiffness, "wall_damping": 0.0}
     loop = cut_loop(dataclasses.replace(axis, **walls), sampling)
     (bad,) = np.nonzero(unstable_multipliers(loop, axis.delay))
-    return float("inf") if len(bad) == 0 else float(tried[max(bad[0] - 1, 0)])
+    return float("inf") if len(bad) == 0 else float(stiffness[max(bad[0] - 1, 0)])
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """What is felt in free motion and of the wall, next to what should be."""
-    fitted = OMEGA <= _FELT_BAND
+    """Return displayed and ideal impedance in free motion and at the wall."""
+    fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
     for name, environment in environments.items():
@@ -180,23 +173,23 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
             for which, impedance in (("felt", felt), ("ideal", ideal))
         }
         figures[name]["unnoticed_to_Hz"] = float(OMEGA[first - 1] / (2 * np.pi)) if first else 0.0
-    follows = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
-    end = len(follows) if follows.all() else int(np.argmin(follows))
+    tracks = np.abs(H[:, 1, 0]) > axis.position_scale / np.sqrt(2)
+    end = len(tracks) if tracks.all() else int(np.argmin(tracks))
     figures["tracking_bandwidth_Hz"] = float(OMEGA[max(end - 1, 0)] / (2 * np.pi))
     width = transparency.transmitted_width(H).decades
     figures["width_decades"] = {
         f"{hz:g} Hz": float(np.interp(2 * np.pi * hz, OMEGA, width)) for hz in (1.0, 5.0, 10.0)
     }
-    told = transparency.smallest_stiffness_change(H, OMEGA, wall[0])
+    change = transparency.smallest_stiffness_change(H, OMEGA, wall[0])
     figures["smallest_stiffness_N_per_m"] = {
-        "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, told)),
+        "on the master, 1 Hz": float(np.interp(2 * np.pi, OMEGA, change)),
         "on the wall itself": transparency.WEBER_FRACTIONS["stiffness"].value * wall[0],
     }
     return figures
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Virtual walls that the device itself could render at the hand's rate."""
+    """Return the virtual walls that the device itself could render."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -225,10 +218,7 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """What the hand feels in free motion, simulated with all of the sensor's noise.
-
-    Coulomb friction of device and arm is left out here too: what it does depends on the amplitude.
-    """
+    """Return the impedance displayed in free motion, simulated with noise, without friction."""
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])
@@ -236,7 +226,7 @@ def measured_figures(
     if scenario.wrist_sensor.ideal:
         estimate[:6] = 0.0
     found = measure_frequency_response(smooth, along, _MULTI_SINE, load_estimate=estimate)
-    # Of a force that is held for a period, the share of the frequency itself, as in the two-port.
+    # Held force: its component at the frequency itself, as in the two-port.
     step = 1j * found.omega / scenario.rates.hand_hz
     held = found.response("hand_force", "hand_velocity") * -np.expm1(-step) / step
     # The hand's mass moves with the stylus and belongs to the hand.
@@ -255,15 +245,15 @@ def measured_figures(
 def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
-    """Title -> grip -> stability over two parameters."""
+    """Return title -> grip -> map."""
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
-    n, tool = _PIXELS, axis.tool_mass
+    n, tool = _MAP_POINTS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)
     walls = np.geomspace(100.0, 1e5, n)
     # The sensor's low-pass has to stay below half of its rate.
     slowest = 2.4 * (sampling.low_pass_hz or 0.0) * sampling.hand_hz / sampling.sensor_hz
     rate = np.geomspace(max(slowest, 100.0), 10e3, n)
-    wanted: dict[str, tuple[Any, ...]] = {
+    parameters: dict[str, tuple[Any, ...]] = {
         "Delay and stiffness of the wall": (touching, "delay", delay, "wall_stiffness", walls),
         "Delay and σ, in free motion": (axis, "delay", delay, "sigma", sigma),
         "Delay and σ, on the wall": (touching, "delay", delay, "sigma", sigma),
@@ -273,7 +263,9 @@ def parameter_maps(
         "Rate and stiffness of the wall": (touching, RATE, rate, "wall_stiffness", walls),
     }
     progress, found = stage("Maps"), {}
-    for done, (title, (base, *grid)) in enumerate(wanted.items()):
-        found[title] = {grip: stability_map(held_by(base, grip), sampling, *grid) for grip in GRIPS}
-        progress((done + 1) / len(wanted))
+    for done, (title, (base, *grid)) in enumerate(parameters.items()):
+        found[title] = {
+            grip: stability_map(with_grip(base, grip), sampling, *grid) for grip in GRIPS
+        }
+        progress((done + 1) / len(parameters))
     return found

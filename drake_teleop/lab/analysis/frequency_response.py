@@ -1,12 +1,8 @@
-"""Frequency responses measured on the whole nonlinear station: the operator draws a multi-sine.
+"""Frequency responses of the whole nonlinear station, measured with a multi-sine of the operator.
 
-The intent oscillates at several frequencies at once, odd multiples of one that are about evenly
-spread over the logarithm. Even distortion then falls between the lines, and a number of whole
-periods has no leakage. Random phases, the best of many, keep the peaks low.
-
-A response is the ratio of two spectra, averaged over the periods before they are divided: what
-noise adds cancels, in a closed loop too, because the intent repeats and the noise does not. The
-coherence says how much of it was left.
+The frequencies are odd multiples of a fundamental, so that even distortion is between the lines.
+Spectra are averaged over the periods before they are divided, so that noise cancels in a closed
+loop too (T64).
 """
 
 from __future__ import annotations
@@ -32,42 +28,31 @@ from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-_DRAWS = 300  # of random phases, of which the flattest is taken
-_APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, up to which the apparent mass is fitted
+_PHASE_DRAWS = 300  # of random phases; the flattest is used
+_APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
 
 
 @dataclass(frozen=True)
 class MultiSine:
-    """What the operator draws.
+    """Multi-sine motion that the operator intends."""
 
-    Args:
-        lowest, highest: frequencies [Hz].
-        lines: their number, at most; on a coarse grid there are fewer.
-        velocity: amplitude of the intended velocity at each [m/s]; for a direction that turns,
-            [rad/s].
-        period: [s], of which all frequencies are odd multiples of the inverse.
-        periods: how many are recorded.
-        settle: for fading in and for transients, before [s].
-        seed: of the phases.
-    """
-
-    lowest: float = 0.5
-    highest: float = 31.0
-    lines: int = 16
-    velocity: float = 0.04
-    period: float = 2.0
-    periods: int = 3
-    settle: float = 1.5
-    seed: int = 0
+    lowest: float = 0.5  #: Hz
+    highest: float = 31.0  #: Hz
+    lines: int = 16  #: largest number of frequencies
+    velocity: float = 0.04  #: amplitude at each frequency [m/s] or [rad/s]
+    period: float = 2.0  #: s; all frequencies are odd multiples of its inverse
+    periods: int = 3  #: recorded
+    settle: float = 1.5  #: s, for fading in and transients
+    seed: int = 0  #: of the phases
 
     def multiples(self) -> NDArray[np.int64]:
-        """(n,) odd multiples of 1 / period."""
-        wanted = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
-        odd: NDArray[np.int64] = np.unique(2 * np.floor((wanted - 1) / 2 + 1e-9).astype(int) + 1)
+        """Return the (n,) odd multiples of 1 / period."""
+        spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
+        odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def segments(self, direction: Array, start: float) -> list[Sine]:
-        """The intent along `direction` (6,) in B, from `start` [s] until all is recorded."""
+        """Return the intent along `direction` (6,) in B, from `start` [s]."""
         frequencies = self.multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
@@ -88,7 +73,7 @@ class MultiSine:
 
     def _phases(self) -> Array:
         k = self.multiples()
-        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_DRAWS, len(k)))
+        draws = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, (_PHASE_DRAWS, len(k)))
         u = np.arange(8 * k[-1]) / (8 * k[-1])
         angle = 2 * np.pi * np.outer(u, k)
         peaks = [np.abs(np.cos(angle + draw).sum(axis=1)).max() for draw in draws]
@@ -99,39 +84,33 @@ class MultiSine:
 class StationResponse:
     """Spectra of the station's signals along a direction, measured or predicted.
 
-    Args:
-        omega: (n,) [rad/s].
-        spectra: signal -> (periods, n) amplitudes; predicted: (1, n), for a unit push. The signals:
-            `hand_force` on the stylus [N], `hand_velocity` [m/s], `felt_force` that the device
-            displays [N], `tool_velocity` at the tip [m/s].
-        force_scale: of the station.
+    The signals: `hand_force` on the stylus [N], `hand_velocity` [m/s], `felt_force` displayed by
+    the device [N], `tool_velocity` at the tip [m/s].
     """
 
-    omega: Array
-    spectra: dict[str, Complex]
+    omega: Array  #: (n,) [rad/s]
+    spectra: dict[str, Complex]  #: signal -> (periods, n); predicted: (1, n), for a unit force
     force_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
-        """(n,) output over input."""
+        """Return the (n,) ratio of output to input."""
         ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
         return ratio
 
     def coherence(self, output: str, input_: str) -> Array:
-        """(n,) share of the output's power that is linear in the input, over the periods."""
+        """Return the (n,) fraction of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
         return cross / power
 
     def apparent_mass(self) -> float:
-        """What the hand feels of the tool's mass, in the slave's units [kg]: sigma m_t on paper.
+        """Return the tool mass displayed to the hand, in the slave's units [kg]; ideally sigma m_t.
 
-        The felt force, undone of its scale, over the tool's acceleration, towards zero frequency;
-        a delay of far less than 1/10 Hz leaves its real part even in frequency. It is what the hand
-        feels of its own acceleration as well, times both scales, as long as the servo follows.
+        It is extrapolated to frequency 0, for delays far below 0.1 s.
 
         Raises:
-            DrakeTeleopError: if fewer than three lines are below 10 Hz.
+            DrakeTeleopError: fewer than three lines are below 10 Hz.
         """
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
@@ -142,7 +121,7 @@ class StationResponse:
             )
         omega = self.omega[low]
         felt = -self.response("felt_force", "tool_velocity")[low] / self.force_scale
-        # Noise of the force is about the same at all lines: the mass times their acceleration.
+        # The force noise is about equal at all lines, so that the weights are the accelerations.
         acceleration = omega * np.abs(self.spectra["tool_velocity"].mean(axis=0))[low]
         powers = (omega[:, None] / omega[-1]) ** [0, 2]
         mass = (felt / (1j * omega)).real
@@ -150,7 +129,7 @@ class StationResponse:
         return float(np.linalg.lstsq(weighted, acceleration * mass, rcond=None)[0][0])
 
     def to_control(self, output: str, input_: str) -> Any:
-        """`response` as a `control.FRD`."""
+        """Return `response` as a `control.FRD`."""
         import control
 
         return control.FRD(self.response(output, input_)[None, None], self.omega)
@@ -164,18 +143,15 @@ def measure_frequency_response(
     load_estimate: Array | None = None,
     approach: Sequence[MinimumJerk] = (),
 ) -> StationResponse:
-    """Simulates the station while the operator draws a multi-sine, and takes the spectra.
+    """Simulate the station with a multi-sine of the operator and return the spectra.
 
     Args:
-        scenario: its intent does not matter.
-        task: the direction.
-        excitation: the multi-sine.
+        scenario: its intent is replaced.
         load_estimate: (16,) as for `MakeTeleopStation`.
-        approach: moves to the operating point; the multi-sine fades in after the last.
+        approach: moves to the operating point, before the multi-sine.
 
     Raises:
-        DrakeTeleopError: if a period is not a whole number of steps of the hand, or as for
-            `MakeTeleopStation`.
+        DrakeTeleopError: a period is no whole number of steps of the hand.
     """
     check_scenario(scenario)
     rate = scenario.rates.hand_hz
@@ -217,13 +193,7 @@ def predict_frequency_response(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> StationResponse:
-    """The same of the linearised Diagram.
-
-    Args:
-        scenario, load_estimate, displacement: as for `linearize_station`.
-        task: the direction.
-        omega: (n,) [rad/s].
-    """
+    """Return the spectra of the linearised Diagram; see `linearize_station`."""
     system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
     first = system.inputs.index("hand_wrench.x")
     pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand
@@ -233,12 +203,12 @@ def predict_frequency_response(
         return (pushed[:, row : row + 6] @ direction)[None]
 
     _, backward = delays(scenario)
-    late = np.exp(-1j * np.asarray(omega) * system.dt * backward)
+    delay_factor = np.exp(-1j * np.asarray(omega) * system.dt * backward)
     spectra = {
-        # The operator's own force answers the push, which takes its intent's place.
+        # Unit force in place of the intent, plus the operator's reaction.
         "hand_force": 1 + along("operator_wrench", task.hand),
         "hand_velocity": along("twist_master", task.hand),
-        "felt_force": late * along("wrench_B", task.hand),
+        "felt_force": delay_factor * along("wrench_B", task.hand),
         "tool_velocity": along("twist_slave", task.tool),
     }
     return StationResponse(omega, spectra, scenario.force_scaling.force_scale)
@@ -255,7 +225,6 @@ def _signals(result: SimulationResult, scenario: Scenario, task: TaskDirection) 
 
 
 def _twists(arm: ArmModel, states: Array) -> Array:
-    """(N, 6) of So in W."""
     n = arm.num_joints
     J, twists = np.empty((6, n)), np.empty((len(states), 6))
     for state, twist in zip(states, twists, strict=True):

@@ -1,25 +1,15 @@
-"""The actual Diagram, linearised at rest over a period (long: a model, and how it comes about).
+"""The station's Diagram, linearised at rest (long: a model and how it is computed).
 
-Every state of the Diagram that acts on anything is displaced by a little, up and down; the Diagram
-is simulated for one period of the hand; what has become of the displacement after that is a column
-of the state transition. Nothing of the blocks is written a second time. Differences, because the
-blocks are compiled for numbers and take no automatic derivatives.
+Each state is displaced up and down and the Diagram simulated for one period of the hand (T63).
+The loops are cut at
 
-The loops are cut where an analysis wants to put something else in:
+    loop                       output              input
+    hand on the stylus         operator_wrench     hand_wrench      F_E_B at E, in B
+    network, master to slave   pose_command        pose_received    of S, in W
+    network, slave to master   wrench_B            wrench_received  F_E_B, in B
 
-    cut                                 output              input
-    the hand lets go of the stylus      operator_wrench     hand_wrench      F_E_B at E, in B
-    the network, master to slave        pose_command        pose_received    of S, in W
-    the network, slave to master        wrench_B            wrench_received  F_E_B, in B
-
-and `Linearization.close` closes them again, with a delay of any number of periods, exactly. The
-input `tool_wrench` is a wrench of the environment on the tool, about So, in W; the environment of
-the scenario is part of the model besides. All inputs are held for a period; outputs are those of
-its start.
-
-What is left out, because it has no linear part at rest: noise, offset, quantisation and range of
-the sensors; Coulomb friction of the master, whose tanh(v / 0.01) would be a huge damping at rest
-and which only takes energy; friction of a contact, likewise.
+The input `tool_wrench` acts on the tool, about So, in W. Inputs are held for a period. Left out are
+noise, offset, quantisation and saturation of the sensor, and all Coulomb friction.
 """
 
 from __future__ import annotations
@@ -60,53 +50,45 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 _INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
 _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
-# Displacements up and down. The error of a difference is their square, or rounding over them.
-_ANGLE, _RATE, _OTHER = 1e-4, 1e-4, 1.0
-_AT_THE_HAND = np.repeat([1.0, 0.02], 3)  # N, N m: within what the device can display
-_ACCELERATION = 20.0  # rad/s^2, that the servo may ask of a joint: within the motors' torque
-_IN_CONTACT = 1e-6  # rad, m: much less than what a newton indents
-_AT_REST = 1e-6  # of these displacements, that a state of rest may move in a period
-_MOST_STEPS = 8  # of Newton's method on the way to rest
-_RAMP, _SETTLE = 0.3, 0.1  # s, of the slave on its way to the operating point, and there
-_LARGEST_DENSE = 800  # states, beyond which eigenvalues are sought piece by piece
-MOST_STATES = 8000  #: with those of the delay, of which multipliers are still found
-_HIGHEST = 100.0  # Hz, up to which
-_AT_ONCE = 40  # of them
+# Displacements of the differences: the error is their square, or rounding over them.
+_ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
+_HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
+_MAX_ACCELERATION = 20.0  # rad/s^2, requested of a joint: within the motors' torque
+_CONTACT_STEP = 1e-6  # rad, m: much less than the indentation by 1 N
+_REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacements
+_MAX_NEWTON_STEPS = 8  # of Newton's method
+_RAMP_S, _SETTLE_S = 0.3, 0.1  # s, motion to the operating point, rest there
+_MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
+MAX_STATES = 8000  #: largest number, delay included, for multipliers
+_MAX_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
+_EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """x' = A x + B u, y = C x + D u from one period to the next, and loops closed with delay.
+    """Model x' = A x + B u, y = C x + D u over one period, and loops with delay.
 
-    Args:
-        A, B, C, D: of small deviations from rest.
-        dt: the period [s].
-        states, inputs, outputs: their names; a port's parts are "port.x", ..., "port.rz": poses as
-            translation [m] and rotation vector [rad], wrenches [N, N m], twists [m/s, rad/s].
-        loops: (outputs, inputs, periods) that are closed with a delay: u += z^-periods y.
+    Parts of a port are "port.x", ..., "port.rz": poses as translation [m] and rotation vector
+    [rad], wrenches [N, N m], twists [m/s, rad/s].
     """
 
     A: Array
     B: Array
     C: Array
     D: Array
-    dt: float
+    dt: float  #: period [s]
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    #: (outputs, inputs, periods) closed with a delay: u += z^-periods y
     loops: tuple[tuple[tuple[int, ...], tuple[int, ...], int], ...] = ()
 
     def close(
         self, outputs: str | Sequence[str], inputs: str | Sequence[str], periods: int = 0
     ) -> Linearization:
-        """Feeds outputs back to inputs: u += z^-periods y. The inputs remain, and add to that.
+        """Return the model with outputs fed back to inputs, u += z^-periods y; the inputs remain.
 
-        Args:
-            outputs, inputs: a port's name, or names of its parts.
-            periods: whole periods of delay.
-
-        Raises:
-            DrakeTeleopError: if there is no such output or input.
+        `outputs` and `inputs` are a port's name, or names of parts; other names raise an error.
         """
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
@@ -115,10 +97,10 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """G(e^(j omega dt)), (n, outputs, inputs), at omega (n,) [rad/s], with exact delays."""
+        """Return G(e^(j omega dt)) (n, outputs, inputs) at omega (n,) [rad/s]."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
-        # A solution for each frequency: eigenvectors of a chain of delays would be defective.
+        # Solve for each frequency: a chain of delays has no basis of eigenvectors.
         states = [np.linalg.solve(w * identity - self.A, self.B.astype(complex)) for w in z]
         G: Complex = self.C @ np.stack(states) + self.D
         for rows, columns, periods in self.loops:
@@ -130,29 +112,27 @@ class Linearization:
 
     @property
     def multipliers(self) -> Complex:
-        """The eigenvalues of the transition over a period, the largest first; stable below 1.
+        """Eigenvalues over a period, largest first; stable below 1.
 
-        With so long a delay that it makes more than 800 states, those near the unit circle up to
-        100 Hz.
-
-        Raises:
-            DrakeTeleopError: for more than 8000 states, whose multipliers lie too close together.
+        Above 800 states, delay included: only those near the unit circle up to 100 Hz. Above 8000:
+        DrakeTeleopError.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
-        if size <= _LARGEST_DENSE:
+        if size <= _MAX_DENSE_STATES:
             values = np.linalg.eigvals(self.expanded().A)
-        elif size > MOST_STATES:
+        elif size > MAX_STATES:
             raise DrakeTeleopError(
                 f"{size} states, most of them of the delay, are too many",
                 where="channel.delay",
                 remedy="count unstable multipliers of one axis instead (cut_loop)",
             )
         else:
-            values = _near_the_circle(self._with_lines(size), 2 * np.pi * _HIGHEST * self.dt)
+            values = _find_eigenvalues_near_circle(
+                self._sparse_transition(size), 2 * np.pi * _MAX_FREQUENCY_HZ * self.dt
+            )
         return values[np.argsort(-np.abs(values))].astype(complex)
 
-    def _with_lines(self, size: int) -> Any:
-        """`expanded().A`, sparse."""
+    def _sparse_transition(self, size: int) -> Any:
         from scipy.sparse import lil_array
 
         n = end = len(self.A)
@@ -168,28 +148,28 @@ class Linearization:
         return A.tocsc()
 
     def expanded(self) -> Linearization:
-        """The same without `loops`: each delay as a shift register among the states."""
+        """Return the model with each delay as a shift register among the states."""
         result = dataclasses.replace(self, loops=())
         for rows, columns, periods in self.loops:
-            result = _with_register(result, rows, columns, periods)
+            result = _add_shift_register(result, rows, columns, periods)
         return result
 
     def to_control(self) -> Any:
-        """As a discrete `control.StateSpace` with the same names, but "port[x]" for "port.x"."""
+        """Return a discrete `control.StateSpace`; "port.x" becomes "port[x]"."""
         import control
 
         system = self.expanded()
         return control.StateSpace(
             *(system.A, system.B, system.C, system.D, system.dt),
-            # python-control takes no dots in the names of inputs and outputs.
-            inputs=[_in_brackets(name) for name in system.inputs],
-            outputs=[_in_brackets(name) for name in system.outputs],
+            # python-control rejects dots in the names of inputs and outputs.
+            inputs=[_use_brackets(name) for name in system.inputs],
+            outputs=[_use_brackets(name) for name in system.outputs],
             states=list(system.states),
         )
 
     @staticmethod
     def _indices(names: str | Sequence[str], known: tuple[str, ...]) -> tuple[int, ...]:
-        parts = _parts(names) if isinstance(names, str) else names
+        parts = _port_parts(names) if isinstance(names, str) else names
         if missing := [name for name in parts if name not in known]:
             ports = sorted({name.rpartition(".")[0] or name for name in known})
             raise DrakeTeleopError(
@@ -200,32 +180,28 @@ class Linearization:
         return tuple(known.index(name) for name in parts)
 
 
-def _in_brackets(name: str) -> str:
+def _use_brackets(name: str) -> str:
     port, dot, part = name.rpartition(".")
     return f"{port}[{part}]" if dot else name
 
 
-def _near_the_circle(A: Any, highest: float) -> Complex:
-    """Eigenvalues of a large sparse A near the unit circle, from angle 0 to `highest`.
-
-    A delay's multipliers lie all around the circle, hardly apart in size: what is found at a time
-    are the nearest to a point on it (shift and invert), and the next point is where they end.
-    """
+def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
+    """Return eigenvalues of a sparse A, by shift and invert along the unit circle."""
     from scipy.sparse.linalg import eigs
 
     start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
     found, angle = np.zeros(0, dtype=complex), 0.0
     while angle < highest:
-        # A little beside the circle, so that none of them is met exactly.
+        # Beside the circle, so that no shift is an eigenvalue.
         shift = 1.0005 * np.exp(1j * angle)
-        values = eigs(A, _AT_ONCE, sigma=shift, v0=start, return_eigenvectors=False)
+        values = eigs(A, _EIGENVALUES_PER_SHIFT, sigma=shift, v0=start, return_eigenvectors=False)
         known = np.abs(values[:, None] - found).min(axis=1, initial=np.inf) < 1e-9
         found = np.concatenate([found, values[~known]])
         angle = max(float(np.angle(values).max()), angle + 1e-4)
     return found
 
 
-def _with_register(
+def _add_shift_register(
     system: Linearization, rows: tuple[int, ...], columns: tuple[int, ...], periods: int
 ) -> Linearization:
     n, width = len(system.A), len(rows)
@@ -246,34 +222,34 @@ def linearize(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """The Diagram of a scenario, linearised at rest with its loops cut; see the module.
+    """Return the Diagram of a scenario, linearised at rest with its loops cut.
 
     Args:
-        scenario: its intent, its network and its method do not matter: their loops are cut.
+        scenario: its intent, network and passivity method have no effect.
         load_estimate: (16,) as for `MakeTeleopStation`.
-        displacement: of the master from its start [m], in B, where all is at rest; the slave
-            follows, and leans on what is in its way.
+        displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
-        DrakeTeleopError: if the rates have no common period that a cut can be made at, or if the
-            slave does not come to rest.
+        DrakeTeleopError: the rates have no common period, or the slave does not come to rest.
     """
     check_scenario(scenario)
     if load_estimate is not None:
         load_estimate = checked("load_estimate", load_estimate, 16)
-        # The sensor has no offset here, so there is none to subtract.
+        # The sensor of the linear model has no offset.
         load_estimate = np.concatenate([np.zeros(6), load_estimate[6:]])
     period = _Period(scenario, load_estimate)
     x, A, C = period.rest(np.asarray(displacement, dtype=float))
     B = period.input_derivative(x)
-    acts = _acting(A, C)
-    names = tuple(name for name, kept in zip(period.states, acts, strict=True) if kept)
+    affects = _states_affecting_outputs(A, C)
+    names = tuple(name for name, used in zip(period.states, affects, strict=True) if used)
     D = np.zeros((len(C), B.shape[1]))
-    A, B, C = A[np.ix_(acts, acts)], B[acts], C[:, acts]
-    return Linearization(A, B, C, D, period.dt, names, _parts(*_INPUTS), _parts(*_OUTPUTS))
+    A, B, C = A[np.ix_(affects, affects)], B[affects], C[:, affects]
+    return Linearization(
+        A, B, C, D, period.dt, names, _port_parts(*_INPUTS), _port_parts(*_OUTPUTS)
+    )
 
 
-def _parts(*ports: str) -> tuple[str, ...]:
+def _port_parts(*ports: str) -> tuple[str, ...]:
     return tuple(f"{port}.{axis}" for port in ports for axis in AXES)
 
 
@@ -283,15 +259,9 @@ def linearize_station(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """As `linearize`, with all loops closed: the operator holds the stylus over the network.
+    """Return the linearised Diagram with all loops closed, over the scenario's constant delays.
 
-    Args:
-        scenario: of its network, the constant part of the delay matters.
-        load_estimate, displacement: as for `linearize`.
-
-    Raises:
-        DrakeTeleopError: as `linearize`, or if a method of passivity is in the channel, which is
-            not linear.
+    As `linearize`; a passivity method raises an error, because it is not linear.
     """
     check_scenario(scenario)
     if scenario.passivity.method != "none":
@@ -301,16 +271,20 @@ def linearize_station(
             remedy="linearise with method: none, or identify the frequency response",
         )
     cut = linearize(scenario, load_estimate=load_estimate, displacement=displacement)
+    return close_network(cut.close("operator_wrench", "hand_wrench"), scenario)
+
+
+def close_network(system: Linearization, scenario: Scenario) -> Linearization:
+    """Return the system with its loops closed over the network's constant delays."""
     forward, backward = delays(scenario)
-    system = cut.close("operator_wrench", "hand_wrench")
     system = system.close("pose_command", "pose_received", forward)
     return system.close("wrench_B", "wrench_received", backward)
 
 
 def delays(scenario: Scenario) -> tuple[int, int]:
-    """Periods of the hand that a pose and a wrench take over the scenario's network.
+    """Return the delays of pose and wrench over the network, in periods of the hand.
 
-    None if the network is ideal, which is nothing but wires; otherwise at least one.
+    They are 0 for an ideal network without a passivity method, otherwise at least 1.
     """
     lines = scenario.channel.lines()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
@@ -322,21 +296,10 @@ def delays(scenario: Scenario) -> tuple[int, int]:
 
 
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """[F_h; -V_s] = H [V_m; F_e] along one direction of the hand and one of the tool.
+    """Return H (n, 2, 2) along one direction of hand and tool (see `TaskDirection`).
 
-    All other directions are as the system has them: closed by the operator, or free. As in
-    `sampled_loop`, forces are the share of a held one that is of the frequency itself.
-
-    Args:
-        system: a linearisation, with the loop of the hand cut in the direction `hand`. The hand's
-            mass is part of its device.
-        omega: (n,) [rad/s], not zero.
-        hand: (6,) direction in B at E, of the hand's force and V_m.
-        tool: (6,) direction in W as a wrench about So, see `TaskDirection`: F_e tool is what the
-            tool exerts on the environment, V_s = tool . [v; omega].
-
-    Returns:
-        (n, 2, 2).
+    In `system` the hand loop is cut in that direction. The hand's mass is part of the device.
+    Forces are those of `sampled_two_port`. omega: (n,) [rad/s], not zero.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -351,23 +314,22 @@ def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) 
     ms = response("twist_master", hand, "tool_wrench", tool) / hold
     sm = response("twist_slave", tool, "hand_wrench", hand) / hold
     ss = response("twist_slave", tool, "tool_wrench", tool) / hold
-    # The tool feels -F_e.
+    # -F_e acts on the tool.
     return two_port(1 / mm, ms / mm, -sm / mm, ss - sm * ms / mm)
 
 
-def _acting(A: Array, C: Array) -> NDArray[np.bool_]:
-    """Which states act on an output, by any way."""
-    acts = (C != 0.0).any(axis=0)
+def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
+    affects = (C != 0.0).any(axis=0)
     while True:
-        more = acts | (A[acts] != 0.0).any(axis=0)
-        if (more == acts).all():
-            return acts
-        acts = more
+        more = affects | (A[affects] != 0.0).any(axis=0)
+        if (more == affects).all():
+            return affects
+        affects = more
 
 
 @dataclass(frozen=True)
 class _States:
-    """Some states of one block: `part` of its discrete `group`, or of the continuous state."""
+    """States of one block: `part` of a discrete `group` or of the continuous state."""
 
     system: str
     group: int | None
@@ -376,50 +338,50 @@ class _States:
 
 
 class _Period:
-    """One period of the station's Diagram as a function of its states and of the cut inputs."""
-
     def __init__(self, scenario: Scenario, load_estimate: Array | None) -> None:
         _check_rates(scenario)
         own_period = scenario.master.own_period(scenario.rates.hand_hz)
         if own_period is not None:
             raise DrakeTeleopError(
-                f"the device has a rate of its own, {1 / own_period:g} Hz, below that of the hand",
+                f"the device's own rate of {1 / own_period:g} Hz is below the hand's rate",
                 where="rates.hand_hz",
                 remedy=f"set it to {1 / own_period:g}, or master.figures.rate_hz to 0",
             )
         self.dt = 1 / scenario.rates.hand_hz
-        smooth = _smooth(scenario)
+        smooth = _linear_part(scenario)
         self._diagram = MakeTeleopStation(smooth, load_estimate=load_estimate)
         if smooth.surroundings is not None:
-            _check_contact(self._diagram)
+            _check_environment(self._diagram)
             _remove_friction(self._diagram)
         self._simulator = MakeSimulator(self._diagram, smooth.simulation)
-        # Steps that followed the error would follow the displacements too.
+        # Error control would make the steps depend on the displacements.
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
-        self._remembers = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        self._has_ik_state = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         servo.check_is_torque("the linearisation")
         scenario.master.check_leads_the_pose("the linearisation")
-        if self._remembers:  # a slow joint would not follow the displacements
+        if self._has_ik_state:  # a speed limit would be nonlinear
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
-        # In a period the arm goes a small part of what it is commanded.
-        self._command_step = min(_ANGLE, _ACCELERATION / gain)
-        touches = smooth.surroundings is not None
-        self._joint_step = min(self._command_step, _IN_CONTACT) if touches else self._command_step
+        # The arm moves only a small part of a command in one period.
+        self._command_step = min(_ANGLE_STEP, _MAX_ACCELERATION / gain)
+        has_contact = smooth.surroundings is not None
+        self._joint_step = (
+            min(self._command_step, _CONTACT_STEP) if has_contact else self._command_step
+        )
         hand = smooth.operator.hand
         self._device = smooth.master.device(hand.mass, hand.inertia)
         self._groups = self._state_groups()
         self._steps = np.concatenate([group.steps for group in self._groups])
-        # What the sensor remembers follows from the rest; it is of order 1.
+        # The sensor's memory follows from the other states; it is of order 1.
         sensed = [group.system == "wrist_sensor" for group in self._groups]
         counts = [len(group.steps) for group in self._groups]
-        self._sizes = np.where(np.repeat(sensed, counts), _OTHER, self._steps)
+        self._sizes = np.where(np.repeat(sensed, counts), _UNIT_STEP, self._steps)
         self.states = tuple(
             f"{g.system} {'' if g.group is None else g.group}[{k}]"
             for g in self._groups
@@ -445,35 +407,33 @@ class _Period:
         self._system(system).GetInputPort(port).FixValue(self._context(system), value)
 
     def _state_groups(self) -> list[_States]:
-        """All that acts. Not the clutch's references, which stay; not monitor, log and noise."""
-
         def whole(system: str, group: int, *steps: Array) -> _States:
             return _States(system, group, slice(None), np.concatenate(steps))
 
         joints = self._context("slave_plant").num_continuous_states() // 2
         axes = self._device.num_joints
-        # Angles, as the sensor remembers some of them, must stay small.
-        remembered = np.full(len(self._sensor.remembered), _ANGLE)
+        # The sensor's memory contains angles, which must stay small.
+        remembered = np.full(len(self._sensor.remembered), _ANGLE_STEP)
         return [
-            whole("master_device", 0, np.full(axes, _ANGLE), np.full(axes, _RATE)),
-            whole("master_device", 1, np.full(7, _ANGLE)),
-            whole("master_device", 2, np.full(6, _RATE)),
-            # The angles again, for the display; what else it remembers acts after faults alone.
-            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE)),
-            whole("joint_control", 0, np.full(self._joints, _OTHER)),
-            _States("slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE], joints)),
+            whole("master_device", 0, np.full(axes, _ANGLE_STEP), np.full(axes, _RATE_STEP)),
+            whole("master_device", 1, np.full(7, _ANGLE_STEP)),
+            whole("master_device", 2, np.full(6, _RATE_STEP)),
+            # The angles for the display; its other states act only after faults.
+            _States("master_device", 3, slice(0, 6), np.full(6, _ANGLE_STEP)),
+            whole("joint_control", 0, np.full(self._joints, _UNIT_STEP)),
+            _States(
+                "slave_plant", None, slice(None), np.repeat([self._joint_step, _RATE_STEP], joints)
+            ),
             _States("wrist_sensor", 0, self._sensor.remembered, remembered),
-            *self._last_command(),
+            *self._ik_state(),
         ]
 
-    def _last_command(self) -> list[_States]:
-        """From which the numeric inverse kinematics goes on; the closed form remembers nothing."""
+    def _ik_state(self) -> list[_States]:
         steps = np.full(self._joints, self._command_step)
         command = _States("inverse_kinematics", 0, slice(0, self._joints), steps)
-        return [command] if self._remembers else []
+        return [command] if self._has_ik_state else []
 
     def get(self) -> Array:
-        """The states now."""
         parts = []
         for group in self._groups:
             context = self._context(group.system)
@@ -495,9 +455,9 @@ class _Period:
         self._sensor.bring_up_to_date(self._context("wrist_sensor"))
 
     def _apply(self, u: Array) -> None:
-        """Sets the cut inputs: `u` (24,) is what they are more than at the operating point."""
+        """Set the cut inputs to those of the operating point plus `u` (24,)."""
         self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
-        self._fix("inverse_kinematics", "pose_command", _moved(self._pose, u[6:12]))
+        self._fix("inverse_kinematics", "pose_command", _displace(self._pose, u[6:12]))
         self._fix("force_display", "wrench_command", self._wrench + u[12:18])
         push = u[18:24]
         self._push.F_Bq_W = SpatialForce(push[3:], push[:3])
@@ -508,11 +468,10 @@ class _Period:
         return self._eval("slave_plant", f"{ARM}_state")
 
     def _run(self) -> Array:
-        """The states after a period, from those now."""
-        # The sample of noise, which is 0, and the log have other instants.
+        # At this time no event of noise or log interferes.
         context = self._simulator.get_mutable_context()
         context.SetTime(self.dt)
-        if self._remembers:  # when its last command was
+        if self._has_ik_state:  # time of its last command
             command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
             command.get_mutable_value()[-1] = 0.0
         self._sensor.bring_up_to_date(self._context("wrist_sensor"))
@@ -528,7 +487,7 @@ class _Period:
         return np.concatenate(
             [
                 self._eval("operator", "hand_wrench_E"),
-                _difference(pose, self._pose),
+                _displacement(pose, self._pose),
                 self._eval("force_scaling", "wrench_B"),
                 self._eval("master_device", "twist_master"),
                 J @ state[self._joints :],
@@ -536,10 +495,7 @@ class _Period:
         )
 
     def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
-        """The states at the operating point, A and C.
-
-        The cut inputs become what keeps it at rest.
-        """
+        """Return the states at the operating point, A and C; set the cut inputs to balance it."""
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -554,37 +510,36 @@ class _Period:
         for group, value in enumerate(rest):
             context.SetDiscreteState(group, value)
         target = self._eval("kinematic_scaling", "pose_command")
-        ramp = round(_RAMP / self.dt) if displacement.any() else 0
-        for k in range(ramp + round(_SETTLE / self.dt)):
+        ramp = round(_RAMP_S / self.dt) if displacement.any() else 0
+        for k in range(ramp + round(_SETTLE_S / self.dt)):
             u = min((k + 1) / ramp, 1.0) if ramp else 1.0
             share = u**3 * (10 + u * (6 * u - 15))
             self._pose = start + share * (target - start)
             self._apply(np.zeros(24))
             self._run()
-        return self._newton(self._balanced())
+        return self._find_equilibrium(self._balance_hand())
 
-    def _balanced(self) -> Array:
-        """The states, where the hand holds the master against what it displays."""
+    def _balance_hand(self) -> Array:
         self._wrench = self._eval("force_scaling", "wrench_B")
         self._apply(np.zeros(24))
         self._hand = -self._eval("force_display", "force_to_master")
         self._apply(np.zeros(24))
         return self.get()
 
-    def _newton(self, x: Array) -> tuple[Array, Array, Array]:
-        """To where nothing moves that acts. The master rests already; unheld, it could anywhere."""
+    def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return the slave's state of rest, A and C, by Newton's method; the master is at rest."""
         slave = np.array([not name.startswith("master") for name in self.states])
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_NEWTON_STEPS):
             A, C = self.derivative(x)
-            free = slave & _acting(A, C)
+            free = slave & _states_affecting_outputs(A, C)
             self._set(x)
             moved = self._run() - x
-            if (np.abs(moved) < _AT_REST * self._sizes)[free].all():
+            if (np.abs(moved) < _REST_TOLERANCE * self._sizes)[free].all():
                 return x, A, C
             moved[free] = np.linalg.solve(np.eye(free.sum()) - A[np.ix_(free, free)], moved[free])
             x[slave] += moved[slave]
             self._set(x)
-            x = self._balanced()
+            x = self._balance_hand()
         raise DrakeTeleopError(
             f"the slave does not come to rest, {self.states[np.argmax(np.abs(moved))]} moves",
             where="displacement",
@@ -592,7 +547,6 @@ class _Period:
         )
 
     def derivative(self, x: Array) -> tuple[Array, Array]:
-        """A and C at the states x, by central differences."""
         A, C = np.empty((len(x), len(x))), np.empty((30, len(x)))
         self._apply(np.zeros(24))
         for k, step in enumerate(self._steps):
@@ -608,10 +562,11 @@ class _Period:
         return A, C
 
     def input_derivative(self, x: Array) -> Array:
-        """B at the states x."""
         B = np.empty((len(x), 24))
-        pose, tool = np.full(6, self._command_step), np.full(6, _OTHER)
-        for k, step in enumerate(np.concatenate([_AT_THE_HAND, pose, _AT_THE_HAND, tool])):
+        pose, tool = np.full(6, self._command_step), np.full(6, _UNIT_STEP)
+        for k, step in enumerate(
+            np.concatenate([_HAND_WRENCH_STEP, pose, _HAND_WRENCH_STEP, tool])
+        ):
             ends = []
             for sign in (1.0, -1.0):
                 self._set(x)
@@ -621,21 +576,18 @@ class _Period:
         return B
 
 
-def _moved(pose: Array, change: Array) -> Array:
-    """The pose after a translation [m] and a rotation vector [rad]."""
+def _displace(pose: Array, change: Array) -> Array:
     return np.concatenate(
         [multiply(exponential(tuple(change[3:])), pose[:4]), pose[4:] + change[:3]]
     )
 
 
-def _difference(pose: Array, other: Array) -> Array:
-    """What moves `other` to `pose`, see `_moved`."""
+def _displacement(pose: Array, other: Array) -> Array:
     turn = logarithm(multiply(tuple(pose[:4]), conjugate(tuple(other[:4]))))
     return np.concatenate([pose[4:] - other[4:], turn])
 
 
-def _smooth(scenario: Scenario) -> Scenario:
-    """The scenario's linear part at rest, without what the cuts replace."""
+def _linear_part(scenario: Scenario) -> Scenario:
     parts = ("noise", "random_walk", "offset", "drift", "quantisation", "saturation")
     return replace(
         scenario,
@@ -649,18 +601,18 @@ def _smooth(scenario: Scenario) -> Scenario:
         master=scenario.master.without_coulomb_friction(),
         slave__friction=[],
         load_estimator__enabled=False,
-        # For an arm that has a closed form, which leads to the same angles and remembers nothing.
+        # The closed form, if the arm has one, has no state.
         slave__inverse_kinematics=AUTOMATIC,
     )
 
 
-def _check_contact(diagram: Diagram) -> None:
+def _check_environment(diagram: Diagram) -> None:
     sensor = GetBlock(diagram, "wrist_sensor")
     if beyond := sensor.beyond or sensor.moves:
         raise DrakeTeleopError(
-            f"these surroundings cannot be linearised: {beyond}",
+            f"this environment cannot be linearised: {beyond}",
             where="environment",
-            remedy="leave them out, or leave a leaf, a slot, walls and boxes",
+            remedy="use only a leaf, a slot, walls and boxes, or none",
         )
 
 

@@ -1,14 +1,7 @@
-"""Maps: where over two parameters the sampled loop is stable, and how true the hand feels.
+"""Stability maps: stability and distortion of the sampled loop over two parameters.
 
-Stability is counted by the argument principle, see `cut_loop`; where it changes between two
-neighbours of the grid, bisection finds the place. The delay is taken as it is instead of rounded to
-whole hand periods, so that its boundaries are curves instead of steps.
-
-Over-compensation. Where the slave is free and sigma = 0, an error dm of the estimated mass is felt
-as the mass -k_f l_p gamma dm. If the slave follows at once, that must not exceed the mass m that
-hand and device move anyway: dm < m / (k_f l_p gamma), and with sigma > 0
-(gamma - sigma) dm - sigma m_t < m / (k_f l_p). The lag of the station's servo lowers the bound, by
-2 % with the firm grip, 10 % with the medium and 18 % with the light one.
+`cut_loop` counts unstable multipliers; bisection refines the boundaries. The delay is not rounded
+to hand periods, so that boundaries are smooth.
 """
 
 from __future__ import annotations
@@ -38,37 +31,28 @@ from drake_teleop.lab.analysis.transparency import ideal_impedance
 
 Array = NDArray[np.float64]
 
-#: All rates together, in their ratios, as the hand's [Hz].
+#: Parameter of a map: the hand's rate [Hz], the other rates in proportion.
 RATE = "rate"
 _PARAMETERS = {entry.name for entry in fields(OneAxis)} - {"ideal_servo"} | {RATE, "low_pass_hz"}
 _HALVINGS = 10
-_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
+_DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, deliberate movements
 
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Over the grid of two parameters.
-
-    Args:
-        x_name, y_name: fields of `OneAxis`, "low_pass_hz" or "rate".
-        x, y: (nx,), (ny,) their values.
-        unstable: (ny, nx) multipliers outside the unit circle.
-        distortion: (ny, nx) see `distortion`; it means something where the loop is stable.
-        boundary: (n, 2) places x, y where stability changes, within a thousandth of the grid's
-            distances.
-    """
+    """Stability over the grid of two parameters."""
 
     x_name: str
     y_name: str
-    x: Array
-    y: Array
-    unstable: NDArray[np.int64]
-    distortion: Array
-    boundary: Array
+    x: Array  #: (nx,)
+    y: Array  #: (ny,)
+    unstable: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
+    distortion: Array  #: (ny, nx), valid only where the loop is stable
+    boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """(ny, nx)."""
+        """Whether the loop is stable, (ny, nx)."""
         return self.unstable == 0
 
 
@@ -80,17 +64,15 @@ def stability_map(
     y_name: str,
     y: ArrayLike,
 ) -> StabilityMap:
-    """Stability and distortion over two parameters, the others as they are.
+    """Return stability and distortion over two parameters.
 
     Args:
-        axis, sampling: the station.
-        x_name, y_name: fields of `OneAxis`, "low_pass_hz" or "rate", all rates together as the
-            hand's [Hz].
+        x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's [Hz], the other
+            rates in proportion.
         x, y: (nx,), (ny,) increasing values.
 
     Raises:
-        DrakeTeleopError: for another name, values that do not increase, or a station that
-            `cut_loop` does not know.
+        DrakeTeleopError: another name, values that do not increase, or as `cut_loop`.
     """
     xs, ys = _increasing(x_name, x), _increasing(y_name, y)
 
@@ -105,7 +87,7 @@ def stability_map(
     shape = len(ys), len(xs)
     unstable = np.broadcast_to(unstable_multipliers(loop, moved.delay), shape)
     stable = unstable == 0
-    # Between neighbours in a row, and between neighbours in a column.
+    # Neighbours in a row, then neighbours in a column.
     row, column = np.nonzero(stable[:, 1:] != stable[:, :-1])
     along_x = _bisect(
         lambda at: is_stable(at, ys[row]), xs[column], xs[column + 1], stable[row, column]
@@ -121,16 +103,10 @@ def stability_map(
     return StabilityMap(x_name, y_name, xs, ys, unstable, felt, boundary)
 
 
-def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _BAND) -> Array:
-    """How far off what the hand has to exert is, the worst of a band, (...).
+def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
+    """Return the largest relative error of the hand's total force over a band [rad/s], (...).
 
-    All of it: for itself, the device and what the loop displays, as a share of the same with the
-    `ideal_impedance`. So it is small where the hand would not notice, in free motion too.
-
-    Args:
-        axis: the axis (...), its delay one way.
-        loop: its `cut_loop` (...).
-        frequency: (N,) the band [rad/s].
+    The total is for hand, device and displayed force; the reference has the `ideal_impedance`.
     """
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))
@@ -157,7 +133,6 @@ def _increasing(name: str, values: ArrayLike) -> Array:
 
 
 def _loops(axis: OneAxis, sampling: Sampling, values: dict[str, Any]) -> tuple[OneAxis, CutLoop]:
-    """The axis with these values, and its loops; their shape is that of the values together."""
     for name, value in values.items():
         if name == RATE:
             factor = value / sampling.hand_hz
@@ -175,7 +150,6 @@ def _loops(axis: OneAxis, sampling: Sampling, values: dict[str, Any]) -> tuple[O
 
 
 def _bisect(is_stable, low: Array, high: Array, stable_at_low: NDArray[np.bool_]) -> Array:
-    """Where stability changes between `low` and `high` (n,), all at once."""
     low, high = low.copy(), high.copy()
     for _ in range(_HALVINGS if low.size else 0):
         middle = 0.5 * (low + high)

@@ -1,8 +1,4 @@
-"""How far a loop with a delay is from its limit: gain, phase and delay margins.
-
-`margins` of loops of known coefficients, exactly but for the gain margin's search;
-`margins_of_response` of loops that are known by their frequency response only.
-"""
+"""Gain, phase and delay margins of a loop with delay."""
 
 from __future__ import annotations
 
@@ -13,51 +9,46 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.delayed_loop import (
+    Array,
     DelayedLoop,
     angle_of,
-    angle_past_minus_one,
     gain_crossings,
-    least_along,
     margin_of_delay,
+    min_without_nan,
+    phase_lag_to_minus_one,
+    polynomial_roots,
     unstable_poles,
 )
-from drake_teleop.lab.analysis.nyquist import break_frequencies, encirclements, frequency_grid
-from drake_teleop.lab.analysis.polynomials import Array
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of a loop or of each loop of a grid (...); those of an unstable loop are 1, 0 and 0.
+    """Margins of a loop, or of each loop of a grid (...); an unstable loop has 1, 0 and 0.
 
-    Args:
-        unstable_poles: of the closed loop.
-        gain, gain_frequency: factor by which L may grow, and where it then meets -1 [rad/s].
-        phase, phase_frequency: by which L may turn either way [rad], and where [rad/s].
-        delay, delay_frequency: that may be added [s], and where [rad/s].
-
-    Where there is no limit the margin is inf and its frequency NaN.
+    Without a limit the margin is inf and its frequency NaN.
     """
 
-    unstable_poles: Array
-    gain: Array
-    gain_frequency: Array
-    phase: Array
-    phase_frequency: Array
-    delay: Array
-    delay_frequency: Array
+    unstable_poles: Array  #: of the closed loop
+    gain: Array  #: factor by which L may grow
+    gain_frequency: Array  #: where L then reaches -1 [rad/s]
+    phase: Array  #: rotation of L to -1, in either direction [rad]
+    phase_frequency: Array  #: [rad/s]
+    delay: Array  #: that may be added [s]
+    delay_frequency: Array  #: [rad/s]
 
 
 def margins(loop: DelayedLoop) -> Margins:
-    """Gain, phase and delay margins with the delay exact.
+    """Return the margins of a loop with known coefficients; the delay is exact.
 
-    Phase and delay margins follow from the exact gain crossings. The phase crossings of the gain
-    margin are bracketed on a grid of frequencies and bisected, for one loop at a time: for large
-    grids of parameters take `delay_margin` and `unstable_poles`.
+    The gain margin needs a grid of frequencies for each loop: for large grids of parameters use
+    `delay_margin` and `unstable_poles`.
     """
     unstable = unstable_poles(loop)
     stable = unstable == 0
     frequency, _ = gain_crossings(loop)
-    phase, phase_frequency = least_along(np.abs(angle_past_minus_one(loop, frequency)), frequency)
+    phase, phase_frequency = min_without_nan(
+        np.abs(phase_lag_to_minus_one(loop, frequency)), frequency
+    )
     delay, delay_frequency = margin_of_delay(loop, stable)
     limits = [_gain_margin(loop[cell]) for cell in np.ndindex(loop.delay.shape)]
     gain, gain_frequency = np.moveaxis(np.reshape(limits, (*loop.delay.shape, 2)), -1, 0)
@@ -81,19 +72,15 @@ def margins_of_response(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Margins:
-    """The margins of loops that are known by their frequency response, measured or sampled.
+    """Return the margins of loops from their frequency responses, measured or sampled.
 
-    Between frequencies, log |L| and the phase are taken as linear in log w: an error of the second
-    order in the spacing. The response of a control.FrequencyResponseData is its `frdata[0, 0]`.
+    log |L| and the phase are interpolated linearly in log w.
 
     Args:
-        omega: (n,) [rad/s], rising, positive.
-        response: L(jw) or L(e^(jw Ts)), (n, ...).
-        delay: (...) [s], to be added to the response, exactly.
+        omega: (n,) [rad/s], increasing, positive.
+        response: L(jw) or L(e^(jw Ts)), (n, ...), as `frdata[0, 0]` of a control.FRD.
+        delay: (...) [s], added to the response, exactly.
         open_loop_poles, poles_at_origin, sampled: as in `encirclements`.
-
-    Raises:
-        DrakeTeleopError: frequencies that do not rise from above zero; else as in `encirclements`.
     """
     omega = np.asarray(omega, dtype=float)
     if omega.ndim != 1 or not np.all(np.diff(omega, prepend=0.0) > 0):
@@ -110,31 +97,70 @@ def margins_of_response(
     log_w, log_gain, angle = np.log(w), np.log(np.abs(L)), angle_of(-L)
     turn = np.unwrap(angle, axis=0)
 
-    at_one = _zero_between(log_gain)
-    w_c = np.exp(_between(log_w, at_one))
-    past = np.mod(_between(turn, at_one), 2 * np.pi)
-    phase, phase_frequency = least_along(np.minimum(past, 2 * np.pi - past), w_c, axis=0)
-    more, more_frequency = least_along(past / w_c, w_c, axis=0)
+    gain_fraction = _zero_fraction(log_gain)
+    w_c = np.exp(_interpolate(log_w, gain_fraction))
+    past = np.mod(_interpolate(turn, gain_fraction), 2 * np.pi)
+    phase, phase_frequency = min_without_nan(np.minimum(past, 2 * np.pi - past), w_c, axis=0)
+    added_delay, added_delay_frequency = min_without_nan(past / w_c, w_c, axis=0)
 
-    at_minus = np.where(np.abs(np.diff(angle, axis=0)) < np.pi, _zero_between(angle), np.nan)
-    factor = np.exp(-_between(log_gain, at_minus))
-    w_p = np.exp(_between(log_w, at_minus))
-    factor, factor_frequency = least_along(np.where(factor > 1, factor, np.nan), w_p, axis=0)
+    phase_fraction = np.where(np.abs(np.diff(angle, axis=0)) < np.pi, _zero_fraction(angle), np.nan)
+    factor = np.exp(-_interpolate(log_gain, phase_fraction))
+    w_p = np.exp(_interpolate(log_w, phase_fraction))
+    factor, factor_frequency = min_without_nan(np.where(factor > 1, factor, np.nan), w_p, axis=0)
     return Margins(
         unstable,
         np.where(stable, factor, 1.0),
         factor_frequency,
         np.where(stable, phase, 0.0),
         phase_frequency,
-        np.where(stable, more, 0.0),
-        more_frequency,
+        np.where(stable, added_delay, 0.0),
+        added_delay_frequency,
     )
 
 
+def encirclements(
+    response: ArrayLike,
+    *,
+    open_loop_poles: int = 0,
+    poles_at_origin: int = 0,
+    sampled: bool = False,
+) -> Array:
+    """Return the unstable closed-loop poles (...), from the turns of 1 + L about the origin.
+
+    A continuous response must extend to where |L| < 1 remains, a sampled one to half the sampling
+    rate.
+
+    Args:
+        response: L at increasing frequencies from near zero, (n, ...).
+        open_loop_poles: unstable poles of L.
+        poles_at_origin: of L, at s = 0 or z = 1; the contour passes them on the unstable side.
+
+    Raises:
+        DrakeTeleopError: the frequencies are too coarse, or end too early.
+    """
+    difference = 1 + np.asarray(response, dtype=complex)
+    steps = np.angle(difference[1:] / difference[:-1])
+    if not np.all(np.abs(steps) < np.pi / 2):
+        raise DrakeTeleopError(
+            "1 + L turns by more than a right angle between two frequencies",
+            remedy="take more frequencies there; a loop at its limit cannot be counted",
+        )
+    if not sampled and not np.all(np.abs(difference[-1] - 1) < 1):
+        raise DrakeTeleopError("|L| is not below 1 at the last frequency", remedy="go further up")
+    start, end = np.angle(difference[0]), np.angle(difference[-1])
+    # At s = 0, or right of poles there, 1 + L is real.
+    start_turn = start + poles_at_origin * np.pi / 2
+    turn = np.sum(steps, axis=0) + start_turn - np.pi * np.round(start_turn / np.pi)
+    turn = turn - poles_at_origin * np.pi / 2
+    if not sampled:
+        turn = turn - end
+    return open_loop_poles - np.round(turn / np.pi)
+
+
 def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
-    """The least factor above 1 that puts a single L on -1 and its frequency, inf for the tail."""
+    """Return the least factor above 1 that puts a single L on -1, and its frequency."""
     slow, fast = break_frequencies(loop)
-    # Past the last pole |L| falls, and with a delay its phase passes -pi within one turn of that.
+    # Above the last pole |L| falls, and with a delay its phase passes -pi within one turn.
     delay = float(loop.delay)
     turn = 2 * np.pi / (delay if delay > 1e-9 / fast else 1e-3 / fast)
     omega = frequency_grid(loop, slow, 3 * fast + 2 * turn)
@@ -156,12 +182,24 @@ def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
     return min((limit for limit in found if limit[0] > 1), default=(np.inf, np.nan))
 
 
-def _zero_between(value: Array) -> Array:
-    """Fraction of each step (n - 1, ...) at which the value passes zero, NaN where it does not."""
+def break_frequencies(loop: DelayedLoop) -> tuple[float, float]:
+    """Return least and largest magnitude of the poles without delay, except 0."""
+    breaks = np.abs(polynomial_roots(loop.denominator))
+    breaks = breaks[breaks > 0]
+    return float(np.min(breaks, initial=1.0)), float(np.max(breaks, initial=1.0))
+
+
+def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
+    """Return frequencies up to the top between which L and its delay turn little."""
+    step = np.pi / 8 / max(float(loop.delay), 1 / top)
+    return np.union1d(np.geomspace(1e-3 * slow, top, 1000), np.arange(step, top, step))
+
+
+def _zero_fraction(value: Array) -> Array:
     before, after = value[:-1], value[1:]
     step = np.where(before == after, 1.0, before - after)
     return np.where((before < 0) != (after < 0), before / step, np.nan)
 
 
-def _between(value: Array, fraction: Array) -> Array:
+def _interpolate(value: Array, fraction: Array) -> Array:
     return value[:-1] + fraction * (value[1:] - value[:-1])

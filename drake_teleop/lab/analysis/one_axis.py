@@ -1,6 +1,4 @@
-"""One task direction of the station: the numbers that every linear model of it is made of.
-
-Hand, device, slave with its servo, tool and environment along one axis:
+"""One task direction of the station: parameters and impedances of all linear models (T50).
 
     Z_h = m_h s + b_h + k_h / s            hand
     Z_m = m_m s + b_m                      device
@@ -8,8 +6,8 @@ Hand, device, slave with its servo, tool and environment along one axis:
     C   = m_s k_v k_p / s                  the servo's spring between command and slave
     Z_e = b_e + k_e / s                    environment
 
-The servo is that of `slave.joint_control`: computed torque for the acceleration
-k_v (k_p (x_command - x) - v).
+The servo (`slave.joint_control`) commands the acceleration k_v (k_p (x_command - x) - v).
+Impedances are in N s/m, s in rad/s.
 """
 
 from __future__ import annotations
@@ -24,88 +22,66 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """What every model of one direction has: hand, slave with its servo, tool, wall.
+    """Parameters of all models of one direction; defaults: the paper's station, medium grip."""
 
-    The defaults are those of the paper's station, held with a medium grip.
-
-    Args:
-        hand_mass, hand_damping, hand_stiffness: [kg], [N s/m], [N/m].
-        device_mass: [kg].
-        slave_mass: effective mass of arm and tool where the environment pushes [kg].
-        position_gain, velocity_gain: k_p, k_v of the servo [1/s].
-        ideal_servo: the slave is where it is told to be.
-        tool_mass: beyond the sensor [kg].
-        force_scale: k_f, slave to master.
-        sigma, gamma: of the elimination.
-        wall_stiffness: of the environment [N/m].
-    """
-
-    hand_mass: float = 0.25
-    hand_damping: float = 8.0
-    hand_stiffness: float = 250.0
-    device_mass: float = 0.15
-    slave_mass: float = 15.13
-    position_gain: float = 2 * np.pi * 12.0
-    velocity_gain: float = 2 * np.pi * 70.0
-    ideal_servo: bool = False
-    tool_mass: float = 3.13
-    force_scale: float = 1 / 17.5
+    hand_mass: float = 0.25  #: kg
+    hand_damping: float = 8.0  #: N s/m
+    hand_stiffness: float = 250.0  #: N/m
+    device_mass: float = 0.15  #: kg
+    slave_mass: float = 15.13  #: kg, effective at the contact point, tool included
+    position_gain: float = 2 * np.pi * 12.0  #: k_p [1/s]
+    velocity_gain: float = 2 * np.pi * 70.0  #: k_v [1/s]
+    ideal_servo: bool = False  #: the slave follows its command exactly
+    tool_mass: float = 3.13  #: kg, beyond the sensor
+    force_scale: float = 1 / 17.5  #: k_f, slave to master
     sigma: float = 0.0
     gamma: float = 1.0
-    wall_stiffness: float = 5100.0
+    wall_stiffness: float = 5100.0  #: N/m
 
     @property
     def servo_stiffness(self) -> float:
-        """m_s k_v k_p [N/m], between the command and the slave."""
+        """Stiffness m_s k_v k_p between command and slave [N/m]."""
         return self.slave_mass * self.velocity_gain * self.position_gain
 
     @property
     def servo_damping(self) -> float:
-        """m_s k_v [N s/m], between the slave and the world."""
+        """Damping m_s k_v between slave and world [N s/m]."""
         return self.slave_mass * self.velocity_gain
 
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(Axis):
-    """One direction of the linear analysis.
+    """One direction of the linear analysis."""
 
-    Args:
-        device_damping: [N s/m].
-        mass_error: of the estimate, estimated minus true tool mass [kg].
-        position_scale: l_p, master to slave.
-        delay: of the network, one way [s].
-        wall_damping: of the environment [N s/m].
-    """
-
-    device_damping: float = 0.5
-    mass_error: float = 0.0
-    position_scale: float = 1.0
-    delay: float = 0.0
-    wall_damping: float = 0.0
+    device_damping: float = 0.5  #: N s/m
+    mass_error: float = 0.0  #: kg, estimated minus true tool mass
+    position_scale: float = 1.0  #: l_p, master to slave
+    delay: float = 0.0  #: s, one way
+    wall_damping: float = 0.0  #: N s/m
 
     @property
-    def felt_tool_mass(self) -> float:
-        """M = sigma m_t + (sigma - gamma) dm [kg], what the elimination leaves of the tool."""
+    def displayed_tool_mass(self) -> float:
+        """Tool mass sigma m_t + (sigma - gamma) dm after the elimination [kg]."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 
 def hand_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Z_h [N s/m] at s [rad/s]."""
+    """Return Z_h."""
     return axis.hand_mass * s + axis.hand_damping + axis.hand_stiffness / s
 
 
 def device_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Z_m [N s/m] at s [rad/s]."""
+    """Return Z_m."""
     return axis.device_mass * s + axis.device_damping
 
 
 def environment_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Z_e [N s/m] at s [rad/s]."""
+    """Return Z_e."""
     return axis.wall_damping + axis.wall_stiffness / s
 
 
 def servo_response(axis: OneAxis, s: Complex) -> Complex:
-    """C / (Z_s + C), slave over command: k_v k_p / (s^2 + k_v s + k_v k_p); 1 if ideal."""
+    """Return C / (Z_s + C), slave over command."""
     if axis.ideal_servo:
         return np.ones_like(s)
     gain = axis.velocity_gain * axis.position_gain
@@ -113,7 +89,7 @@ def servo_response(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_admittance(axis: OneAxis, s: Complex) -> Complex:
-    """1 / (Z_s + C) [m/(N s)], by which the slave gives way; 0 if ideal."""
+    """Return 1 / (Z_s + C), the admittance of the slave."""
     if axis.ideal_servo:
         return np.zeros_like(s)
     kv, kp = axis.velocity_gain, axis.position_gain

@@ -1,20 +1,14 @@
-"""The station's one axis over the period of all its rates: sampled, held, delayed by samples.
+"""The station's one axis over the common period of its rates: sampled, held, delayed.
 
-The station's timing is kept event by event. All updates at one instant read what stood before it:
+The map keeps the order of events. All updates at one instant read earlier values:
 
-* The device goes on by one hand period with the hand's pull and the felt force of its beginning
-  held; its own damping acts all the time. In between, the others read where it will be.
-* The servo takes the command that stands there and the slave as it is; its pull is held.
-* The sensor sees the acceleration and the environment's force just before the servo's update.
-  What reads it at the same instant gets the sample before. Its low-pass, if any, is digital.
-* A channel with a delay of d whole hand periods hands on what was there d periods ago. Without
-  delay there is none: d = 0.
-* The slave moves continuously, against the environment's spring and damper.
+* The device advances by one hand period with held force; the other blocks read its prediction.
+* The servo reads the command and the slave's state; its force is held.
+* The sensor samples just before the servo's update; its low-pass, if any, is digital.
+* A channel with a delay of d hand periods returns its input of d periods ago.
 
-Between two events everything is linear with constant inputs, so the map over the period that all
-rates have in common is exact (matrix exponentials), whatever the rates.
-
-Fields of `OneAxis` and `Sampling` may be arrays that broadcast; results have their shape in front.
+Between events, matrix exponentials are exact. Fields of `OneAxis` and `Sampling` may be arrays
+that broadcast; results have their shape in front.
 """
 
 from __future__ import annotations
@@ -34,35 +28,29 @@ from drake_teleop.station.sensor.sensor_chain import butterworth_sections
 
 Array = NDArray[np.float64]
 X_M, V_M, SERVO, X_S, V_S, SAMPLE, FILTER = range(7)
-# Behind the states: the inputs, held, and the force that is felt where the loop is cut.
+# After the states: the held inputs, and the force received where the loop is cut.
 _HAND, _ENVIRONMENT, RECEIVED = -3, -2, -1
-_MOST_EVENTS = 1000
+_MAX_EVENTS = 1000
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """The rates of the station; the defaults are its own, with the ideal sensor.
+    """Rates of the station; defaults: its own, with the ideal sensor."""
 
-    Args:
-        hand_hz: of haptic device and channel [Hz].
-        joint_control_hz, sensor_hz: [Hz].
-        low_pass_hz: of the sensor's 4th-order Butterworth low-pass [Hz]; None: ideal sensor.
-    """
-
-    hand_hz: float = 2000.0
+    hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
     sensor_hz: float = 8000.0
-    low_pass_hz: float | None = None
+    low_pass_hz: float | None = None  #: of the sensor's 4th-order Butterworth filter; None: ideal
 
 
 def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
-    """Hand periods that a packet travels: rounded, at least one if there is any delay at all."""
+    """Return the delay in hand periods: rounded, at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """(..., n + 3, n + 3) over the hand's period, without delay."""
+    """Return the map (..., n + 3, n + 3) over the hand's period, cut and without delay."""
     M, periods = period_map(axis, sampling, 0, cut=True)
     if periods != 1:
         raise DrakeTeleopError(
@@ -74,10 +62,9 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 
 
 def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
-    """The map of [states; held inputs; force received] over the common period, and its length.
+    """Return the map (..., n + 3, n + 3) over the common period, and the hand periods in it.
 
-    Returns:
-        (..., n + 3, n + 3), in hand periods.
+    It maps [states; held inputs; force received].
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
@@ -122,7 +109,7 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
 
 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """Hand periods in the common period; each event's time to the next, and who updates at it."""
+    """Return the hand periods in the common period; each event's duration and updates."""
     hand = np.asarray(sampling.hand_hz, dtype=float)
     ratios = []
     for name in ("joint_control_hz", "sensor_hz"):
@@ -142,14 +129,13 @@ def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, b
 def _schedule(
     servo: Fraction, sensor: Fraction
 ) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """`_events` of a servo and a sensor so many times as fast as the hand."""
     lengths = [Fraction(1), 1 / servo, 1 / sensor]
     common = Fraction(
         math.lcm(*(length.numerator for length in lengths)),
         math.gcd(*(length.denominator for length in lengths)),
     )
     times = sorted({i * length for length in lengths for i in range(int(common / length))})
-    if len(times) > _MOST_EVENTS:
+    if len(times) > _MAX_EVENTS:
         raise DrakeTeleopError(
             f"the rates take {float(common):g} hand periods to meet again",
             where="sampling",
@@ -163,7 +149,6 @@ def _schedule(
 
 
 def _sections(sampling: Sampling) -> Array:
-    """(..., 2, 5) of the low-pass at the sensor's rate, (0, 5) for the ideal sensor."""
     if sampling.low_pass_hz is None:
         return np.zeros((0, 5))
     cutoffs, rates = np.broadcast_arrays(sampling.low_pass_hz, sampling.sensor_hz)
@@ -179,13 +164,12 @@ def _sections(sampling: Sampling) -> Array:
 
 
 class _Rows:
-    """What each event writes, as rows over [states; inputs; force received]."""
+    """Rows that each event writes, over [states; inputs; force received]."""
 
     def __init__(self, axis: OneAxis, size: int) -> None:
         self._axis, self._size = axis, size
 
     def _row(self, entries: dict[int, Any]) -> Array:
-        """(..., size) from entries that broadcast."""
         values = np.broadcast_arrays(
             *(np.asarray(value, dtype=float) for value in entries.values())
         )
@@ -198,31 +182,29 @@ class _Rows:
         return {X_S: self._axis.wall_stiffness, V_S: self._axis.wall_damping, _ENVIRONMENT: 1.0}
 
     def hand(self, period: Array, received: int) -> Array:
-        """x_m and v_m a hand period later, with the force on the device held."""
         axis = self._axis
         mass = axis.hand_mass + axis.device_mass
         x, v, push = _held_response(0.0, axis.device_damping / mass, period)
-        pull = {
+        hand_force = {
             X_M: -axis.hand_stiffness / mass,
             V_M: -axis.hand_damping / mass,
             _HAND: 1 / mass,
         }
-        force = self._row(pull) + self._row({received: -1 / mass})
+        force = self._row(hand_force) + self._row({received: -1 / mass})
         ahead = [force * push[..., i, None] for i in range(2)]
         for i in range(2):
             ahead[i] = ahead[i] + self._row({X_M: x[..., i], V_M: v[..., i]})
         return np.stack(np.broadcast_arrays(*ahead), axis=-2)
 
     def servo(self, command: int) -> Array:
-        """The acceleration k_v (k_p (l_p x_command - x_s) - v_s)."""
         kv, kp = self._axis.velocity_gain, self._axis.position_gain
         row = self._row({command: kv * kp * self._axis.position_scale})
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor(self, sections: Array) -> Array:
-        """The sample, scaled for the hand after the elimination, and the memory of its low-pass."""
+        """Return the scaled sample after elimination, and the filter's memory."""
         axis = self._axis
-        felt_mass = axis.felt_tool_mass
+        felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
         value = self._row(
             {
@@ -241,7 +223,6 @@ class _Rows:
         return np.stack(np.broadcast_arrays(value, *memory), axis=-2)
 
     def slave(self, time: Array) -> Array:
-        """x_s and v_s after `time` [s], with the servo's pull held, in touch with the wall."""
         axis = self._axis
         mass = axis.slave_mass
         x, v, push = _held_response(axis.wall_stiffness / mass, axis.wall_damping / mass, time)
@@ -255,20 +236,16 @@ class _Rows:
 
 
 def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    """Of x'' = u - damping x' - stiffness x with u held: what (x, v) owe to x, to v and to u.
-
-    Returns:
-        Three arrays (..., 2).
-    """
+    """Return the parts (..., 2) of (x, v) due to x, v and u of x'' = u - b x' - k x."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
-    E = _exponential(M)
+    E = _matrix_exponential(M)
     return E[..., :2, 0], E[..., :2, 1], E[..., :2, 2]
 
 
-def _exponential(M: Array) -> Array:
-    """e^M of (..., n, n), vectorised: the Taylor series of M / 2^s, squared s times."""
+def _matrix_exponential(M: Array) -> Array:
+    """Return e^M by the Taylor series of M / 2^s, squared s times."""
     largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
     halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0
     term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)

@@ -1,4 +1,4 @@
-"""The report of `drake-teleop analyze`: one page with a verdict, tables and pictures."""
+"""Report of `drake-teleop analyze`: one page with a verdict, tables and pictures."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from drake_teleop.lab.analysis.two_port import (
 )
 
 _GRIP_COLOURS = {"light": COLOURS[3], "medium": COLOURS[4], "firm": COLOURS[1]}
-#: Parameter of a map -> its name on an axis, and the factor to its unit there.
+#: Parameter of a map -> label of its axis, and the factor to its unit.
 _AXES = {
     "delay": ("round trip [ms]", 2e3),
     "wall_stiffness": ("stiffness of the wall [kN/m]", 1e-3),
@@ -48,27 +48,19 @@ _AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """What the pictures show beyond the figures.
-
-    Args:
-        omega: (n,) [rad/s].
-        H: (n, 2, 2) of the Diagram, without the hand's mass; closed_form: likewise.
-        wall: stiffness and damping of the environment [N/m], [N s/m].
-        nyquist: grip -> (n,) loop, which is at its limit where it is -1.
-        maps: title -> grip -> map.
-    """
+    """Data of the pictures beyond the figures."""
 
     axis: OneAxis
-    omega: NDArray[np.float64]
-    H: Complex
-    closed_form: Complex
-    wall: tuple[float, float]
-    nyquist: dict[str, Complex]
-    maps: dict[str, dict[str, StabilityMap]]
+    omega: NDArray[np.float64]  #: (n,) [rad/s]
+    H: Complex  #: (n, 2, 2) of the Diagram, without the hand's mass
+    closed_form: Complex  #: likewise, of one axis
+    wall: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
+    nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
+    maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
 
 
 def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
-    """Writes report.html and its pictures into `out`."""
+    """Write report.html and its pictures into `out`."""
     pictures = {
         "bode": draw_bode(curves, summary["measured"]),
         "nyquist": draw_nyquist(curves),
@@ -91,7 +83,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
 
 
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The one-axis numbers with their units, as printed."""
+    """Return the one-axis parameters with their units, as text."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
     return [
         (
@@ -113,7 +105,7 @@ def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
-    """A row of the table of margins, as printed."""
+    """Return a row of the table of margins, as text."""
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")
@@ -128,7 +120,7 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
 
 
 def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
-    """What the hand feels over frequency, in free motion and of the wall."""
+    """Draw the displayed impedance over frequency, in free motion and at the wall."""
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     stiffness, damping = curves.wall
     environments = {
@@ -168,7 +160,7 @@ def _degrees(felt: Complex) -> Any:
 
 
 def draw_nyquist(curves: Curves) -> Figure:
-    """The loop before the wall, held by each grip; -1 must not be gone around."""
+    """Draw the loop at the wall for each grip; it must not encircle -1."""
     with house_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
@@ -188,7 +180,7 @@ def draw_nyquist(curves: Curves) -> Figure:
 
 
 def draw_passive_loads(curves: Curves) -> Figure:
-    """Llewellyn's parameter, the norm of S, and mu: for anything passive, and for real grips."""
+    """Draw Llewellyn's parameter, the norm of S, and mu."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
     scaled = power_scaled(curves.H, ratio) if ratio > 0 else curves.H
@@ -203,27 +195,17 @@ def draw_passive_loads(curves: Curves) -> Figure:
         left.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         left.set_ylim(-1.2, 5.0)
         left.set_title("Llewellyn's parameter: absolutely stable from 1 on")
-        right.semilogx(
-            hertz,
-            absolute_stability.scattering_norm(S),
-            color=COLOURS[2],
-            label="passive: norm of S",
-        )
-        right.semilogx(
-            hertz,
-            absolute_stability.structured_singular_value(S),
-            color=COLOURS[0],
-            label="any passive hand and environment: μ",
-        )
-        right.semilogx(
-            hertz,
-            bounded,
-            color=COLOURS[3],
-            label=f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ",
-        )
+        realistic = f"hands from light to firm, walls up to {curves.wall[0] / 1e3:.3g} kN/m: μ"
+        mu = absolute_stability.structured_singular_value(S)
+        for label, value, colour in (
+            ("passive: norm of S", absolute_stability.scattering_norm(S), COLOURS[2]),
+            ("any passive hand and environment: μ", mu, COLOURS[0]),
+            (realistic, bounded, COLOURS[3]),
+        ):
+            right.semilogx(hertz, value, color=colour, label=label)
         right.axhline(1.0, color=VERMILION, linewidth=0.9, linestyle="--")
         right.set_ylim(0.0, 3.0)
-        right.set_title("stable for sure below 1")
+        right.set_title("stable below 1")
         right.legend(fontsize=7.5)
         for axes in (left, right):
             axes.set_xlabel("frequency [Hz]")
@@ -231,7 +213,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
 
 
 def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
-    """What can be felt between nothing and a rigid wall; virtual walls of the device itself."""
+    """Draw the transmitted Z-width, and the virtual walls of the device itself."""
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
@@ -262,7 +244,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
 
 
 def draw_maps(curves: Curves, grip: str) -> Figure:
-    """Stability over two parameters: for the scenario's grip as area, for each as boundary."""
+    """Draw stability over two parameters, for all grips."""
     with house_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
@@ -305,14 +287,14 @@ def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Margins and verdict on the terminal."""
+    """Print margins and verdict to the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     console = Console()
-    table = Table(title="How far from the limit", title_justify="left", box=SIMPLE_HEAD)
+    table = Table(title="Stability margins", title_justify="left", box=SIMPLE_HEAD)
     for heading in ("Grip", "Wall", "Stable"):
         table.add_column(heading)
     for heading in ("Gain", "Phase", "More round trip [ms]"):

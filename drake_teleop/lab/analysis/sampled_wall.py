@@ -1,22 +1,13 @@
-"""A wall rendered by a sampled device: how stiff it may be (the device's Z-width).
+"""Z-width of a sampled device: the stiffest virtual wall that it can render.
 
-The device, with viscous damping b, moves in continuous time; its position x is sampled every Ts,
-the wall answers d samples later, and the force is held:
+The device with damping b [N s/m] moves continuously; its position x is sampled every Ts [s], the
+wall of stiffness K [N/m] and damping B [N s/m] answers d samples later, and the force is held:
 
     H(z) = z^-d (K + B (z - 1) / (Ts z)),    force of the wall at t_k: f_k = (H x)_k.
 
-Passive means that the wall with the device's damping never gives more energy than it got, whatever
-moves it. That holds if and only if (Colgate and Schenkel 1997), for 0 <= theta = w Ts <= pi,
-
-    b > (Ts / 2) / (1 - cos theta) Re[(1 - e^(-j theta)) H(e^(j theta))],
-
-which for the wall above is a sum of cosines,
-
-    (K Ts / 2) (1 + 2 sum_{i=1..d} cos(i theta)) - B cos((d + 1) theta):
-
-K Ts / 2 + |B| without delay, K Ts (1/2 + d) without B; with both it is less than their sum.
-Passive is sufficient for stability, not necessary: `stable_stiffness` is the limit with one known
-hand. `energy_damping` finds the limit of passivity again in time, from energy alone.
+It is passive if and only if b exceeds the right side of (T62), here a sum of cosines of
+theta = w Ts. Passive is sufficient for stability. Invalid signs, and delays that are no whole
+number, raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -28,37 +19,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.analysis.delayed_loop import checked_positive
 from drake_teleop.lab.analysis.one_axis import Complex
 
 Array = NDArray[np.float64]
 
 
 def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Array:
-    """Device damping [N s/m] that covers a wall at each frequency: the right side of the condition.
-
-    Args:
-        response: H(e^(j theta)) [N/m].
-        angle: theta = w Ts, in (0, pi].
-        period: Ts [s].
-
-    Raises:
-        DrakeTeleopError: the period is not positive.
-    """
-    _require_positive(period, "period")
+    """Return the device damping for a wall H(e^(j theta)) at theta in (0, pi] (T62)."""
+    checked_positive(period, "period")
     H = np.asarray(response, dtype=complex)
-    # Re[(1 - e^(-j theta)) H] / (1 - cos theta), without the difference of nearly equal numbers
+    # Re[(1 - e^(-j theta)) H] / (1 - cos theta), without cancellation
     return period / 2 * (H.real - H.imag / np.tan(np.asarray(angle, dtype=float) / 2))
 
 
 def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> float:
-    """Least device damping [N s/m] that makes any sampled wall H(z) passive.
+    """Return the least device damping that makes a sampled wall H(z) passive.
 
-    Args:
-        wall: H at z, (n,): a function or a sampled control.TransferFunction with one input.
-        period: Ts [s].
-
-    Raises:
-        DrakeTeleopError: the period is not positive.
+    `wall` returns H at z, (n,): a function or a sampled control.TransferFunction.
     """
     from scipy.optimize import minimize_scalar
 
@@ -82,43 +60,27 @@ def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> flo
 def passive_damping(
     stiffness: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Least device damping [N s/m] that makes the wall passive, exact.
-
-    Args:
-        stiffness, wall_damping: K [N/m] and B [N s/m]; they broadcast.
-        period: Ts [s].
-        delay: d, in samples.
-
-    Raises:
-        DrakeTeleopError: the period is not positive, or the delay not a whole number from 0 on.
-    """
+    """Return the least device damping that makes the wall passive, exact."""
     K, B = np.asarray(stiffness, dtype=float), np.asarray(wall_damping, dtype=float)
-    return _largest(_cosines(K, B, period, delay))[0]
+    return _maximum(_cosine_coefficients(K, B, period, delay))[0]
 
 
 def passive_stiffness(
     device_damping: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Largest K [N/m] of a passive wall, 0 if there is none: over B, the Z-width of the device.
-
-    Args:
-        device_damping, wall_damping: b and B [N s/m]; they broadcast.
-        period: Ts [s].
-        delay: d, in samples.
-
-    Raises:
-        DrakeTeleopError: the period or b is not positive, or the delay not a whole number.
-    """
-    b, B = np.broadcast_arrays(_positive(device_damping, "damping of the device"), wall_damping)
-    _require_positive(period, "period")
-    K = np.maximum((b + B) / (period * (delay + 0.5)), 0.0)  # no more than this at theta = 0
-    share = _cosines(np.ones_like(K), np.zeros_like(K), period, delay)
-    # The damping needed is convex in K: Newton's steps from above meet the largest root.
+    """Return the largest K of a passive wall, 0 if there is none."""
+    b, B = np.broadcast_arrays(
+        checked_positive(device_damping, "damping of the device"), wall_damping
+    )
+    checked_positive(period, "period")
+    K = np.maximum((b + B) / (period * (delay + 0.5)), 0.0)  # upper bound, from theta = 0
+    share = _cosine_coefficients(np.ones_like(K), np.zeros_like(K), period, delay)
+    # The required damping is convex in K: Newton's method from above finds the largest root.
     for _ in range(50):
-        needed, angle = _largest(_cosines(K, B, period, delay))
-        slope = _sum(share, angle)
-        slope = np.maximum(slope, 1e-300)  # where more stiffness helps, only 0 is left
-        step = np.minimum(np.maximum(needed - b, 0.0) / slope, K)
+        required, angle = _maximum(_cosine_coefficients(K, B, period, delay))
+        slope = _cosine_sum(share, angle)
+        slope = np.maximum(slope, 1e-300)  # if stiffness reduces the damping, K becomes 0
+        step = np.minimum(np.maximum(required - b, 0.0) / slope, K)
         K = K - step
         if np.all(step <= 1e-12 * K):
             break
@@ -128,22 +90,13 @@ def passive_stiffness(
 def passive_friction(
     stiffness: ArrayLike, wall_damping: ArrayLike, period: float, resolution: float
 ) -> Array:
-    """Coulomb friction [N] that covers what an encoder's steps add to the wall, at any delay.
+    """Return the Coulomb friction [N] that compensates an encoder's resolution Delta [m].
 
-    Half a step of error in each sample is an error of the force of at most Delta / 2 times the sum
-    of |h_k|: Delta / 2 (|K + B / Ts| + |B / Ts|). Necessary for B = 0, where K <= 2 f_c / Delta;
-    the device's damping must cover the wall without steps besides.
-
-    Args:
-        stiffness, wall_damping: K [N/m], B [N s/m].
-        period: Ts [s].
-        resolution: Delta, of the encoder [m].
-
-    Raises:
-        DrakeTeleopError: the period or the resolution is not positive.
+    Half a step of error in each sample gives a force error of at most
+    Delta / 2 (|K + B / Ts| + |B / Ts|). The device's damping must cover the wall in addition.
     """
-    _require_positive(period, "period")
-    _require_positive(resolution, "resolution of the encoder")
+    checked_positive(period, "period")
+    checked_positive(resolution, "resolution of the encoder")
     rate = np.asarray(wall_damping, dtype=float) / period
     return resolution / 2 * (np.abs(np.asarray(stiffness, dtype=float) + rate) + np.abs(rate))
 
@@ -151,16 +104,13 @@ def passive_friction(
 def friction_stiffness(
     device_damping: ArrayLike, friction: ArrayLike, period: float, resolution: float
 ) -> Array:
-    """min(2 b / Ts, 2 f_c / Delta) [N/m], the K that damping and friction cover (B = d = 0).
+    """Return min(2 b / Ts, 2 f_c / Delta), the passive K with friction and encoder (B = d = 0).
 
     Diolaiti, Niemeyer, Barbagli and Salisbury (2006).
-
-    Raises:
-        DrakeTeleopError: the period, the resolution or b is not positive, or f_c negative.
     """
-    b = _positive(device_damping, "damping of the device")
-    _require_positive(period, "period")
-    _require_positive(resolution, "resolution of the encoder")
+    b = checked_positive(device_damping, "damping of the device")
+    checked_positive(period, "period")
+    checked_positive(resolution, "resolution of the encoder")
     if np.any(np.asarray(friction) < 0):
         raise DrakeTeleopError("the friction of the device is negative")
     return np.minimum(2 * b / period, 2 * np.asarray(friction) / resolution)
@@ -175,40 +125,30 @@ def stable_stiffness(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Array:
-    """K [N/m] at which the sampled loop becomes unstable, exact; 0 if any K is unstable.
+    """Return the K at which the loop with one hand becomes unstable; 0 if any K is unstable.
 
-    A pole reaches the unit circle at e^(j theta) where the K that closes the loop there,
-    -z^d / P(z) - B (z - 1) / (Ts z), is real. P is the device between two samples under held force.
-
-    Args:
-        mass, damping, hand_stiffness: of device and hand together [kg], [N s/m], [N/m].
-        wall_damping: B [N s/m].
-        period: Ts [s].
-        delay: d, in samples.
-
-    Raises:
-        DrakeTeleopError: the period, the mass or the damping is not positive, the stiffness of the
-            hand negative, or the delay not a whole number from 0 on.
+    A pole reaches the unit circle where the K that closes the loop there is real. `mass`, `damping`
+    and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
     """
     mass, damping, B, hand = np.broadcast_arrays(mass, damping, wall_damping, hand_stiffness)
-    state, held = _held_motion(mass, damping, hand, period)
-    _require_samples(delay)
+    state, held = _sampled_device(mass, damping, hand, period)
+    _require_whole_samples(delay)
     angles = np.geomspace(1e-4, np.pi, 1000 * (1 + delay // 5)).reshape(-1, *(1,) * mass.ndim)
-    closing = _closing_stiffness(state, held, B, period, delay, angles)
-    crossed = (closing.imag[1:] < 0) != (closing.imag[:-1] < 0)
+    critical = _critical_stiffness(state, held, B, period, delay, angles)
+    crossed = (critical.imag[1:] < 0) != (critical.imag[:-1] < 0)
     low = np.broadcast_to(angles[:-1], crossed.shape)[crossed]
     high = np.broadcast_to(angles[1:], crossed.shape)[crossed]
-    below = closing.imag[:-1][crossed] < 0
+    below = critical.imag[:-1][crossed] < 0
     cell = np.nonzero(crossed)[1:]
     part = (state[cell], held[cell], B[cell], period, delay)
     for _ in range(50):
         middle = (low + high) / 2
-        same = (_closing_stiffness(*part, middle).imag < 0) == below
+        same = (_critical_stiffness(*part, middle).imag < 0) == below
         low, high = np.where(same, middle, low), np.where(same, high, middle)
 
     real = np.full((len(angles), *mass.shape), np.inf)
-    real[:-1][crossed] = _closing_stiffness(*part, high).real
-    real[-1] = closing.real[-1]  # at z = -1 always
+    real[:-1][crossed] = _critical_stiffness(*part, high).real
+    real[-1] = critical.real[-1]  # always real at z = -1
     limit = np.min(np.where(real > 0, real, np.inf), axis=0)
     poles = sampled_poles(mass, damping, limit / 2, B, period, delay, hand_stiffness=hand)
     return np.where(np.max(np.abs(poles), axis=-1) < 1, limit, 0.0)
@@ -224,17 +164,14 @@ def sampled_poles(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Multipliers over a sample (..., 3 + d) of device and hand on the wall.
-
-    Args and errors: as in `stable_stiffness`; stiffness: K of the wall [N/m].
-    """
+    """Return the multipliers (..., 3 + d) over a sample; see `stable_stiffness`."""
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )
-    state, held = _held_motion(mass, damping, hand, period)
-    _require_samples(delay)
+    state, held = _sampled_device(mass, damping, hand, period)
+    _require_whole_samples(delay)
     rate = B / period
-    # Position, velocity, and the positions of the last d + 1 samples
+    # States: position, velocity, positions of the last d + 1 samples
     force = np.zeros((*mass.shape, 3 + delay))
     now = 0 if delay == 0 else 1 + delay
     force[..., now], force[..., 2 + delay] = K + rate, -rate
@@ -247,53 +184,10 @@ def sampled_poles(
     return np.linalg.eigvals(step).astype(complex)
 
 
-def wall_impulse_response(
-    stiffness: float, wall_damping: float, period: float, delay: int, samples: int
-) -> Array:
-    """h_k of the wall, (samples,) [N/m]: K + B / Ts after d samples, then -B / Ts.
-
-    Raises:
-        DrakeTeleopError: the period is not positive, or the delay not a whole number from 0 on.
-    """
-    _require_positive(period, "period")
-    _require_samples(delay)
-    h = np.zeros(max(samples, delay + 2))
-    h[delay] = stiffness + wall_damping / period
-    h[delay + 1] = -wall_damping / period
-    return h[:samples]
-
-
-def energy_damping(impulse_response: ArrayLike, period: float) -> float:
-    """Device damping [N s/m] that makes a wall passive over the samples given, from its energy.
-
-    With the force held from t_k to t_(k+1) the work on the wall is exactly f_k (x_(k+1) - x_k),
-    whatever happens between. From rest, f_k is the sum of the step response over the earlier steps
-    of x: the energy is v' W v with v the mean velocities over the samples and W Toeplitz and
-    strictly lower triangular. The device loses at least b Ts v'v. So b = -(least eigenvalue of the
-    symmetric part of W) / Ts, which rises with the number of samples to the limit of the condition
-    on H.
-
-    Args:
-        impulse_response: h_k of the wall (n,) [N/m].
-        period: Ts [s].
-
-    Raises:
-        DrakeTeleopError: the period is not positive.
-    """
-    from scipy.linalg import eigh, toeplitz
-
-    _require_positive(period, "period")
-    step_response = np.cumsum(np.asarray(impulse_response, dtype=float))
-    n = len(step_response)
-    work = toeplitz(np.r_[0.0, step_response[:-1]], np.zeros(n)) * period**2
-    least = eigh((work + work.T) / 2, eigvals_only=True, subset_by_index=[0, 0])
-    return float(-least[0] / period)
-
-
-def _cosines(K: Array, B: Array, period: float, delay: int) -> Array:
-    """Coefficients (..., d + 2) of the damping needed over cos(i theta)."""
-    _require_positive(period, "period")
-    _require_samples(delay)
+def _cosine_coefficients(K: Array, B: Array, period: float, delay: int) -> Array:
+    """Return the required damping's coefficients over cos(i theta)."""
+    checked_positive(period, "period")
+    _require_whole_samples(delay)
     K, B = np.broadcast_arrays(K, B)
     coefficients = np.zeros((*K.shape, delay + 2))
     coefficients[..., 0] = K * period / 2
@@ -302,19 +196,18 @@ def _cosines(K: Array, B: Array, period: float, delay: int) -> Array:
     return coefficients
 
 
-def _sum(coefficients: Array, angle: Array) -> Array:
-    """sum_i a_i cos(i theta), theta (...) for coefficients (..., n)."""
+def _cosine_sum(coefficients: Array, angle: Array) -> Array:
     order = np.arange(coefficients.shape[-1])
     return np.sum(coefficients * np.cos(order * angle[..., None]), axis=-1)
 
 
-def _largest(coefficients: Array) -> tuple[Array, Array]:
-    """Largest sum of cosines over theta and where it is: on a grid, then by Newton's method."""
+def _maximum(coefficients: Array) -> tuple[Array, Array]:
+    """Return the largest sum of cosines and its theta."""
     order = np.arange(coefficients.shape[-1])
     angles = np.linspace(0, np.pi, 64 * len(order) + 1)
     step = angles[1]
     values = coefficients @ np.cos(np.outer(order, angles))
-    # Of two peaks of nearly the same height, the parabola through three values tells the higher.
+    # A parabola through three values finds the higher of two nearly equal peaks.
     before = np.concatenate([values[..., 1:2], values[..., :-1]], axis=-1)
     after = np.concatenate([values[..., 1:], values[..., -2:-1]], axis=-1)
     bend = 2 * values - before - after
@@ -327,22 +220,25 @@ def _largest(coefficients: Array) -> tuple[Array, Array]:
         curve = -np.sum(coefficients * order**2 * np.cos(order * angle[..., None]), axis=-1)
         move = np.where(curve < 0, -slope / np.where(curve < 0, curve, 1.0), 0.0)
         angle = np.clip(angle + move, np.maximum(start - step, 0), np.minimum(start + step, np.pi))
-    better = _sum(coefficients, angle) >= _sum(coefficients, start)
+    better = _cosine_sum(coefficients, angle) >= _cosine_sum(coefficients, start)
     angle = np.where(better, angle, start)
-    return _sum(coefficients, angle), angle
+    return _cosine_sum(coefficients, angle), angle
 
 
-def _held_motion(
+def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Position and velocity after a sample: Phi (..., 2, 2), Gamma (..., 2) for a held force."""
+    """Return Phi (..., 2, 2) and Gamma (..., 2) of the device under held force."""
     from scipy.linalg import expm
 
-    m, b = _positive(mass, "mass of the device"), _positive(damping, "damping of the device")
+    m, b = (
+        checked_positive(mass, "mass of the device"),
+        checked_positive(damping, "damping of the device"),
+    )
     k = np.asarray(stiffness, dtype=float)
     if not np.all(k >= 0):
         raise DrakeTeleopError("the stiffness of the hand is negative")
-    _require_positive(period, "period")
+    checked_positive(period, "period")
     rates = np.zeros((*m.shape, 3, 3))
     rates[..., 0, 1] = 1
     rates[..., 1, 0], rates[..., 1, 1], rates[..., 1, 2] = -k / m, -b / m, 1 / m
@@ -350,10 +246,10 @@ def _held_motion(
     return motion[..., :2, :2], motion[..., :2, 2]
 
 
-def _closing_stiffness(
+def _critical_stiffness(
     state: Array, held: Array, B: Array, period: float, delay: int, angle: Array
 ) -> Complex:
-    """The K that puts a pole of the closed loop on e^(j theta); only a real one can be built."""
+    """Return the K that puts a pole on e^(j theta), if real."""
     z = np.exp(1j * angle)
     trace = state[..., 0, 0] + state[..., 1, 1]
     det = state[..., 0, 0] * state[..., 1, 1] - state[..., 0, 1] * state[..., 1, 0]
@@ -361,18 +257,6 @@ def _closing_stiffness(
     return -(z**delay) * (z * (z - trace) + det) / answer - B / period * (1 - 1 / z)
 
 
-def _require_samples(delay: int) -> None:
+def _require_whole_samples(delay: int) -> None:
     if delay < 0 or delay != int(delay):
         raise DrakeTeleopError("the delay is not a whole number of samples from 0 on")
-
-
-def _require_positive(value: float, what: str) -> None:
-    if not value > 0:
-        raise DrakeTeleopError(f"the {what} is not positive")
-
-
-def _positive(value: ArrayLike, what: str) -> Array:
-    value = np.asarray(value, dtype=float)
-    if not np.all(value > 0):
-        raise DrakeTeleopError(f"the {what} is not positive")
-    return value

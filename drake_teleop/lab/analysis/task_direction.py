@@ -1,11 +1,8 @@
-"""The one-axis numbers of a scenario along a direction of its task, from its models.
+"""One-axis parameters of a scenario along a task direction: true values from its models.
 
-They are the plant's truth, for analysis; no estimator may see them.
-
-One axis is the whole station only where a push of the environment turns nothing, as along the tool.
-Sideways a push at the tip, 0.2 m away from the sensor, is a torque at the hand, whose wrist yields,
-and the tool follows its turn: the tip is some hundred times as soft as the servo makes it, and with
-sigma > 0 the tool's moment of inertia is felt as well. `linearization` has all six directions.
+One axis represents the station if a contact force causes no rotation, as along the tool. Sideways,
+wrist and tool turn: the tip is about a hundred times softer than the servo. `linearization`
+models this.
 """
 
 from __future__ import annotations
@@ -36,22 +33,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TaskDirection:
-    """A direction of the task, at a state of rest.
-
-    Args:
-        axis: its numbers.
-        hand: (6,) the direction at E, in B: force and velocity of the hand along it.
-        tool: (6,) the direction at the tip as a wrench about So, in W. Likewise tool . twist of S
-            is the tip's velocity.
-        tool_coupling: acceleration of the tool's centre of mass over that of the tip along the
-            direction, when the tip is pushed. A push turns the tool as well, so the sensor feels
-            tool_coupling m_t in h12 = kf (gamma - tool_coupling M s / (Z_s + C)); h11 has m_t,
-            because a command turns nothing.
-    """
+    """A direction of the task, at a state of rest."""
 
     axis: OneAxis
-    hand: Array
+    hand: Array  #: (6,) direction of the hand's force and velocity at E, in B
+    #: (6,) wrench about So, in W, of a unit force at the tip; tool . twist is the tip's velocity.
     tool: Array
+    #: Acceleration of the tool's centre of mass over that of the tip, for a force at the tip:
+    #: h12 = kf (gamma - tool_coupling M s / (Z_s + C)).
     tool_coupling: float
 
 
@@ -62,7 +51,7 @@ def OneAxisFromScenario(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> OneAxis:
-    """The axis of `task_direction`."""
+    """Return the axis of `task_direction`."""
     return task_direction(
         scenario, direction, load_estimate=load_estimate, displacement=displacement
     ).axis
@@ -75,19 +64,18 @@ def task_direction(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> TaskDirection:
-    """What a scenario is along one direction.
+    """Return the parameters of a scenario along one direction of the slave's motion in W.
 
-    Masses are those of bodies that are free in all other directions: 1 / (n' J M^-1 J' n).
+    Masses are those of bodies that are free in all other directions: 1 / (n' J M^-1 J' n). The
+    network's delay is the mean of both ways.
 
     Args:
-        scenario: its delay is the mean of both ways, its environment the leaf, if it has one.
-        direction: (3,) of the slave's motion in W, of any length.
-        load_estimate: (16,) as for `MakeTeleopStation`; None: without error.
+        load_estimate: (16,) as for `MakeTeleopStation`; default: no error.
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
-        DrakeTeleopError: for a direction of length zero, a pose out of reach, or gripper and object
-            that are scaled differently.
+        DrakeTeleopError: the direction is zero, the pose out of reach, or gripper and object have
+            different scales.
     """
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)
@@ -96,25 +84,25 @@ def task_direction(
     sigma, sigma_object, gamma = scenario.force_scaling.scales()
     if sigma != sigma_object:
         raise DrakeTeleopError(
-            "gripper and object are scaled differently: there is no one sigma",
+            "gripper and object have different scales; one axis needs one sigma",
             where="force_scaling.eta",
             remedy="set eta: null",
         )
     n_W = n_W / np.linalg.norm(n_W)
     scaling, hand = scenario.kinematic_scaling, scenario.operator.hand
     R_WB = RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix()
-    moved_B = checked("displacement", displacement, 3)
+    displacement_B = checked("displacement", displacement, 3)
     hand_B = np.concatenate([R_WB.T @ n_W, np.zeros(3)])
-    device_mass, device_damping = _device(scenario, moved_B, hand_B)
+    device_mass, device_damping = _device_mass_and_damping(scenario, displacement_B, hand_B)
     slave = NominalSlave(scenario.slave)
     arm = slave.arm
-    moved_W = scaling.translation_scale * R_WB @ moved_B
-    q = _slave_posture(slave, moved_W)
+    displacement_W = scaling.translation_scale * R_WB @ displacement_B
+    q = _slave_posture(slave, displacement_W)
     J, R_WS, p_WS = np.empty((6, arm.num_joints)), np.empty((3, 3)), np.empty(3)
     jacobian(arm.table, q, J)
     forward_kinematics(arm.table, q, R_WS, p_WS)
     tool_W = np.concatenate([n_W, np.cross(R_WS @ slave.tip, n_W)])
-    # Acceleration of S for a unit push at the tip, while no motor reacts.
+    # Acceleration of S for a unit force at the tip, without motor torques.
     a, alpha = np.split(J @ np.linalg.solve(mass_matrix(arm, q), J.T @ tool_W), 2)
     mass, first_moment_S = arm.phi_load[0], arm.phi_load[1:4]
     mobility = tool_W @ np.concatenate([a, alpha])
@@ -146,7 +134,7 @@ def task_direction(
 
 
 def _wall_stiffness(scenario: Scenario) -> float:
-    """Of the leaf, or of a wall and the tool's ball in series [N/m]; 0 for anything else."""
+    """Return that of the leaf, or of wall and tool ball in series; else 0."""
     if scenario.leaf is not None:
         return float(scenario.leaf.stiffness)
     wall = scenario.surroundings
@@ -156,15 +144,16 @@ def _wall_stiffness(scenario: Scenario) -> float:
     return float(pairs[:, STIFFNESS].sum())
 
 
-def _device(scenario: Scenario, moved_B: Array, n: Array) -> tuple[float, float]:
-    """Mass [kg] and damping [N s/m] of the device along n (6,), without the hand's mass."""
+def _device_mass_and_damping(
+    scenario: Scenario, displacement_B: Array, n: Array
+) -> tuple[float, float]:
     hand = scenario.operator.hand
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    start[4:] += moved_B
+    start[4:] += displacement_B
     device = scenario.master.device(hand.mass, hand.inertia)
     q = device.inverse_kinematics(start)
     J, M = device.jacobian(q), device.mass_matrix(q)
-    rate = np.linalg.solve(M, J.T @ n)  # of the joints, for a unit push
+    rate = np.linalg.solve(M, J.T @ n)  # of the joints, for a unit force
     mobility = n @ J @ rate
     damping = rate @ device.damping_matrix(q) @ rate / mobility**2
     return float(1 / mobility - hand.mass), float(damping)

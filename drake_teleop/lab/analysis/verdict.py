@@ -1,4 +1,4 @@
-"""What the figures of `drake-teleop analyze` say, in words."""
+"""Verdict of `drake-teleop analyze`: its figures in short sentences."""
 
 from __future__ import annotations
 
@@ -8,90 +8,90 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """The figures in words: short sentences, each of which can be read alone."""
-    said = []
+    """Return the figures as short sentences, each understandable alone."""
+    sentences = []
     if figures["method"] != "none":
-        said += [
+        sentences += [
             f"The method {figures['method']} is not linear.",
-            "All that follows is about the station without it.",
+            "The analysis is for the station without this method.",
         ]
     if "is not analysed" in figures["wall_is"]:
-        said.append(f"The wall is {figures['wall_is']}.")
-    said += [_rest(point, figures["grip"]) for point in figures["diagram"]]
+        sentences.append(f"The wall is {figures['wall_is']}.")
+    sentences += [_stability_sentence(point, figures["grip"]) for point in figures["diagram"]]
     for row in figures["margins"]:
         if row["grip"] == figures["grip"] and row["wall_N_per_m"] == figures["wall_N_per_m"]:
-            said += _bears(row, figures["delay_s"])
+            sentences += _margin_sentences(row, figures["delay_s"])
     worst = max(figures["two_port"]["sampled"].values())
     if worst > 0.1:
-        said += [
-            f"Along {figures['direction']} it is not one axis: a push turns hand and tool.",
+        sentences += [
+            f"Along {figures['direction']} it is not one axis: contact rotates hand and tool.",
             f"Its two-port differs from one axis by up to {100 * worst:.2g} % below 30 Hz.",
-            "Margins and maps are those of one axis, and rough here.",
+            "Margins and maps assume one axis and are approximate here.",
         ]
-    return said + _walls(figures) + _transparency(figures)
+    return sentences + _wall_sentences(figures) + _transparency_sentences(figures)
 
 
-def _rest(point: dict[str, Any], grip: str) -> str:
-    pace, hertz = point["decay_1_per_s"], point["frequency_Hz"]
-    if pace is None:
+def _stability_sentence(point: dict[str, Any], grip: str) -> str:
+    decay, hertz = point["decay_1_per_s"], point["frequency_Hz"]
+    if decay is None:
         stable = "stable" if point["stable"] else "unstable"
         return f"In the state '{point['point']}' one axis of the station is {stable}."
     state = f"In the state '{point['point']}', {grip} grip, it is"
     motion = f"at {hertz:.3g} Hz" if hertz > 0.01 else "without oscillation"
     if point["stable"]:
-        return f"{state} stable: motion halves every {1e3 * np.log(2) / pace:.3g} ms, {motion}."
-    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / pace:.3g} ms, {motion}."
+        return f"{state} stable: motion halves every {1e3 * np.log(2) / decay:.3g} ms, {motion}."
+    return f"{state} unstable: it doubles every {-1e3 * np.log(2) / decay:.3g} ms, {motion}."
 
 
-def _bears(row: dict[str, Any], delay: float) -> list[str]:
-    wall = f"a wall of {_stiffness(row['wall_N_per_m'])}"
+def _margin_sentences(row: dict[str, Any], delay: float) -> list[str]:
+    wall = f"a wall of {_stiffness_text(row['wall_N_per_m'])}"
     if not row["stable"]:
-        return [f"Before {wall} it is unstable with that grip."]
-    spare = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
-    longest = "any round trip" if spare is None else f"{1e3 * spare:.3g} ms more round trip"
+        return [f"At {wall} it is unstable with this grip."]
+    reserve = None if row["round_trip_s"] is None else row["round_trip_s"] - 2 * delay
+    longest = "any round trip" if reserve is None else f"{1e3 * reserve:.3g} ms more round trip"
     more = "any gain" if row["gain"] is None else f"{row['gain']:.3g} times its gain"
-    return [f"Before {wall} it stays stable with {longest}, or with {more}."]
+    return [f"At {wall} it stays stable with {longest}, or with {more}."]
 
 
-def _walls(figures: dict[str, Any]) -> list[str]:
+def _wall_sentences(figures: dict[str, Any]) -> list[str]:
     bounded, absolute = figures["bounded"], figures["absolute"]
-    each = ", ".join(f"{grip} {_stiffness(K)}" for grip, K in bounded["each"].items())
-    every = _stiffness(bounded["grips"])
-    said = [
+    each = ", ".join(f"{grip} {_stiffness_text(K)}" for grip, K in bounded["each"].items())
+    every = _stiffness_text(bounded["grips"])
+    sentences = [
         f"The stiffest stable wall depends on the grip: {each}.",
-        f"For every hand from the lightest to the firmest grip it is {every}.",
-        "These limits are without Coulomb friction, which only takes energy.",
+        f"For all hands between the lightest and the firmest grip it is {every}.",
+        "These limits exclude Coulomb friction, which dissipates energy.",
     ]
     if absolute["absolutely_stable"]:
         return [
-            *said,
+            *sentences,
             "It is absolutely stable: no passive hand and environment make it oscillate.",
         ]
     lacking = absolute["lacking_damping_Ns_per_m"]
     remedy = "No damping" if lacking is None else f"{lacking:.3g} N s/m more damping"
     return [
-        *said,
+        *sentences,
         "It is not absolutely stable: with some passive hand and environment it would oscillate.",
         f"{remedy} of the device would prevent that.",
-        "Position-force stations behind a servo hardly ever are absolutely stable.",
-        "For hands and walls that there are, the limits above count.",
+        "Position-force stations with a servo are rarely absolutely stable.",
+        "For realistic hands and walls, the limits above apply.",
     ]
 
 
-def _transparency(figures: dict[str, Any]) -> list[str]:
+def _transparency_sentences(figures: dict[str, Any]) -> list[str]:
     free, wall = figures["transparency"]["free"], figures["transparency"]["wall"]
     felt, ideal = wall["felt"]["stiffness"], wall["ideal"]["stiffness"]
     sigma = f"σ = {figures['axis']['sigma']:g}"
     return [
         f"In free motion the hand feels {1e3 * free['felt']['mass']:.3g} g.",
-        f"With device and {sigma} alone it would be {1e3 * free['ideal']['mass']:.3g} g.",
-        f"Of a wall that should be {ideal:.3g} N/m the hand feels {felt:.3g} N/m.",
-        f"A human could not tell it from the ideal one up to {wall['unnoticed_to_Hz']:.2g} Hz.",
+        f"The ideal for device and {sigma} is {1e3 * free['ideal']['mass']:.3g} g.",
+        f"At the wall the hand feels {felt:.3g} N/m; the ideal is {ideal:.3g} N/m.",
+        f"A human cannot distinguish it from the ideal up to {wall['unnoticed_to_Hz']:.2g} Hz.",
         f"The slave follows up to {figures['transparency']['tracking_bandwidth_Hz']:.3g} Hz.",
     ]
 
 
-def _stiffness(value: float | None) -> str:
+def _stiffness_text(value: float | None) -> str:
     if value == 0:
         return "none"
     return "any stiffness" if value is None else f"{value / 1e3:.3g} kN/m"

@@ -1,27 +1,22 @@
-"""`drake-teleop compare-passivity`: every method that keeps a station passive, over every network.
+"""`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies, with the same channel:
-
-* The whole 6-DoF station presses on a leaf (`delayed_contact`), for each method, network and leaf.
-* In one degree of freedom the hand lets go while it presses, and taps (`hands`).
-* There too: each method's longest round trip (`one_dof`), for walls of three stiffnesses.
-
-`summary.json` holds
+Three studies use the same channel: the whole station presses on leaves (`delayed_contact`); in one
+degree of freedom the hand lets go and taps (`release_and_taps`); there, the longest stable round
+trip for walls of three stiffnesses (`one_dof`). `summary.json` contains
 
 ========= ======================================================================================
-decision  list: method, network, verdict (`decision`); felt_N, and pressed_N that should be,
-          before each leaf; leaked_J: all of it null or empty if unstable
-station   list of runs: method, network, leaf, and the figures of `one_dof.Figures`, the energy
-          between hand and actual motion; pressed_force: what should be felt [N]; felt_share of it;
-          left_behind [m]; leaked [J], these three never negative. A run that is not at rest in its
-          hold ends there (left_behind and drift are null); `error` says why one ended earlier (its
-          other figures are then null)
-hands     list: method, network, and the figures of `hands.Hands`
-one_dof   list: method, wall_N_per_m, jitter, loss, longest_s: the longest round trip of the grid up
-          to which every one was stable (0: none was), and grid_s, the round trips tried
-covering  list: sigma, round_trip_s, wall_N_per_m, injected_J: energy that a loop without a method
-          has created in one run; damping_Ns_per_m: what the device needs so that it creates none
-networks, methods, scenario, seed  as asked for
+decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
+          leaked_J: all of it null or empty if unstable
+station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
+          hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
+          left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
+          (left_behind and drift are null); `error` says why a run ended early (others are null)
+hands     list: method, network, fields of `release_and_taps.ReleaseAndTaps`
+one_dof   list: method, wall_N_per_m, jitter, loss; longest_s, up to which all round trips of
+          grid_s were stable (0: none)
+covering  list: sigma, round_trip_s, wall_N_per_m; injected_J, energy created in one run without
+          a method; damping_Ns_per_m of the device that prevents it
+networks, methods, scenario, seed  as requested
 ========= ======================================================================================
 """
 
@@ -40,7 +35,6 @@ from pydrake.systems.framework import Diagram
 from drake_teleop.common.errors import DrakeTeleopError, meant
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.common.writing import make_folder, output_folder, write_json, write_table
-from drake_teleop.lab.comparison.active_elements import covering_damping
 from drake_teleop.lab.comparison.decision import decide
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAVES,
@@ -48,8 +42,16 @@ from drake_teleop.lab.comparison.delayed_contact import (
     station_figures,
     vertical_traces,
 )
-from drake_teleop.lab.comparison.hands import hands
-from drake_teleop.lab.comparison.one_dof import ACTUAL, Figures, OneDof, Task, figures, run_one_dof
+from drake_teleop.lab.comparison.one_dof import (
+    ACTUAL,
+    Figures,
+    OneDof,
+    Task,
+    covering_damping,
+    figures,
+    run_one_dof,
+)
+from drake_teleop.lab.comparison.release_and_taps import simulate_release_and_taps
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
@@ -60,22 +62,22 @@ from drake_teleop.station.simulation import MakeSimulator, advance, read_log
 from drake_teleop.station.station import MakeTeleopStation
 
 NETWORKS = ("lan", "wan", "internet", "geostationary", "lunar")
-#: Round trips that are tried in one degree of freedom [s].
+#: Round trips of the study in one degree of freedom [s].
 ROUND_TRIPS = (
     *(0.002, 0.005, 0.01, 0.015, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0),
 )
 WALLS = (500.0, 5100.0, 20000.0)  #: N/m
 IMPAIRMENTS = ((0.0, 0.0), (0.5, 0.3))
-"""(jitter, loss) of the networks that are tried in one degree of freedom."""
+"""(jitter, loss) of the networks of the study in one degree of freedom."""
 SIGMAS = (0.0, 1.0)
-_COVERED = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
-#: Of the station: a quarter of the shipped scenarios' for the sensor, half for the rest.
+_COVERING_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
+#: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
-#: s; events cut it. One of their period would often end a rounding before them: a step of its own.
-_LONGEST_STEP = 2e-3
-#: m/s, at which the leaf's friction is complete: Drake's own, as of all other surroundings. At the
-#: leaf's tenth of it a tip that rests takes 9,000 to 16,000 steps a second instead of 1,500.
-_SLIP = 1e-3
+#: s; longer than the events' period, to avoid extra steps of one rounding error before them.
+_MAX_STEP = 2e-3
+#: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
+#: needs 9,000 to 16,000 steps per second instead of 1,500.
+_SLIP_SPEED = 1e-3
 
 
 def compare_command(
@@ -89,31 +91,25 @@ def compare_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Compares the methods; writes summary.json, runs.parquet, report.html and its pictures.
+    """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        out: the folder.
-        networks: names of presets.
-        methods: names of methods.
-        scenario: whose station it is, a shipped one or a YAML file: slave, master, sensor, scales,
-            grip; not its rates, its integrator, nor what it touches.
+        networks, methods: by name.
+        scenario: a shipped one or a YAML file; its rates, integrator and environment are not used.
         seed: of sensor and networks.
-        jobs: processes at once; -1: one for each core.
+        jobs: number of processes; -1: one for each core.
         quiet: no progress bars and no tables.
-        progress: False for no progress bars alone.
+        progress: False hides only the progress bars.
 
     Returns:
         The summary, see the top of this module.
-
-    Raises:
-        DrakeTeleopError: for an unknown method or network.
     """
-    _check("network", networks, tuple(PRESETS))
-    _check("method", methods, METHODS)
-    make_folder(out)  # before the work: a bad path costs no time
+    _check_names("network", networks, tuple(PRESETS))
+    _check_names("method", methods, METHODS)
+    make_folder(out)  # before the work, so that a bad path fails early
     with show_progress(progress and not quiet) as stage:
         limits = _one_dof_study(methods, seed, jobs, stage)
-        let_go = _hands_study(networks, methods, seed, jobs, stage)
+        released = _hands_study(networks, methods, seed, jobs, stage)
         runs, traces = _station_study(scenario, networks, methods, seed, jobs, stage)
         covering = _covering_study(stage)
     summary = {
@@ -122,7 +118,7 @@ def compare_command(
         "scenario": str(scenario),
         "seed": seed,
         "station": runs,
-        "hands": let_go,
+        "hands": released,
         "one_dof": limits,
         "covering": covering,
     }
@@ -153,7 +149,7 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """The longest of `ROUND_TRIPS` [s] up to which every run is stable; 0 if none is."""
+    """Return the longest of `ROUND_TRIPS` [s] up to which every run is stable, or 0."""
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -166,11 +162,10 @@ def longest_round_trip(
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """The station of a scenario as the comparison has it: with rates and steps of its own, and
-    nothing to touch yet."""
+    """Return the scenario with the comparison's rates and steps, without environment."""
     return replace(
         LoadScenario(scenario).without_environment(),
-        simulation=Simulation(seed=seed, max_step=_LONGEST_STEP),
+        simulation=Simulation(seed=seed, max_step=_MAX_STEP),
         rates=_RATES,
         contact_detection=None,
     )
@@ -179,12 +174,9 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """One run of the whole station: its row of the table, and what a picture shows of it.
+    """Run the whole station once; return its row of the table and the traces of a picture.
 
-    Args:
-        scenario: rates, sensor, scales and grip.
-        method, network, leaf: by name.
-        estimate: (16,) of the load.
+    `estimate` is (16,) of the load.
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
@@ -192,38 +184,38 @@ def station_run(
     setup, task = delayed_contact(
         scenario, Channel(network=network), PassivityConfig(method=method), leaf
     )
-    setup = replace(setup, sheet_spring__slip=_SLIP)
+    setup = replace(setup, sheet_spring__slip=_SLIP_SPEED)
     try:
         station = MakeTeleopStation(setup, load_estimate=estimate)
-        result, found = _as_far_as_it_holds(station, setup, task)
+        result, found = _run_to_end_or_hold(station, setup, task)
     except DrakeTeleopError as error:
         return row | dict.fromkeys(names) | {"stable": False, "error": str(error)}, {}
     shown = vertical_traces(result, setup)
     held = (shown["t"] >= task.release - task.judged) & (shown["t"] < task.release)
-    own = {
+    additional = {
         "pressed_force": abs(float(shown["pressed"][held].mean())),
         "felt_share": max(1 + found.force_error, 0.0),
         "left_behind": abs(found.drift),
         "leaked": max(-found.least_energy, 0.0),
     }
-    return row | _plain(dataclasses.asdict(found) | own) | {"error": None}, shown
+    return row | _finite_or_none(dataclasses.asdict(found) | additional) | {"error": None}, shown
 
 
-def _as_far_as_it_holds(
+def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, Figures]:
-    """The run and its figures; to the end of the hold alone if it is not at rest there."""
+    """Return run and figures; end it after the hold if it is not at rest there."""
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
     hold = dataclasses.replace(task, end=task.release)
     for part in (hold, task):
-        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # to the event's own instant
+        advance(simulator, 1e-3 * round(1e3 * (settle + part.end)))  # exactly to the event
         result = read_log(simulator, settle)
         found = station_figures(result, scenario, part)
         if not found.stable:
             break
-    # After a hold that is not at rest nobody looks what is left behind.
+    # Without rest in the hold the drift is not defined.
     return result, found if part is task else dataclasses.replace(found, drift=float("nan"))
 
 
@@ -231,14 +223,14 @@ def _one_dof_study(
     methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(methods, WALLS, IMPAIRMENTS))
-    # What is compiled here, processes side by side need not compile each for itself.
+    # Compile here once, so that the parallel processes read the cache.
     longest_round_trip(methods[0], OneDof(), 0.0, 0.0, [seed])
     for method in methods:
         steps_of(method)
     seeds = range(seed, seed + 2)
-    found = _each(
+    found = _run_parallel(
         longest_round_trip,
-        [(m, OneDof(wall_stiffness=wall), *how, seeds) for m, wall, how in cases],
+        [(m, OneDof(wall_stiffness=wall), *impairment, seeds) for m, wall, impairment in cases],
         jobs,
         stage("One degree of freedom"),
     )
@@ -259,8 +251,8 @@ def _hands_study(
     networks: Sequence[str], methods: Sequence[str], seed: int, jobs: int, stage: Stage
 ) -> list[dict[str, Any]]:
     cases = list(itertools.product(networks, methods))
-    found = _each(
-        hands,
+    found = _run_parallel(
+        simulate_release_and_taps,
         [(method, network, seed) for network, method in cases],
         jobs,
         stage("Let go, and taps"),
@@ -283,10 +275,10 @@ def _station_study(
 ) -> tuple[list[dict[str, Any]], dict[tuple[str, str], dict[str, NDArray[np.float64]]]]:
     base = station_base(scenario, seed)
     estimate = identified_load(base, stage).estimate
-    # The longest runs first, so that no process is left with one at the end.
+    # Longest runs first, for an even load of the processes.
     slowest = sorted(networks, key=lambda name: -PRESETS[name].delay)
     cases = list(itertools.product(slowest, LEAVES, methods))
-    results = _each(
+    results = _run_parallel(
         station_run,
         [(base, method, network, leaf, estimate) for network, leaf, method in cases],
         jobs,
@@ -307,8 +299,8 @@ def _station_study(
 
 
 def _covering_study(stage: Stage) -> list[dict[str, Any]]:
-    progress, rows = stage("What the elimination puts in"), []
-    for done, (sigma, round_trip, wall) in enumerate(_COVERED):
+    progress, rows = stage("Energy added by the elimination"), []
+    for done, (sigma, round_trip, wall) in enumerate(_COVERING_CASES):
         model = OneDof(sigma=sigma, wall_stiffness=wall)
         run = run_one_dof(model, PassivityConfig(), NetworkConfig(delay=round_trip / 2))
         rows.append(
@@ -320,12 +312,13 @@ def _covering_study(stage: Stage) -> list[dict[str, Any]]:
                 "damping_Ns_per_m": covering_damping(model, round_trip),
             }
         )
-        progress((done + 1) / len(_COVERED))
+        progress((done + 1) / len(_COVERING_CASES))
     return rows
 
 
-def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any) -> list[Any]:
-    """The function's result for each case, in order, in several processes."""
+def _run_parallel(
+    function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any
+) -> list[Any]:
     from joblib import Parallel, delayed
 
     results = []
@@ -336,8 +329,8 @@ def _each(function: Any, cases: list[tuple[Any, ...]], jobs: int, progress: Any)
     return results
 
 
-def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-    for name in wanted:
+def _check_names(what: str, requested: Sequence[str], known: Sequence[str]) -> None:
+    for name in requested:
         if name not in known:
             raise DrakeTeleopError(
                 f"there is no {what} '{name}'",
@@ -346,7 +339,7 @@ def _check(what: str, wanted: Sequence[str], known: Sequence[str]) -> None:
             )
 
 
-def _plain(figures: dict[str, Any]) -> dict[str, Any]:
+def _finite_or_none(figures: dict[str, Any]) -> dict[str, Any]:
     return {
         name: None if isinstance(value, float) and not np.isfinite(value) else value
         for name, value in figures.items()

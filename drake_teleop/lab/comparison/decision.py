@@ -1,13 +1,12 @@
-"""Which method for which network, in a word: a cell of the decision table for each.
+"""Decision table: one verdict for each method and network.
 
-The first of these that is so, of the whole station before all leaves, and for energy of the hands
-(`hands`) as well::
+The first that applies, of the whole station on all leaves (energy: also of `release_and_taps`)::
 
     unstable      it does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact
-    leaks         more than 1 mJ came out between hand and actual motion that had not gone in and
-                  was not stored at the start
-    holds         none of it
+    leaks         more than 1 mJ came out between hand and actual motion, beyond the energy put in
+                  and stored at the start
+    holds         otherwise
 """
 
 from __future__ import annotations
@@ -18,30 +17,23 @@ from typing import Any
 
 from drake_teleop.lab.comparison.one_dof import TIP
 
-UNSTABLE, BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
-FAR, LEAST = 5e-3, 1e-3  #: m; J
+UNSTABLE, LEFT_BEHIND, LEAKS, HOLDS = "unstable", "left behind", "leaks", "holds"
+MAX_DRIFT_M, MIN_LEAK_J = 5e-3, 1e-3  #: m; J
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What became of one method over one network.
-
-    Args:
-        verdict: one of the four words.
-        forces: for each leaf, on average while holding it: on the hand, and the scaled force of the
-            contact [N]; none if unstable.
-        unrest: for each leaf, in words, how the hold is not at rest; none if it is before all.
-        leaked: the most that came out in any run [J]; None if unstable.
-    """
+    """Result of one method over one network."""
 
     verdict: str
+    #: For each leaf, mean in the hold: force on the hand, scaled contact force [N].
     forces: tuple[tuple[float, float], ...] = ()
-    unrest: tuple[str, ...] = ()
-    leaked: float | None = None
+    unrest: tuple[str, ...] = ()  #: for each leaf, motion in the hold; stable: empty
+    leaked: float | None = None  #: largest of all runs [J]; None if unstable
 
     @property
     def words(self) -> str:
-        """The verdict, with how much it leaks."""
+        """Verdict, with the leaked energy."""
         if self.verdict != LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
@@ -49,13 +41,13 @@ class Cell:
 
     @property
     def share(self) -> str:
-        """How much of the contact's force is felt, of the leaf with the least; "" if unstable."""
+        """Felt share of the contact force at the worst leaf; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
 def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """(method, network) -> cell, of the `station` and `hands` of a summary."""
+    """Return (method, network) -> cell from the `station` and `hands` of a summary."""
     return {
         (row["method"], row["network"]): _cell(
             [
@@ -70,18 +62,17 @@ def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
 
 
 def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
-    """Of the runs of the station before its leaves."""
     if not all(run["stable"] for run in runs):
-        return Cell(UNSTABLE, unrest=tuple(map(_unrest, runs)))
+        return Cell(UNSTABLE, unrest=tuple(map(_motion_in_hold, runs)))
     leaked = max(leaked_by_hands, *(run["leaked"] for run in runs))
     forces = tuple((run["felt_force"], run["pressed_force"]) for run in runs)
-    if max(run["left_behind"] for run in runs) > FAR:
-        return Cell(BEHIND, forces, leaked=leaked)
-    return Cell(LEAKS if leaked > LEAST else HOLDS, forces, leaked=leaked)
+    if max(run["left_behind"] for run in runs) > MAX_DRIFT_M:
+        return Cell(LEFT_BEHIND, forces, leaked=leaked)
+    return Cell(LEAKS if leaked > MIN_LEAK_J else HOLDS, forces, leaked=leaked)
 
 
-def _unrest(run: Mapping[str, Any]) -> str:
-    """How a run is not at rest in its hold: by what is larger at the tool's tip."""
+def _motion_in_hold(run: Mapping[str, Any]) -> str:
+    """Return how a run moves in its hold: the larger of both at the tool's tip."""
     if run["stable"]:
         return "at rest"
     if run["hunting"] is None:

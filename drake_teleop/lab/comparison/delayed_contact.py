@@ -1,7 +1,7 @@
-"""One task for every method and network: swing freely, rest, press on the leaf, hold, let go, rest.
+"""Task of the whole station for each method and network: swing, press on a leaf, hold, rest.
 
-The whole 6-DoF station does it; the times follow the network's round trip, so that a station over
-the moon has as many round trips to come to rest as one in a building.
+Its times grow with the network's round trip, so that every station has equally many round trips to
+come to rest.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.plant import NominalSlave
 
-_GAP, _DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; how deep the operator presses
-#: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, which is light enough not to rattle.
+_START_GAP, _PRESS_DEPTH = 0.03, 0.02  # m, between tip and leaf at the start; intended depth
+#: Leaves by name: thickness [m] of a leaf of 120 mm x 50 mm, light enough not to oscillate.
 LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
-def task_over(round_trip: float) -> Task:
-    """The task; a round trip [s] before the press, three of them to hold, two to come to rest."""
+def task_for_round_trip(round_trip: float) -> Task:
+    """Return the task: one round trip [s] before the press, three to hold, two to rest."""
     return Task(
         swing=0.3,
         swung=1.8,
@@ -49,15 +49,8 @@ def task_over(round_trip: float) -> Task:
 def delayed_contact(
     base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
 ) -> tuple[Scenario, Task]:
-    """The scenario of the task.
-
-    Args:
-        base: rates, sensor, scales, grip of the operator.
-        channel: the network.
-        passivity: the method.
-        leaf: one of `LEAVES`.
-    """
-    task = task_over(sum(line.delay for line in channel.lines()))
+    """Return the scenario of the task, from a base with rates, sensor, scales and grip."""
+    task = task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
     swing = Sine(
         t_start=settle + task.swing,
@@ -67,21 +60,23 @@ def delayed_contact(
         translation=[0.005, 0.0, 0.02],
         rotation=[0.0, 0.05, 0.0],
     )
-    reach = [0.0, 0.0, -(_GAP + _DEPTH)]
-    press, back = (
-        MinimumJerk(t_start=settle + start, duration=end - start, translation=way)
-        for start, end, way in (
+    reach = [0.0, 0.0, -(_START_GAP + _PRESS_DEPTH)]
+    press, retreat = (
+        MinimumJerk(t_start=settle + start, duration=end - start, translation=translation)
+        for start, end, translation in (
             (task.press, task.pressed, reach),
             (task.release, task.released, [-x for x in reach]),
         )
     )
     x, y, z = NominalSlave(base.slave).start_tip.tolist()
-    sheet = SheetSpring(position=[x, y, z - _GAP], length=0.12, width=0.05, thickness=LEAVES[leaf])
+    sheet = SheetSpring(
+        position=[x, y, z - _START_GAP], length=0.12, width=0.05, thickness=LEAVES[leaf]
+    )
     return (
         replace(
             base.without_environment(),
             simulation=dataclasses.replace(base.simulation, settle=settle, duration=task.end),
-            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, back]),
+            operator=OperatorConfig(grip=base.operator.grip, intent=[swing, press, retreat]),
             channel=channel,
             passivity=passivity,
             sheet_spring=sheet,
@@ -91,9 +86,9 @@ def delayed_contact(
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
-    """The run in numbers: vertical motion and force, which the task is about, and the turning.
+    """Return the figures of a run: vertical motion and force, and the rotation of the tool.
 
-    Its energy is that between hand and actual motion (`energy_between`).
+    Its energy is `energy_between`.
     """
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
@@ -110,7 +105,7 @@ def station_figures(result: SimulationResult, scenario: Scenario, task: Task) ->
 
 
 def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """What a picture of the task shows: t [s], forces in the master's units [N], energy [J]."""
+    """Return t [s], forces in the master's units [N] and energy [J] for pictures."""
     scaling = scenario.force_scaling
     return {
         "t": result.t,
@@ -121,10 +116,10 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """(N,) that hand and environment have put in, and what the stores held at the start [J].
+    """Return (N,) the energy from hand and environment and the stores' energy at the start [J].
 
-    It never falls below zero if the station is passive between the hand, with the force that is
-    held there, and the slave's actual motion: that of contact and, with sigma > 0, load.
+    It is never negative if the station is passive between the hand, with held force, and the
+    slave's actual motion, where contact and (with sigma > 0) load act.
     """
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales()[:2]):
@@ -135,7 +130,7 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
 def _slave_motion(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) height of So [m] and (N, 3) rotation vector since the start of the log [rad]."""
+    """Return height of So [m] and (N, 3) rotation vector from the start [rad]."""
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
     poses = _poses(arm.table, q)
@@ -145,7 +140,6 @@ def _slave_motion(
 
 @njit(cache=True)
 def _poses(arm, q):
-    """(N, 7) X_WS at each row of q."""
     R, p, poses = np.empty((3, 3)), np.empty(3), np.empty((q.shape[0], 7))
     for k in range(q.shape[0]):
         forward_kinematics(arm, q[k], R, p)

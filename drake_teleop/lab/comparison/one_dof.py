@@ -1,31 +1,9 @@
-"""One degree of freedom of the station (long: its plant, task, figures): thousands of runs.
+"""One degree of freedom of the station: plant, task and figures, for thousands of runs.
 
-Hand and device are one mass on the hand's spring and damper, the slave is a mass behind a position
-servo, the environment a stiff wall. Between them is the station's own channel,
-`drake_teleop.station.channel.channel.channel_step`, with motion along x alone::
-
-    (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
-    m_s a_s = K (x_cmd - x_s) - D v_s + f_w                                  slave and its servo,
-                                                                             K = D k_p, D = m_s k_v
-    f_w = -max(k_e (x_s - x_w) + b_e (v_s - v_w), 0) where x_s > x_w         wall
-    f_e = k_f (gamma f_w - sigma m_t a_s)                                    what is sent back
-
-The channel steps at 1 kHz; in between the forces of its ends are held and the masses take 20 steps
-of integration. The operator moves freely, rests, presses on the wall, holds, lets go and rests,
-or does as he is told; grip, wall and network may change on the way.
-
-Four accounts are kept of what goes into the station between hand and environment, in the master's
-power units, positive inwards [J]. What comes out of a passive one never exceeds what its stores
-held at the start: the hand's account plus any one of the others never falls below -E_0 then::
-
-    hand      -sum f_(k-1) (x_k - x_(k-1))      the held force, exact
-    command    sum w_k (c_k - c_(k-1))          the wrench f_e that is sent, along the command; no
-                                                physical port: its sign depends on the servo's lag
-    motor     -integral k_f gamma f_m dx_s      the servo's force: the next one, less what moves
-                                                and rubs (to half a step of the integration)
-    actual     integral k_f gamma f_w dx_s      the wall's force; exact for a spring
-
-The inertia that sigma leaves in f_e is no part of the environment, so the last two do without it.
+The equations are those of `OneDof`. The station's own `channel_step` connects hand and slave along
+x at 1 kHz. Its forces are held for a period; the masses take 20 integration steps in it. The
+operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a given
+intent.
 """
 
 from __future__ import annotations
@@ -56,18 +34,19 @@ from drake_teleop.station.passivity.packet import PACKET_SIZE
 
 PERIOD = 1e-3  #: s, of the channel
 _SUBSTEPS = 20
-_FRICTION_SPEED = 5e-3  # m/s, below it the device's Coulomb friction fades
-_SLAVES_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
-HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: of the accounts
+_FRICTION_SPEED = 5e-3  # m/s, regularisation of the device's Coulomb friction
+_SLAVE_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
+HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
-_QUIET = 0.5e-3  # m, peak to peak at rest
+_FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
+_MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
 TIP = 0.2  #: m, from the wrist to the tool's tip
-_FREE, _DEPTH = -0.04, 0.02  # m, from the wall: where the operator rests, and how deep he presses
+_REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest, and intended depth
 
 
 @dataclass(frozen=True)
 class Task:
-    """When the operator does what [s]: swings, rests, presses, holds, lets go, rests."""
+    """Times of the operator's task [s]: swing, rest, press, hold, let go, rest."""
 
     swing: float = 0.5
     swung: float = 3.0
@@ -76,23 +55,31 @@ class Task:
     release: float = 11.5
     released: float = 12.5
     end: float = 17.0
-    judged: float = 1.9  #: length of the windows in which the station has to be at rest
+    judged: float = 1.9  #: length of the windows of required rest
 
 
 @dataclass(frozen=True, kw_only=True)
 class OneDof(Axis):
-    """`Axis` with a device that does not damp but rubs, and with what else is not ideal."""
+    """`Axis` with Coulomb friction instead of device damping, and with imperfections.
+
+    The equations of motion are::
+
+        (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
+        m_s a_s = K (x_cmd - x_s) - D v_s + f_w          slave, K = D k_p, D = m_s k_v
+        f_w = -max(k_e (x_s - x_w) + b_e (v_s - v_w), 0) where x_s > x_w         wall
+        f_e = k_f (gamma f_w - sigma m_t a_s)                                    sent back
+    """
 
     device_friction: float = 0.05  #: N, Coulomb
     slave_friction: float = 0.0  #: N, Coulomb, of the arm
     wall_damping: float = 0.0  #: N s/m
-    motor_lag: float = 0.0  #: s, time constant of the motor's force
+    motor_lag: float = 0.0  #: s, time constant of the motor force
     master_resolution: float = 0.0  #: m, of the encoder; 0: exact
     slave_resolution: float = 0.0  #: m, likewise
-    wrench_noise: float = 0.0  #: N, standard deviation of what the wrist measures
-    believed_stiffness: float = 1.0  #: what the method is told of the servo, over what it is
+    wrench_noise: float = 0.0  #: N, standard deviation of the wrist's force
+    believed_stiffness: float = 1.0  #: configured servo stiffness over the true one
     believed_damping: float = 1.0  #: likewise
-    believed_mass: float = 1.0  #: likewise, of the slave
+    believed_mass: float = 1.0  #: configured slave mass over the true one
 
 
 REFERENCE = OneDof(
@@ -102,83 +89,61 @@ REFERENCE = OneDof(
     position_gain=58.5,
     velocity_gain=234.0,
 )
-"""What the figures of docs/delay.md, notebook 02 and benchmarks/README.md are of.
+"""Model of the figures in docs/delay.md, notebook 02 and benchmarks/README.md.
 
-Not the station's medium grip, and not its servo: this one is critically damped and softer, 207
-instead of 502 kN/m, -3 dB at 12 instead of 14 Hz, 17 instead of 13 ms late.
+Its servo is softer than the station's and critically damped: 207 instead of 502 kN/m, -3 dB at 12
+instead of 14 Hz, delay 17 instead of 13 ms.
 """
 
 
 @dataclass(frozen=True)
 class OneDofRun:
-    """What happened; arrays (N,), one entry for each period.
+    """Time series (N,) of a run, one entry for each period.
 
-    Args:
-        t: time [s].
-        master, slave: positions [m].
-        command: position that the slave was told [m].
-        felt: force on the hand [N].
-        wall: force of the wall on the slave [N].
-        energy: (N, 2) that hand and slave have put into the channel [J].
-        silent: (N, 2) for how long hand and slave have heard nothing [s].
-        accounts: (N, 4) what has gone in at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL` motion so far
-            [J], see the module.
-        start_energy: E_0, what the method says that its stores hold at the start [J].
+    `accounts` (N, 4) is the energy that entered the station so far, in the master's power units
+    [J]. In a passive station the hand's plus any other one never falls below -start_energy::
+
+        HAND      -sum f_(k-1) (x_k - x_(k-1))   held force, exact
+        COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port,
+                                                 its sign depends on the servo's lag
+        MOTOR     -integral k_f gamma f_m dx_s   servo's force, to half an integration step
+        ACTUAL     integral k_f gamma f_w dx_s   wall's force, exact for a spring
+
+    MOTOR and ACTUAL exclude the inertia that sigma leaves in f_e: it is no part of the environment.
     """
 
-    t: NDArray[np.float64]
-    master: NDArray[np.float64]
-    slave: NDArray[np.float64]
-    command: NDArray[np.float64]
-    felt: NDArray[np.float64]
-    wall: NDArray[np.float64]
-    energy: NDArray[np.float64]
-    silent: NDArray[np.float64]
-    accounts: NDArray[np.float64]
-    start_energy: float
+    t: NDArray[np.float64]  #: s
+    master: NDArray[np.float64]  #: m
+    slave: NDArray[np.float64]  #: m
+    command: NDArray[np.float64]  #: m, received by the slave
+    felt: NDArray[np.float64]  #: N, on the hand
+    wall: NDArray[np.float64]  #: N, on the slave
+    energy: NDArray[np.float64]  #: (N, 2) from hand and slave into the channel [J]
+    silent: NDArray[np.float64]  #: (N, 2) time without packets of hand and slave [s]
+    accounts: NDArray[np.float64]  #: (N, 4) J
+    start_energy: float  #: E_0 of the method's stores [J]
 
     def least(self, place: int) -> float:
-        """The least that hand and one other place (`HAND`: the hand alone) have put in, and E_0.
-
-        Not negative if the station is passive between the two [J].
-        """
+        """Return the least of E_0 plus the energy from hand and one other place (or hand alone)."""
         other = 0.0 if place == HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
 
 
 @dataclass(frozen=True)
 class Figures:
-    """A run in numbers.
+    """Figures of a run."""
 
-    Args:
-        stable: whether it comes to rest, holding the wall and after it: within 0.5 mm peak to peak
-            about a parabola at the end of either. Of the whole station the orientation has to be at
-            rest as well, within what moves the tool's tip by as much.
-        hunting: that peak to peak, the larger of the two [m].
-        turning: likewise of the orientation [rad]; 0 in one degree of freedom.
-        felt_force: on the hand while holding, mean [N].
-        chatter: its standard deviation [N].
-        force_error: of the force felt against the scaled force of the wall, while holding [1]. It
-            says nothing of how hard the slave presses.
-        drift: of the slave against the master, 2 s after contact [m].
-        free_force: felt in free motion, rms [N].
-        rise_delay: from when the scaled force of the wall has reached half of the steady force
-            felt to when the force felt has, so not negative [s]; NaN where it had before, by a
-            drag that hides the rise, or where one of them never does.
-        least_energy: the least that both ends together have put into the channel [J]; negative if
-            it gave out more than it got.
-    """
-
+    #: At rest in hold and end: within 0.5 mm about a parabola, also at the tip of a rotating tool.
     stable: bool
-    hunting: float
-    turning: float
-    felt_force: float
-    chatter: float
-    force_error: float
-    drift: float
-    free_force: float
-    rise_delay: float
-    least_energy: float
+    hunting: float  #: this peak to peak, the larger of the two [m]
+    turning: float  #: likewise of the orientation [rad]
+    felt_force: float  #: on the hand in the hold, mean [N]
+    chatter: float  #: its standard deviation [N]
+    force_error: float  #: relative to the scaled contact force, in the hold
+    drift: float  #: slave minus master, 2 s after contact [m]
+    free_force: float  #: on the hand in free motion, rms [N]
+    rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
+    least_energy: float  #: least energy from both ends into the channel [J]; negative: active
 
 
 def run_one_dof(
@@ -194,23 +159,18 @@ def run_one_dof(
     wall: NDArray[np.float64] | None = None,
     delays: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
 ) -> OneDofRun:
-    """Simulates one run.
+    """Simulate one run.
 
     Args:
-        model: masses, hand, wall.
         passivity: the method.
-        forward, backward: the network; backward None: as forward.
-        seed, timeout: of the network; of the safe state [s].
-        intent: (N, 2) position [m], velocity [m/s] intended at the periods; default: the task's.
-        grip: (N, 3) mass [kg], damping [N s/m] and stiffness [N/m] of the hand at the periods,
-            zeros where it has let go; default: the model's.
-        wall: (N, 2) position [m] and stiffness [N/m] of the wall at the periods. In between it
-            moves evenly and is as stiff as at their start. Default: the model's, at 0.
-        delays: forward and backward, periods that the packet of each step travels and -1 where it
-            is lost; in the place of the network's, `forward` and `backward` say the rest.
-
-    Raises:
-        DrakeTeleopError: for a network that cannot be.
+        forward, backward: the network; backward default: as forward.
+        timeout: of the safe state [s].
+        intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
+        grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
+            go; default: the model's.
+        wall: (N, 2) position [m], linear in between, and stiffness [N/m]; default: the model's.
+        delays: forward and backward, periods of travel of each packet, -1 if lost; replace those of
+            the network.
     """
     scale = model.force_scale
     passivity = dataclasses.replace(
@@ -222,15 +182,17 @@ def run_one_dof(
     p = methods.parameters(passivity, [scale, scale])
     intent = operators_intent() if intent is None else intent
     start = np.array([1.0, 0.0, 0.0, 0.0, intent[0, 0], 0.0, 0.0])
-    # The block's command is that of the next step, here it is used at once.
+    # The channel's command belongs to the next step; here it is used at once.
     playout = forward.playout + PERIOD if forward.playout > 0 else 0.0
     forward_line = dataclasses.replace(forward, delay=forward.delay + PERIOD, playout=playout)
-    there, back = (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
+    forward_delays, backward_delays = (
+        (None, None) if delays is None else (delays[0] + (delays[0] >= 0), delays[1])
+    )
     lines = [
         network.parameters(line, seed, direction, PERIOD, least=1, delays=travels)
         for line, direction, travels in (
-            (forward_line, network.FORWARD, there),
-            (forward if backward is None else backward, network.BACKWARD, back),
+            (forward_line, network.FORWARD, forward_delays),
+            (forward if backward is None else backward, network.BACKWARD, backward_delays),
         )
     ]
     states = [network.initial_state(line, np.zeros(PACKET_SIZE)) for line in lines]
@@ -242,11 +204,14 @@ def run_one_dof(
         model.tool_mass, model.wall_damping, scale, model.sigma, model.gamma,
         model.master_resolution, model.slave_resolution, model.wrench_noise, seed % 2**53,
     )  # fmt: skip
-    own = (model.hand_mass, model.hand_damping, model.hand_stiffness), (0.0, model.wall_stiffness)
-    given = intent, own[0] if grip is None else grip, own[1] if wall is None else wall
-    course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in given]
-    # These methods know the force of the slave's motor, which is therefore held over a period; for
-    # the others the command is interpolated over it.
+    defaults = (
+        (model.hand_mass, model.hand_damping, model.hand_stiffness),
+        (0.0, model.wall_stiffness),
+    )
+    inputs = intent, defaults[0] if grip is None else grip, defaults[1] if wall is None else wall
+    course = [np.broadcast_to(part, (len(intent), np.shape(part)[-1])) for part in inputs]
+    # These methods use the motor's force, which is held over a period; the others interpolate the
+    # command over it.
     held = passivity.method in AT_THE_MOTOR and not model.ideal_servo
     rows = _simulate(
         methods.steps_of(passivity.method), tuple(map(float, numbers)), held, p, *lines, *states,
@@ -259,14 +224,14 @@ def run_one_dof(
 
 
 def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
-    """(N, 2) position [m] and velocity [m/s] that the operator intends; the wall is at 0."""
+    """Return (N, 2) intended position [m] and velocity [m/s]; the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
-    x = np.full_like(t, _FREE)
+    x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
     x += 0.03 * fade * np.sin(2 * np.pi * 1.5 * (t - task.swing))
     pressing = _ramp(t, task.press, task.pressed - task.press)
     releasing = _ramp(t, task.release, task.released - task.release)
-    x += (_DEPTH - _FREE) * (pressing - releasing)
+    x += (_DEPTH - _REST_POSITION) * (pressing - releasing)
     return np.stack([x, np.gradient(x, PERIOD)], axis=1)
 
 
@@ -276,7 +241,7 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
 
 
 def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    """The run in numbers."""
+    """Return the figures of a run."""
     return figures_of(
         t=run.t,
         master=run.master,
@@ -299,16 +264,14 @@ def figures_of(
     task: Task,
     turned: NDArray[np.float64] | None = None,
 ) -> Figures:
-    """A run of the task in numbers; all arrays (N,), equidistant.
+    """Return the figures of a run of the task; all arrays (N,), equidistant.
 
     Args:
-        t: time [s].
-        master, slave: positions in the direction in which is pressed [m].
+        master, slave: positions in the direction of pressing [m].
         felt: force on the hand [N].
         pressed: force of the environment, scaled to the hand [N].
-        energy: that both ends have put into the channel [J].
-        task: when what happened.
-        turned: (N, 3) rotation vector of the slave's tool since the start [rad], if it can turn.
+        energy: from both ends into the channel [J].
+        turned: (N, 3) rotation vector of the slave's tool [rad], if it can rotate.
     """
     dt = float(t[1] - t[0])
 
@@ -317,14 +280,14 @@ def figures_of(
 
     hold = window(task.release - task.judged, task.release)
     rest = window(task.end - task.judged, task.end)
-    hunting = max(_hunting(x[part]) for x in (master, slave) for part in (hold, rest))
+    hunting = max(_peak_to_peak(x[part]) for x in (master, slave) for part in (hold, rest))
     angles = () if turned is None else turned.T
-    turning = max((_hunting(x[part]) for x in angles for part in (hold, rest)), default=0.0)
+    turning = max((_peak_to_peak(x[part]) for x in angles for part in (hold, rest)), default=0.0)
     steady, goal = float(felt[hold].mean()), float(pressed[hold].mean())
     after = min(round((task.released + 2.0) / dt), len(t) - 1)
     start = round(task.press / dt)
     return Figures(
-        stable=bool(hunting < _QUIET and turning < _QUIET / TIP),
+        stable=bool(hunting < _MAX_MOTION_AT_REST and turning < _MAX_MOTION_AT_REST / TIP),
         hunting=hunting,
         turning=turning,
         felt_force=abs(steady),
@@ -337,8 +300,26 @@ def figures_of(
     )
 
 
-def _hunting(x: NDArray[np.float64]) -> float:
-    """Peak to peak about the parabola that fits best; infinite if it is not finite."""
+def covering_damping(model: OneDof, round_trip: float) -> float:
+    """Return the least device damping that makes it passive with delay and slave [N s/m] (T43)."""
+    return max(0.0, -float(_resistance(model, round_trip).min()))
+
+
+def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
+    s = 1j * _FREQUENCIES
+    D, K = model.servo_damping, model.servo_stiffness
+    slave = model.slave_mass * s**2 + D * s + K + model.wall_stiffness
+    closed_loop = 1.0 if model.ideal_servo else K / slave
+    # The command's interpolation and the held force add 1.5 periods.
+    delay_factor = np.exp(-s * (round_trip + 1.5 * PERIOD))
+    contact = model.gamma * model.wall_stiffness / s
+    inertia = model.sigma * model.tool_mass * s
+    felt = model.force_scale * (contact + inertia) * closed_loop * delay_factor
+    return np.asarray(felt.real)
+
+
+def _peak_to_peak(x: NDArray[np.float64]) -> float:
+    """Return the peak to peak about the best parabola; infinite if not finite."""
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -346,17 +327,13 @@ def _hunting(x: NDArray[np.float64]) -> float:
 
 
 def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
-    """Samples from `pressed` to `felt`, both beyond half of `steady`; NaN if that tells nothing.
-
-    One level for both: a method that shows half of the force would otherwise seem to show it before
-    it is there.
-    """
+    """Return the samples from `pressed` to `felt`, both beyond half of `steady`, or NaN."""
     level, sign = 0.5 * abs(steady), np.sign(steady)
-    there, shown = pressed * sign > level, felt * sign > level
-    start = int(np.argmax(there))
-    if not there.any() or shown[max(start - 1, 0)] or not shown[start:].any():
+    exceeds, displayed = pressed * sign > level, felt * sign > level
+    start = int(np.argmax(exceeds))
+    if not exceeds.any() or displayed[max(start - 1, 0)] or not displayed[start:].any():
         return float("nan")
-    return float(np.argmax(shown[start:]))
+    return float(np.argmax(displayed[start:]))
 
 
 @njit(cache=True)
@@ -364,7 +341,7 @@ def _simulate(
     steps, model, held, p, forward_line, backward_line, forward, backward, ends, start, timeout,
     course,
 ):  # fmt: skip
-    """(N, 13) rows [master, slave, command, felt, wall, energy (2), silence (2), accounts (4)]."""
+    """Return rows [master, slave, command, felt, wall, energy (2), silence (2), accounts (4)]."""
     device_mass, friction, slave_mass, K, D, ideal, slave_friction, lag = model[:8]
     tool_mass, wall_damping, scale, sigma, gamma = model[8:13]
     master_resolution, slave_resolution, noise, seed = model[13:]
@@ -381,17 +358,17 @@ def _simulate(
         mass, damping, stiffness = device_mass + course[k, 2], course[k, 3], course[k, 4]
         x_w, wall_stiffness, following = course[k, 5], course[k, 6], min(k + 1, len(course) - 1)
         v_w = (course[following, 5] - x_w) / PERIOD
-        push = _push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
+        push = _wall_push(wall_stiffness, wall_damping, x_s - x_w, v_s - v_w)
         wall = -max(push, 0.0)
         wrench[0] = scale * (gamma * wall - sigma * tool_mass * a_s)
         load[0] = -scale * sigma * tool_mass * a_s
         if noise > 0.0:
             wrench[0] += scale * noise * random_normal(np.uint64(seed), k)
         hand[0] = stiffness * (course[k, 0] - x) + damping * (course[k, 1] - v)
-        pose_m[4], pose_s[4] = _read(x, master_resolution), _read(x_s, slave_resolution)
+        pose_m[4], pose_s[4] = _quantise(x, master_resolution), _quantise(x_s, slave_resolution)
         accounts[HAND] -= felt[0] * (x - x_before)
         before, x_before = received[4], x
-        # No literal False: for that the whole channel would be compiled once more.
+        # A literal False would compile the whole channel once more.
         channel_step(
             steps, pose_m, wrench, load, hand, pose_s, np.bool_(False), 0.0, PERIOD, timeout,
             frame, p, forward_line, backward_line, forward, backward, ends, received, ports, felt,
@@ -400,7 +377,7 @@ def _simulate(
         put(rows[k], 0, (x, x_s, command, felt[0], wall, ports[0], ports[2]), 0, 7)
         put(rows[k], 7, ports, 4, 2)
         put(rows[k], 9, accounts, 0, 4)
-        wanted = K * (command - x_s) - D * v_s
+        servo_force = K * (command - x_s) - D * v_s
         for i in range(_SUBSTEPS):
             share = (i + 0.5) / _SUBSTEPS
             x_i = course[k, 0] + share * (course[following, 0] - course[k, 0])
@@ -415,18 +392,18 @@ def _simulate(
                 a_s, v_s = (v_new - v_s) / PERIOD if i == 0 else a_s, v_new
             else:
                 if not held:
-                    wanted = K * (before + share * (command - before) - x_s) - D * v_s
-                motor = motor + dt / lag * (wanted - motor) if lag > dt else wanted
+                    servo_force = K * (before + share * (command - before) - x_s) - D * v_s
+                motor = motor + dt / lag * (servo_force - motor) if lag > dt else servo_force
                 a_s = (motor - max(push, 0.0)) / slave_mass
                 if slave_friction > 0.0:
-                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVES_FRICTION_SPEED)
+                    a_s -= slave_friction / slave_mass * np.tanh(v_s / _SLAVE_FRICTION_SPEED)
                 v_s += dt * a_s
                 x_s += dt * v_s
             beyond = x_s - (x_w + (i + 1.0) / _SUBSTEPS * PERIOD * v_w)
-            push_then, push = push, _push(wall_stiffness, wall_damping, beyond, v_s - v_w)
+            push_then, push = push, _wall_push(wall_stiffness, wall_damping, beyond, v_s - v_w)
             work = -_mean_positive(push_then, push) * (x_s - x_then)
             accounts[ACTUAL] += scale * gamma * work
-            # The speed's mean, with which the work of all forces is the gain of kinetic energy. An
+            # With the mean speed, the work of all forces equals the change of kinetic energy. An
             # ideal servo moves a slave without mass.
             if ideal == 0.0:
                 work = -motor * 0.5 * (v_then + v_s) * dt
@@ -438,20 +415,18 @@ def _simulate(
 
 
 @njit(cache=True)
-def _read(x, resolution):
-    """What an encoder makes of a position."""
+def _quantise(x, resolution):
     return np.round(x / resolution) * resolution if resolution > 0.0 else x
 
 
 @njit(cache=True)
-def _push(stiffness, damping, depth, speed):
-    """What the wall pushes the slave out with, if it is positive [N]."""
+def _wall_push(stiffness, damping, depth, speed):
+    """Return the wall's outward force; negative: no contact."""
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 
 
 @njit(cache=True)
 def _mean_positive(a, b):
-    """The mean of max(., 0) on the straight way from a to b."""
     if a >= 0.0 and b >= 0.0:
         return 0.5 * (a + b)
     if a <= 0.0 and b <= 0.0:

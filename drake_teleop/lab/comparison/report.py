@@ -1,4 +1,4 @@
-"""The report of `drake-teleop compare-passivity`: one page with tables and pictures."""
+"""Report of `drake-teleop compare-passivity`: one page with tables and pictures."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
 from drake_teleop.common.writing import write_picture, write_text
-from drake_teleop.lab.comparison.decision import BEHIND, HOLDS, LEAKS, UNSTABLE, decide
-from drake_teleop.lab.comparison.hands import RATES
+from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
+from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
 
 #: Columns of the station's table: key of the row, heading, factor, decimals.
@@ -31,22 +31,21 @@ COLUMNS = (
     ("leaked", "Leaked [mJ]", 1e3, 1),
 )
 
-#: Of the verdicts: mark, colour of the cell, colour of what stands in it. They differ in lightness
-#: too, and the words say the same.
+#: Verdict -> mark, colour of the cell, colour of the text. The cells also differ in lightness.
 VERDICTS = {
     HOLDS: ("✓", "#CBE4F4", BLACK),
     LEAKS: ("⚠", "#FBEBB8", BLACK),
-    BEHIND: ("↷", "#F0B878", BLACK),
+    LEFT_BEHIND: ("↷", "#F0B878", BLACK),
     UNSTABLE: ("✗", "#565C66", "white"),
 }
 _MARKERS = "os^Dv"  # of the networks
-_MIDDLE: dict[str, Any] = {"ha": "center", "va": "center"}
+_CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
 
 
 def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
-    """Writes report.html and decision, hands, runs, energy and limits as PNG into `out`."""
+    """Write report.html and its PNG pictures into `out`."""
     pictures = {
         "decision": draw_decision(summary),
         "hands": draw_hands(summary),
@@ -69,33 +68,39 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """The figures of one run of the station, as printed; a run that ended early has none."""
+    """Return the figures of one run of the station, as text."""
     return [
-        # Adding 0 to what is rounded takes the sign from -0.
+        # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
         for key, _, factor, decimals in COLUMNS
     ]
 
 
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
-    """What becomes of each method (a row) over each network (a column), in words."""
+    """Draw the verdict of each method (a row) over each network (a column)."""
     methods, networks, table = summary["methods"], summary["networks"], decide(summary)
     with house_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
         axes = figure.subplots()
         for (method, network), cell in table.items():
             x, y = networks.index(network), methods.index(method)
-            mark, colour, ink = VERDICTS[cell.verdict]
+            mark, colour, text_colour = VERDICTS[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
             lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
             lines += cell.unrest
-            up = 0.12 * len(lines)
+            offset = 0.12 * len(lines)
             axes.text(
-                x, y - up, f"{mark} {cell.words}", color=ink, size=9.5, weight="bold", **_MIDDLE
+                x,
+                y - offset,
+                f"{mark} {cell.words}",
+                color=text_colour,
+                size=9.5,
+                weight="bold",
+                **_CENTRED,
             )
             for place, line in enumerate(lines):
-                down = y - up + 0.27 * (place + 1)
-                axes.text(x, down, line, color=ink, size=8.5, **_MIDDLE)
+                line_y = y - offset + 0.27 * (place + 1)
+                axes.text(x, line_y, line, color=text_colour, size=8.5, **_CENTRED)
         axes.set_xlim(-0.5, len(networks) - 0.5)
         axes.set_ylim(len(methods) - 0.5, -0.5)
         names = [f"{name}\n{2e3 * PRESETS[name].delay:g} ms" for name in networks]
@@ -106,17 +111,25 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
         axes.grid(False)
         for side in axes.spines.values():
             side.set_visible(False)
-        figure.suptitle("What becomes of each method over each network", x=0.01, ha="left")
+        figure.suptitle("Verdict of each method over each network", x=0.01, ha="left")
     return figure
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """A hand that lets go and one that taps: a row for each method, a mark for each network."""
+    """Draw letting go and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
-        (f"felt of taps at {RATES[0]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][0]),
-        (f"felt of taps at {RATES[1]:g} Hz [%]", "linear", lambda row: 100 * row["tap_shares"][1]),
+        (
+            f"felt of taps at {TAP_RATES[0]:g} Hz [%]",
+            "linear",
+            lambda row: 100 * row["tap_shares"][0],
+        ),
+        (
+            f"felt of taps at {TAP_RATES[1]:g} Hz [%]",
+            "linear",
+            lambda row: 100 * row["tap_shares"][1],
+        ),
     )
     with house_style():
         figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
@@ -124,7 +137,7 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
         for axes, (title, scale, value) in zip(columns, panels, strict=True):
             for place, network in enumerate(networks):
                 shown = [row for row in rows if row["network"] == network]
-                # Side by side, so that none hides another.
+                # Offsets keep all marks visible.
                 y = [methods.index(row["method"]) + 0.12 * (place - 2) for row in shown]
                 marker, colour = _MARKERS[place % 5], COLOURS[place % len(COLOURS)]
                 x = [max(value(row), 0.0) for row in shown]
@@ -142,34 +155,34 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """What the hand feels over time: a row for each method, a column for each network."""
+    """Draw the displayed force over time: a row for each method, a column for each network."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.plot(shown["t"], shown["pressed"], color=GREY, linewidth=0.8)
         axes.plot(shown["t"], shown["felt"], color=COLOURS[0], linewidth=0.9)
 
-    figure = _grid(summary, traces, draw, "force [N]")
+    figure = _draw_grid(summary, traces, draw, "force [N]")
     figure.suptitle("Felt force (blue) and scaled contact force (grey)", x=0.01, ha="left")
     return figure
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """What hand and environment have put in, with what was stored at the start, over time."""
+    """Draw the energy from hand and environment, with the initial one, over time."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)
         axes.plot(shown["t"], shown["energy"], color=COLOURS[2], linewidth=1.0)
 
-    figure = _grid(summary, traces, draw, "energy [J]")
+    figure = _draw_grid(summary, traces, draw, "energy [J]")
     figure.suptitle(
-        "Energy between hand and actual motion:\nbelow 0 more came out than went in or was stored",
+        "Energy between hand and actual motion:\nbelow 0 the station is active",
         x=0.01,
         ha="left",
     )
     return figure
 
 
-def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
+def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
     methods, networks = summary["methods"], summary["networks"]
     with house_style():
         figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))
@@ -191,7 +204,7 @@ def _grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> F
 
 
 def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """The longest stable round trip of each method: a panel for each wall."""
+    """Draw the longest stable round trip of each method: a panel for each wall."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
     with house_style():
@@ -218,7 +231,7 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """The decision table on the terminal."""
+    """Print the decision table to the terminal."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table

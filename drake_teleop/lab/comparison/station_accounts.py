@@ -1,21 +1,15 @@
-"""Where a station's energy comes from: four accounts of a run, from the signals that it recorded.
+"""Energy balances of a station's run, from its recorded signals.
 
-They are those of one degree of freedom (`lab.comparison.one_dof`), in the same order, for
-translation and rotation apart; in the master's power units, positive inwards [J]. What comes out of
-a passive station never exceeds what its stores held at the start: the hand's account plus any one
-of the others never falls below -E_0 then. The command is no physical port. With sigma > 0 the hand
-feels the load too, which gives back what was put into it: energy that `MOTOR` and `ACTUAL` lack,
-and `load_work` has.
+They are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately, in the
+master's power units, positive inwards [J]. With c = k_f gamma over the kinematic scale::
 
-    HAND      -sum f_(k-1) . dx_k           the held wrench, at every period of the channel: exact
-    COMMAND    sum w_k . dc_k               what the slave sends, along its command: as exact
-    MOTOR     -integral c f_m . dx_s        the motors' torque less the weight, as a wrench at So
-    ACTUAL     integral c f_w . dx_s        the true contact wrench at So
+    HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel: exact
+    COMMAND    sum w_k . dc_k           sent wrench along the command: exact; no physical port
+    MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
+    ACTUAL     integral c f_w . dx_s    true contact wrench at So
 
-with c = k_f gamma over the kinematic scale. The first two are summed up by the running channel
-(signal `ports`). The others are taken from the log's rows: a torque is held, so its work is exact
-if none lies between two rows; that of the contact is exact for a spring, and else of second order
-in the time between rows.
+The channel sums the first two (signal `ports`). The others use the log's rows: a held torque is
+exact if none is between two rows; a contact is exact for a spring, otherwise of second order.
 """
 
 from __future__ import annotations
@@ -36,27 +30,21 @@ from drake_teleop.station.slave.forward_kinematics import pose_into
 
 Array = NDArray[np.float64]
 
-_NEEDED = ("ports", "slave_state", "joint_torque")
+_REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """What has gone into the station at its four places, up to each row.
-
-    Args:
-        result: of a station with a channel. With nothing to touch, the account at the actual
-            motion is zero.
-        scenario: what it was made of; its scales, arm and rates.
+    """Return the energy that entered the station at its four places, up to each row.
 
     Returns:
-        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL` motion, by translation and rotation
-        [J], zero in the first row. Hand and command lack what belongs to the last row's period.
-        The motors' is not a number if the log is slower than the joint control, whose torque may
-        alternate from one period to the next.
+        (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J], zero
+        in the first row. Hand and command lack the last row's period. `MOTOR` is NaN if the log is
+        slower than the joint control.
 
     Raises:
-        DrakeTeleopError: if the result lacks a signal that is needed.
+        DrakeTeleopError: the result lacks a signal.
     """
-    if missing := [name for name in _NEEDED if name not in result]:
+    if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
             f"this result holds no {', '.join(missing)}",
             where="accounts",
@@ -64,7 +52,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
         )
     t, torque = result.t, result["joint_torque"]
     q = np.ascontiguousarray(result["slave_state"][:, : torque.shape[1]])
-    poses, motor = _motors(scenario, q, torque)
+    poses, motor = _motor_wrenches(scenario, q, torque)
     contact = np.zeros_like(motor)
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
@@ -73,28 +61,26 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     power = scenario.force_scaling.force_scale * gamma / _motion_scale(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
-    # A row shows the torque that has acted before it.
-    known = rates.log_hz >= rates.joint_control_hz
-    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if known else np.nan
+    # A row contains the torque before it.
+    has_torques = rates.log_hz >= rates.joint_control_hz
+    accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
     accounts[:, ACTUAL] = power * port_work(contact, poses, "mean")
-    # A row shows what the channel had summed up a period ago.
-    then = t - 1 / rates.hand_hz
+    # A row contains the channel's sum of one period ago.
+    channel_times = t - 1 / rates.hand_hz
     for place, first in ((HAND, 0), (COMMAND, 6)):
         for g in range(2):
-            so_far = np.interp(t, then, result["ports"][:, first + g])
+            so_far = np.interp(t, channel_times, result["ports"][:, first + g])
             accounts[:, place, g] = so_far - so_far[0]
     return accounts
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """What weight and inertia of the slave's load have put in along its actual motion, as felt.
+    """Return the displayed work of weight and inertia of the slave's load along its actual motion.
 
-    It is to `ACTUAL` as the load is to the contact: where the load is felt (sigma > 0), the two
-    together are the environment. Of the true load, with accelerations from one row to the next.
+    With sigma > 0 it belongs to the environment like the contact; `ACTUAL` does not contain it.
 
     Returns:
-        (N, 2) by translation and rotation [J], zero in the first row; never more in all than the
-        load's energy at the start, if both kinematic scales are alike.
+        (N, 2) by translation and rotation [J], zero in the first row.
     """
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
@@ -114,7 +100,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """(2,) E_0, what the method says that its stores hold at the start, by group [J]."""
+    """Return (2,) E_0, the initial energy of the method's stores, by group [J]."""
     scales = _motion_scale(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.parameters(scenario.passivity, list(power), list(scales))
@@ -123,24 +109,24 @@ def start_energy(scenario: Scenario) -> Array:
 
 
 def _motion_scale(scenario: Scenario) -> Array:
-    """(2,) slave over master, of translation and rotation; 1 where motion is scaled to zero."""
+    """Return (2,) slave over master, of translation and rotation; 1 where it is zero."""
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return np.where(scales > 0.0, scales, 1.0)
 
 
-def _motors(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """(N, 7) X_WS; (N, 6) what the motors do beside bearing the weight, as a wrench at So in W.
+def _motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
+    """Return (N, 7) X_WS and (N, 6) the motors' wrench at So in W without the weight.
 
-    Of a redundant arm, what comes nearest: the rest of its torques moves it within itself.
+    For a redundant arm it is the nearest one: other torques only cause null-space motion.
     """
     n = q.shape[1]
-    arm, still = slave_arm(scenario).table, np.zeros(n)
+    arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))
     for k in range(len(q)):
         pose_into(arm, q[k], poses[k])
-        inverse_dynamics(arm, q[k], still, still, weight[k])
+        inverse_dynamics(arm, q[k], zero, zero, weight[k])
         jacobian(arm, q[k], J[k])
-    to_torque, beside = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
-    wrench = np.linalg.solve(to_torque, beside) if n == 6 else np.linalg.pinv(to_torque) @ beside
+    to_torque, excess = J.swapaxes(1, 2), (torque - weight)[:, :, np.newaxis]
+    wrench = np.linalg.solve(to_torque, excess) if n == 6 else np.linalg.pinv(to_torque) @ excess
     return poses, wrench[:, :, 0]

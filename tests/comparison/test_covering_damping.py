@@ -1,4 +1,4 @@
-"""The damping that covers delay: enough, and not more than enough, for the hand in simulation."""
+"""Covering damping is sufficient and necessary for the hand in simulation."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.lab.comparison.active_elements import covering_damping, worst_frequency
-from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, run_one_dof
+from drake_teleop.lab.comparison import one_dof
+from drake_teleop.lab.comparison.one_dof import PERIOD, OneDof, covering_damping, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 
@@ -17,7 +17,7 @@ FIRM = OneDof(hand_stiffness=2e5, hand_damping=500.0, device_friction=0.0)
 
 
 def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping: float) -> float:
-    """What hand and covering damping have put in, over whole periods of a small steady swing [J].
+    """Return the energy from hand and damping over whole periods of a small oscillation [J].
 
     The swing is around a point in the wall, or far from it if there is no wall.
     """
@@ -36,11 +36,12 @@ def work_of_the_hand(model: OneDof, round_trip: float, frequency: float, damping
 @pytest.mark.slow
 @pytest.mark.parametrize("wall", [0.0, 5100.0])
 @pytest.mark.parametrize("round_trip", [0.02, 0.1])
-def test_it_covers_what_delay_puts_in_and_little_more(wall, round_trip):
+def test_covering_damping_compensates_the_energy_of_the_delay(wall, round_trip):
     model = dataclasses.replace(FIRM, wall_stiffness=wall, sigma=1.0)
     damping = covering_damping(model, round_trip)
-    # Before a wall the worst frequency is nearly 0, which takes too long to swing.
-    frequency = max(worst_frequency(model, round_trip), 0.5)
+    # At a wall the worst frequency is nearly 0, which takes too long to simulate.
+    worst = one_dof._FREQUENCIES[np.argmin(one_dof._resistance(model, round_trip))]
+    frequency = max(worst / (2 * np.pi), 0.5)
     assert damping > 1.0
     without = work_of_the_hand(model, round_trip, frequency, 0.0)
     assert without < 0.0
@@ -49,14 +50,14 @@ def test_it_covers_what_delay_puts_in_and_little_more(wall, round_trip):
     )
 
 
-def test_elimination_takes_what_free_motion_puts_in():
+def test_covering_damping_in_free_motion_is_proportional_to_sigma():
     free = dataclasses.replace(FIRM, wall_stiffness=0.0)
     needed = [covering_damping(dataclasses.replace(free, sigma=s), 0.1) for s in (0.0, 0.5, 1.0)]
     assert needed[0] == 0.0
     assert needed[2] == pytest.approx(2 * needed[1])
 
 
-def test_a_held_wall_needs_stiffness_times_delay():
+def test_covering_damping_at_a_wall_is_stiffness_times_delay():
     """Re K e^(-j w R) / (j w) = -K R sin(w R) / (w R), which is -K R at w = 0."""
     model = OneDof(ideal_servo=True, sigma=0.0)
     needed = covering_damping(model, 0.1)

@@ -1,0 +1,100 @@
+"""A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`).
+
+Medium grip and servo of the station, wall of 5.1 kN/m, network as it is.
+
+* Let go: after some round trips of pressing only the device of 0.15 kg remains on the held force.
+* Taps: eight of 30 mm at each of `TAP_RATES`. The displayed force is late, or comes from the
+  method's memory of the wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.lab.comparison.one_dof import (
+    ACTUAL,
+    PERIOD,
+    OneDof,
+    OneDofRun,
+    Task,
+    operators_intent,
+    run_one_dof,
+)
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import PRESETS
+from drake_teleop.station.passivity.methods import PassivityConfig
+
+TAP_RATES = (1.0, 1.5)  #: Hz
+_NUM_TAPS, _TAP_AMPLITUDE = 8, 0.03  # number; m, amplitude about the wall's surface
+_EVALUATED_S = 2.0  # s, evaluated after letting go
+
+
+@dataclass(frozen=True)
+class ReleaseAndTaps:
+    """Result of one method over one network; no value is negative."""
+
+    release_force: float  #: mean on the hand in the last 0.1 s before it lets go [N]
+    release_speed: float  #: largest of the device in 2 s after that [m/s]
+    release_way: float  #: largest displacement in them [m]
+    tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES`
+    leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
+
+
+def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
+    """Simulate letting go and taps with a method over a preset network."""
+    round_trip, model = 2 * PRESETS[network].delay, OneDof()
+
+    def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:
+        return run_one_dof(
+            model,
+            PassivityConfig(method=method),
+            PRESETS[network],
+            seed=seed,
+            timeout=Channel(network=network).silent_after(PERIOD),
+            intent=intent,
+            grip=grip,
+        )
+
+    release_time = 3.0 + 3 * round_trip
+    end = release_time + _EVALUATED_S
+    task = Task(0.1, 0.6, 0.7, 1.5, release_time + 10.0, release_time + 11.0, end, judged=0.1)
+    pressing = operators_intent(task)
+    release_row = round(release_time / PERIOD)
+    grip = np.tile([model.hand_mass, model.hand_damping, model.hand_stiffness], (len(pressing), 1))
+    grip[release_row:] = 0.0
+    released = run(pressing, grip)
+    after = released.master[release_row:]
+    tapping = [run(_tap_intent(rate, round_trip)) for rate in TAP_RATES]
+    scale = model.force_scale * model.gamma
+    return ReleaseAndTaps(
+        release_force=float(np.abs(released.felt[release_row - 100 : release_row]).mean()),
+        release_speed=float(np.abs(np.diff(after)).max() / PERIOD),
+        release_way=float(np.abs(after - after[0]).max()),
+        tap_shares=tuple(
+            _displayed_share(found, scale, rate, 0.5 * round_trip)
+            for found, rate in zip(tapping, TAP_RATES, strict=True)
+        ),
+        leaked=max(max(0.0, -found.least(ACTUAL)) for found in (released, *tapping)),
+    )
+
+
+def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
+    t = np.arange(round((1.0 + _NUM_TAPS / rate + round_trip + 1.0) / PERIOD)) * PERIOD - 0.5
+    moving = (t > 0.0) & (t < _NUM_TAPS / rate)
+    x = np.where(moving, -_TAP_AMPLITUDE * np.sin(2 * np.pi * rate * t), 0.0)
+    return np.stack([x, np.gradient(x, PERIOD)], axis=1)
+
+
+def _displayed_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
+    """Return the displayed impulse over the wall's, without the first contact.
+
+    `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` one way [s].
+    """
+    first = int(np.argmax(run.wall < 0.0))
+    second = first + round(0.75 / rate / PERIOD)  # between first and second contact
+    pressed = scale * run.wall[second:].sum()
+    felt = run.felt[second + round(way / PERIOD) :].sum()
+    return float(max(felt / pressed, 0.0)) if pressed < 0.0 else 0.0
