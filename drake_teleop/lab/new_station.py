@@ -1,8 +1,7 @@
-"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station of one's own, to start from.
+"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station with a custom arm.
 
-Reads the arm, looks for a place in front of it where the tool points down and the arm can go to all
-sides, chooses scales that fit the haptic device, writes a short commented scenario, and runs it
-once: in free motion, and down onto a wall.
+It finds a start with the tool down, chooses scales that match the device, writes a commented
+scenario, and runs it: free motion, then contact with a wall.
 """
 
 from __future__ import annotations
@@ -36,14 +35,14 @@ from drake_teleop.station.slave.plant import ParseSlave, finalize, lowest_point
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
-#: The cube in which the Phantom's grip can go from where scenarios start, half its edge [m] (E).
+#: Half edge of the Phantom's workspace cube around the default start [m] (E).
 _PHANTOMS = 0.08
-#: A tool to be replaced [kg, m].
+#: Placeholder of a tool [kg, m].
 _STAND_IN = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])])
-_HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # of cubes that are tried [m]
-_POSTURES, _PLACES = 20_000, 24  # at random; of them looked at
-_TURNS = (0.0, 90.0, -90.0, 180.0)  # of the tool about the vertical that are tried [deg]
-# What turns z onto another axis, as URDF says it.
+_HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
+_POSTURES, _PLACES = 20_000, 24  # random postures; examined places
+_TURNS = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
+# URDF rpy of the rotation from z to another axis.
 _ONTO_Z = {
     "x": "0 1.5708 0",
     "-x": "0 -1.5708 0",
@@ -51,28 +50,28 @@ _ONTO_Z = {
     "-y": "1.5708 0 0",
     "-z": "3.1416 0 0",
 }
-_ASIDE = 0.1  # of a way: so far beside its end an arm of few joints may come
-_ROOM = 0.1  # of half a joint's range to its limit, which is enough
-_STEEP = np.cos(np.radians(40.0))  # z_S so far from straight down at most
-_LIKED = np.array([0.6, 0.0, 0.4])  # in reaches: where most arms can go to all sides
-_SWING, _PRESS = 0.04, 0.01  # of the slave: free motion, depth in the wall, at most [m]
-# N, of a hard press: the device displays that and 1.5 times the weight.
+_ASIDE = 0.1  # position error of an arm of few joints, over the displacement
+_ROOM = 0.1  # sufficient distance to a joint limit, over half the range
+_STEEP = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
+_LIKED = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
+_SWING, _PRESS = 0.04, 0.01  # of the slave: largest amplitude, largest depth in the wall [m]
+# Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT = 30.0
-# N/m: the wall, and how stiff the hand may feel it. The paper's station is stable up to 680 N/m
-# with a hand of medium grip; `analyze` says what this one is.
+# Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
+# 680 N/m with medium grip.
 _WALL, _FELT = 2000.0, 400.0
-_FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; share of the joints' speeds that it may take
+_FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
 
 
 class Place(NamedTuple):
-    """Where an arm can start, the tool down.
+    """Start of an arm with the tool down.
 
     Attributes:
         pose: (7,) X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: whether x_S is along x_W, as where a station is told the position alone.
+        by_position: True if the position alone defines the pose.
         q: (n,) joint positions [rad].
-        half: half the edge of the cube around it that can be reached, so turned [m]; 0: none.
-        room: how far the joint that is nearest to a limit is from it, over half its range.
+        half: half edge of the reachable cube [m].
+        room: smallest distance of a joint to its limit, over half its range.
     """
 
     pose: NDArray[np.float64]
@@ -88,24 +87,20 @@ class Place(NamedTuple):
 
     @property
     def home(self) -> list[float]:
-        """What `slave.home` has to be; empty if the position alone says it."""
+        """Value of `slave.home`; empty if the position is sufficient."""
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What was found for an arm and a device.
+    """Start, scales and motions for an arm and a device.
 
     Args:
-        joints: names of the arm's joints up to the sensor.
-        tool_mass: what hangs on the sensor [kg].
-        own_tool: whether the model has it.
-        place: where it starts.
-        translation_scale, force_scale: slave over master; master over slave.
-        swing: of the slave in free motion [m]; the wall is 1.5 times as far below the tool.
+        tool_mass: mass beyond the sensor [kg].
+        own_tool: True if the model contains the tool.
+        swing: amplitude of the slave in free motion [m].
         lowest: p_W of the tool's lowest point at the start [m].
-        assumptions: what the models do not say.
-        about_z: what is odd about the sensor's axes, if anything.
+        about_z: note about unusual axes of the sensor.
     """
 
     joints: tuple[str, ...]
@@ -131,24 +126,15 @@ def new_command(
     sensor: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Writes `station.yaml` into a folder, and runs it into `first_run` there.
+    """Write `station.yaml` into a folder, run it into `first_run`, and return the summary.
 
     Args:
-        folder: new, or with no station.yaml.
-        arm: its model, see `Slave.model`.
-        sensor_frame: frame or link of the model at which the wrist sensor measures.
-        package_paths: for package:// addresses.
-        tool: model of the tool; None: what the arm's model has beyond the sensor, or a stand-in.
-        device: the haptic device.
-        sensor: preset of the wrist sensor; None: as scenarios have it.
-        quiet: no progress bars and no tables.
-
-    Returns:
-        The summary of the run, as of `run_command`.
+        tool: model file; None: the bodies beyond the sensor, or a placeholder.
+        sensor: preset of the wrist sensor; None: the default sensor.
 
     Raises:
-        DrakeTeleopError: for a model that cannot be used, an arm that cannot point its tool down
-            anywhere, a device or a sensor that is not known, or a folder with a station.
+        DrakeTeleopError: for an unusable model, an arm that cannot point its tool down, an unknown
+            name, or an existing station.
     """
     scenario = folder / "station.yaml"
     if scenario.exists():
@@ -197,7 +183,7 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM,
 ) -> Plan:
-    """Place and scales for an arm and a device; arguments and errors as of `new_command`."""
+    """Choose start and scales for an arm and a device."""
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
@@ -233,14 +219,10 @@ def plan_station(
 
 
 def find_place(arm: ArmModel, seed: int = 0) -> Place:
-    """Where the arm can hold the tool down and go to all sides, its position to a centimetre.
-
-    Args:
-        arm: with limits.
-        seed: of the postures that are tried.
+    """Find a start with the tool down and reachable space in all directions.
 
     Raises:
-        DrakeTeleopError: if there is no such place.
+        DrakeTeleopError: if there is none.
     """
     random = np.random.default_rng(seed)
     postures = random.uniform(arm.lower, arm.upper, (_POSTURES, arm.num_joints))
@@ -253,7 +235,7 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
     fit = np.flatnonzero(down & _before(poses[:, 4:], reach))
     away = np.linalg.norm(poses[fit, 4:] - reach * _LIKED, axis=1)
-    if arm.num_joints < 6:  # they turn the tool where they carry it, so each pose is one of a kind
+    if arm.num_joints < 6:  # position and orientation are coupled
         steepest = fit[np.argsort(down_z[fit])[:_PLACES]]
         found = [_of_few(arm, postures[k], poses[k]) for k in steepest]
     else:
@@ -270,14 +252,13 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
 
 
 def _merit(place: Place) -> tuple[float, bool, float]:
-    """By which places are compared: a joint that leaves its range at once is the worst."""
     return min(place.room, _ROOM), place.by_position, place.half
 
 
 def _about_z(arm: ArmModel) -> str:
-    """What to do if another axis of S than z is along the last joint, as tools are; or nothing."""
+    """Return advice if another axis of S is along the last joint."""
     n = arm.num_joints
-    # The axis of the last joint, away from it, in S.
+    # Axis of the last joint in S, directed away from the joint.
     along = arm.table[n, ROTATION:TRANSLATION].reshape(3, 3)[2]
     along = along * (-1.0 if arm.table[n, TRANSLATION + 2] < 0.0 else 1.0)
     k = int(np.argmax(np.abs(along)))
@@ -291,7 +272,6 @@ def _about_z(arm: ArmModel) -> str:
 
 
 def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Which places (k, 3) are in front of the base, neither on its post nor behind it, nor low."""
     x, y, z = places.T / reach
     r = np.hypot(x, y)
     result: NDArray[np.bool_] = (r > 0.35) & (r < 0.85) & (x > 0.9 * r) & (z > 0.15) & (z < 0.8)
@@ -299,10 +279,7 @@ def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
 
 
 def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
-    """A place, with the largest of `_HALVES` whose corners can be reached.
-
-    It stays away from the base by as much.
-    """
+    """Return a place with the largest reachable cube of `_HALVES`."""
     R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
     q, status = tool_down(arm, position, R_WS)
@@ -319,10 +296,7 @@ def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
 
 
 def _of_few(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
-    """A posture of an arm of five joints or less as a place: how far its position can go.
-
-    The tool turns on the way, as it has to.
-    """
+    """Return a place of an arm with at most five joints."""
     reached = np.empty(7)
 
     def goes(way: NDArray[np.float64]) -> bool:
@@ -340,7 +314,6 @@ def _room(arm: ArmModel, q: NDArray[np.float64]) -> float:
 
 
 def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
-    """The largest share of its speed that a joint takes for the swing up and down."""
     above = place.pose.copy()
     above[6] += swing
     way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
@@ -356,7 +329,7 @@ def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
 
 
 def _rounded(value: float) -> float:
-    """To two digits, downwards."""
+    """Round down to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
 
@@ -374,7 +347,6 @@ def _text(
     device: str,
     sensor: str | None,
 ) -> str:
-    """The scenario, with comments on what was found."""
     s, swing = plan.translation_scale, plan.swing
     x, y, z = plan.lowest
     down = 1.5 * swing + min(_PRESS, swing / 4.0)
@@ -419,7 +391,7 @@ def _text(
 
 
 def _rates(device: str) -> dict[str, Any]:
-    """Those of a device that is slower than the hand, or `analyze` refuses them."""
+    """Return slow rates for a slow device, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 

@@ -1,21 +1,7 @@
-"""`drake-teleop run SCENARIO`: one scenario, its log, its picture and its figures.
+"""`drake-teleop run SCENARIO`: run one scenario; write its log, picture and summary.
 
-What the station knows about its load, by one rule:
-
-- A scenario whose load estimator is enabled starts from nothing and learns while it runs. If its
-  operator wants nothing either (the shipped "identification"), the slave alone runs an excitation
-  trajectory as long as the scenario.
-- Every other scenario does what an honest user would: it first identifies the load with that
-  trajectory and its own sensor, from the sensor's samples alone; or it takes what was found when
-  that was done before, see `drake_teleop.lab.identified_load`.
-
-The same scenario gives the same bytes in every file but `session.json`, which holds
-
-=========================== =====================================================================
-load_source                 which load was used: "learnt while it ran", "identified before the run",
-                            "cache", identified before an earlier run, or "of the drive"
-real_time_factor            simulated over elapsed time, this machine, compilation included
-=========================== =====================================================================
+An enabled load estimator starts without a load; without intent and task of the operator, the slave
+runs an excitation trajectory. Otherwise the load is identified first or read from the cache.
 """
 
 from __future__ import annotations
@@ -63,7 +49,7 @@ _WRITTEN_AT_THE_END = (
 
 
 class RecordedDrive(Protocol):
-    """A drive that can be repeated; `drake_teleop.live.session.read_drive` returns one."""
+    """Drive that can be repeated, see `drake_teleop.live.session.read_drive`."""
 
     @property
     def folder(self) -> Path:
@@ -71,7 +57,7 @@ class RecordedDrive(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario that was driven, with the duration of the drive."""
+        """Scenario of the drive, with the duration of the drive."""
 
     @property
     def load(self) -> IdentifiedLoad | None:
@@ -91,31 +77,20 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Runs one scenario.
-
-    Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
-    replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
-    (unless the scenario learnt while it ran), session.json and summary.json into `out`. The log is
-    a folder, written while the station runs; all but the scenario follow at the end, the summary
-    last. What an earlier run left there is removed first; a run that fails before it begins leaves
-    nothing.
+    """Run one scenario; write all results into a folder, without files of an earlier run.
 
     Args:
-        scenario: the name of a shipped one, or a YAML file.
-        out: the folder.
-        drive: a recorded drive, which is repeated instead of the scenario.
-        seed: instead of the scenario's.
-        fresh: whether to identify the load anew although it was kept.
-        quiet: no progress bars and no table.
-        progress: False for no progress bars alone.
+        scenario: name of a shipped scenario, or a YAML file.
+        drive: recorded drive that is repeated instead.
+        seed: replaces the scenario's seed.
+        fresh: True ignores a cached load.
 
     Returns:
-        The summary, and what is in session.json.
+        The summary and the content of session.json.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used, a joint leaves its range, or a file cannot
-            be written; then saying what was.
-        KeyboardInterrupt: saying what was recorded until then.
+        DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
+        KeyboardInterrupt: with the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
@@ -147,9 +122,8 @@ def run_command(
 def _logged(
     setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
-    """Runs it with its log and its scenario in a folder, without what an earlier run left there."""
     log, its_scenario = out / "log.parquet", out / "scenario.yaml"
-    # It must not be taken for what belongs to this run, should this one be interrupted.
+    # After an interruption, old files must not look like results of this run.
     remove_log(log)
     for name in _WRITTEN_AT_THE_END:
         with naming(out / name):
@@ -179,16 +153,10 @@ def run_scenario(
     *,
     fresh: bool = False,
 ) -> ScenarioRun:
-    """Runs a scenario by the rule at the top of this module.
-
-    Args:
-        scenario: what to run.
-        progress: whether bars are shown, or where: see `pages/progress.py`.
-        log: as `simulate` has it.
-        fresh: as for `identified_load`.
+    """Run a scenario, with its load as described at the top.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+        DrakeTeleopError: for an unusable scenario or a joint outside its range.
     """
     check_scenario(scenario)
     learns = scenario.load_estimator.enabled
