@@ -1,7 +1,4 @@
-"""Capsules around collision shapes: distances that are quick and have gradients.
-
-A capsule holds its shape entirely, so what keeps clear of it keeps clear of the shape.
-"""
+"""Bounding capsules of collision shapes, for fast conservative distances with gradients."""
 
 from __future__ import annotations
 
@@ -23,34 +20,29 @@ from pydrake.math import RigidTransform
 
 Array = NDArray[np.float64]
 
-# Points on the rim of a cylinder; the capsule grows by what the polygon leaves out.
+# Vertices of the circumscribed polygon of a cylinder.
 _RIM = 24
 
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """All points within `radius` of a segment.
-
-    Args:
-        ends: (2, 3) of the segment [m].
-        radius: [m].
-    """
+    """All points within `radius` [m] of a segment with `ends` (2, 3) [m]."""
 
     ends: Array
     radius: float
 
     def moved(self, X: RigidTransform) -> Capsule:
-        """In another frame."""
+        """Return the capsule transformed by X."""
         return Capsule(X.multiply(self.ends.T).T, self.radius)
 
     def holds(self, other: Capsule) -> bool:
-        """Whether the other lies in it."""
+        """Return whether this capsule contains another one."""
         distances = _distances(self.ends, other.ends)
         return bool(np.all(distances + other.radius <= self.radius + 1e-9))
 
 
 def bounding_capsule(shape: Shape) -> Capsule:
-    """A small capsule around a shape, in the shape's frame."""
+    """Return a small capsule around a shape, in its frame."""
     if isinstance(shape, Sphere):
         return Capsule(np.zeros((2, 3)), shape.radius())
     if isinstance(shape, CapsuleShape):
@@ -72,7 +64,6 @@ def bounding_capsule(shape: Shape) -> Capsule:
 
 
 def _hull(shape: Shape) -> Array:
-    """(N, 3) points whose convex hull holds the shape."""
     if isinstance(shape, Box):
         corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
         return corners * shape.size()
@@ -91,7 +82,6 @@ def _hull(shape: Shape) -> Array:
 
 
 def _distances(ends: Array, points: Array) -> Array:
-    """(N,) distances of points (N, 3) from a segment (2, 3)."""
     along = ends[1] - ends[0]
     length = float(along @ along)
     share = np.clip((points - ends[0]) @ along / length, 0, 1) if length > 0 else 0 * points[:, 0]

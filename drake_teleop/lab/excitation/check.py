@@ -1,8 +1,6 @@
-"""The verdict on a trajectory: every limit again at 1 kHz, by Drake's rigid bodies and shapes.
+"""Independent check of a trajectory against every limit at 1 kHz.
 
-Nothing is shared with the optimiser but the trajectory's positions and the limits: speeds and
-accelerations are differences of positions, torques and accelerations of bodies are the plant's,
-distances are those of the shapes themselves.
+Derivatives are finite differences; Drake's plant gives torques, accelerations and distances.
 """
 
 from __future__ import annotations
@@ -22,23 +20,22 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 
-#: Samples a second.
+#: Sample rate [Hz].
 RATE = 1000.0
-# Of the differences [s]: errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
+# Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _STEP = 1e-4
-# Distances are looked up this far beyond the clearance [m].
+# Search distance beyond the clearance [m].
 _NEAR = 0.01
 
 
 @dataclass(frozen=True)
 class Use:
-    """How much of a limit a trajectory uses.
+    """Largest use of one limit.
 
     Attributes:
-        limit: its name.
         share: largest |value| over the limit; above 1 violates it.
-        time: when [s].
-        what: which joint, axis or pair of shapes.
+        time: of the largest value [s].
+        what: joint, axis or pair of shapes.
     """
 
     limit: str
@@ -56,13 +53,7 @@ def check(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Use of every limit, the largest first.
-
-    Args:
-        robot: the arm in its surroundings.
-        trajectory: one period of it is looked at, both ends included.
-        progress: called with the share done.
-    """
+    """Return the use of every limit by one period, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP, 0.0, _STEP))
     qd, qdd = (after - before) / (2 * _STEP), (after - 2 * q + before) / _STEP**2
@@ -77,13 +68,11 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Use of every limit by a motion that was sampled, or executed, the largest first.
+    """Return the use of every limit by a sampled motion, largest first.
 
     Args:
-        robot: the arm in its surroundings.
         t: (T,) [s].
         q, qd, qdd: (T, n) [rad, s].
-        progress: called with the share done.
     """
     names, limits = robot.arm.joint_names, robot.limits
     motion = _bodies(robot, q, qd, qdd, progress)
@@ -113,8 +102,15 @@ def _use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Of (T,) samples: joint torques (T, n), norms at the sensor (T, 4), use of the box (T, 3 P),
-    clearance over distance (T,), and the shapes that it is between."""
+    """Values of (T,) samples of a motion.
+
+    Attributes:
+        torque: (T, n) of the joints.
+        sensor: (T, 4) norms at the sensor.
+        workspace: (T, 3 P) use of the box.
+        clearance: (T,) clearance over distance.
+        nearest: names of the nearest shapes.
+    """
 
     torque: Array
     sensor: Array
@@ -167,7 +163,7 @@ def _bodies(
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
-    """(T, 4) norms of force, torque, s and alpha, from (T, 3) in S: Newton and Euler."""
+    """Return (T, 4) norms of force, torque, s, alpha in S (Newton-Euler)."""
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))
@@ -176,7 +172,6 @@ def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> 
 
 
 def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
-    """The load: all bodies that hang on the one that carries S."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     found = [frame_S.body().index()]
     for body in found:
@@ -185,7 +180,7 @@ def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
 
 
 def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
-    """Smallest distance [m] up to `reach` of any two shapes, and their bodies' names."""
+    """Return the smallest distance [m], at most `reach`, and body names."""
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all farther"

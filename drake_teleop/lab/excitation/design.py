@@ -1,10 +1,6 @@
-"""The optimiser of excitation trajectories.
+"""Optimiser: penalties with L-BFGS lead random candidates to the limits; SLSQP then minimises.
 
-From random candidates, the best first: L-BFGS with the limits as penalties brings each near, then
-SLSQP with one smooth-maximum constraint for each kind of limit; both with the analytic gradients
-of `problem.py`. The best iterates that respect all limits on the optimiser's grid are kept, since
-SLSQP often ends on one that does not. A problem may bound a descent, where SLSQP would go too far
-and not come back; it is repeated from its end then. Nothing here is a verdict: `check.py` is.
+All improving feasible iterates are recorded, because SLSQP often ends on an infeasible one.
 """
 
 from __future__ import annotations
@@ -23,36 +19,28 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 
-#: Held back from each limit; the optimiser's grid misses up to 0.9 % of a fifth harmonic's peak.
+#: Share of each limit; the grid misses up to 0.9 % of a fifth harmonic's peak.
 MARGIN = 0.985
-# An iterate on the grid counts as feasible up to here.
+# Largest use of a feasible iterate on the grid.
 _FEASIBLE = 0.9885
 
-# Candidates drawn at once, and how many of them are followed.
+# Size of a batch of candidates, and number of followed ones.
 _CANDIDATES, _FOLLOWED = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _APPROACH = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
 _DESCENT = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 _TOLERANCE = 1e-5
-# A start is given up without a feasible iterate after so many evaluations, and after the first
-# stage of SLSQP if it is not within this factor of the best.
+# A start ends without a feasible iterate after so many evaluations, or after the first stage of
+# SLSQP outside this factor of the best.
 _PATIENCE, _PROMISING = 250, 1.08
-# Where the problem bounds how far a descent goes, it is repeated while it is worth so much.
+# A bounded descent is repeated while it improves the criterion by this factor.
 _WORTH = 0.995
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """A trajectory that respects all limits on the optimiser's grid, the best of its start so far.
-
-    Attributes:
-        seconds: thread CPU time since the design began, without compilation.
-        evaluations: of the criterion, since the design began.
-        start: the candidate that it came from, counted from 0.
-        value: the criterion on the grid.
-        trajectory: itself.
-    """
+    """Best feasible trajectory of its start so far; `seconds` is thread CPU time."""
 
     seconds: float
     evaluations: int
@@ -69,17 +57,13 @@ def design(
     seconds: float | None = None,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> list[Iterate]:
-    """Minimises the criterion within the limits.
+    """Minimise the criterion within the limits; return feasible iterates in order.
 
     Args:
-        problem: what to design.
-        seed: of the candidates. With `seconds` left out, the result is a function of the arguments.
-        starts: how many candidates are followed.
-        seconds: thread CPU time; instead of `starts`, as many as fit.
-        progress: called with the share done and the criterion's best value (inf: none yet).
-
-    Returns:
-        The feasible iterates as they were found; none if there were none.
+        seed: of the candidates; without `seconds` the result is reproducible.
+        starts: number of followed candidates.
+        seconds: thread CPU time; replaces `starts`.
+        progress: called with completed share and best criterion.
     """
     search = _Search(problem, starts, seconds, progress)
     with one_blas_thread(), suppress(_TimeIsUpError):
@@ -93,16 +77,14 @@ def design(
 
 
 class _TimeIsUpError(Exception):
-    """Raised inside the optimisers, to leave them."""
+    """Ends all optimisers."""
 
 
 class _HopelessError(Exception):
-    """Likewise: this start does not become feasible."""
+    """Ends a start that does not become feasible."""
 
 
 class _Search:
-    """What was found, and when to stop."""
-
     def __init__(
         self,
         problem: Problem,
@@ -120,14 +102,14 @@ class _Search:
         from scipy.optimize import minimize
 
         self._minimize = minimize
-        # Compiles, if that has not been done, before the clock starts.
+        # Compile before the clock starts.
         self._last = problem.evaluate(
             self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
         )
         self._began = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
-        """Random motions without end, the most promising of a batch first."""
+        """Yield random motions, the best of each batch first."""
         while True:
             batch = [self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_CANDIDATES)]
             merit = []
@@ -139,7 +121,7 @@ class _Search:
                 yield batch[k]
 
     def follow(self, x: Array) -> None:
-        """Descends from x; what is feasible on the way is remembered."""
+        """Descend from x."""
         self._evaluations, self._best_of_start = 0, float("inf")
         for of_criterion, of_maxima, weight, iterations in _APPROACH:
             options = {"maxiter": iterations}
@@ -157,7 +139,6 @@ class _Search:
             x = self._descended(x, *_DESCENT[-1])
 
     def _descended(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
-        """Where SLSQP ends."""
         found: Array = self._minimize(
             lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
             x,
@@ -184,7 +165,7 @@ class _Search:
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
     def _at(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """SLSQP asks for value, limits and gradients of a point one after the other."""
+        """Evaluate a point once; SLSQP requests its parts separately."""
         key = np.array([*x, of_criterion, of_maxima]).tobytes()
         if key != self._key:
             self._tick()

@@ -1,4 +1,4 @@
-"""An excitation trajectory for a robot: designed, and checked; or an error."""
+"""Design and check of an excitation trajectory for a robot."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 
-# A trajectory between whose samples the optimiser missed a peak is made smaller about its middle.
+# Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _REPAIRS = (1.0, 0.995, 0.99, 0.98)
-# Of one descent, a candidate at every such factor of the criterion; how many are checked at most.
+# Factor of the criterion between candidates of one descent; largest number of checks.
 _WORSE, _CHECKED = 1.05, 30
 _HULLS = (
     "; or, if it is the hulls of meshes that touch, excite a station (drake-teleop new): what"
@@ -40,18 +40,14 @@ _HULLS = (
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """A trajectory that was checked.
+    """Trajectory that passed the check.
 
     Attributes:
-        robot: the arm, its surroundings and its limits.
-        trajectory: at rest at both ends.
-        criterion: name of what was minimised.
-        values: every criterion, by name, of one period at 1 kHz.
-        deviations: (16,) predicted standard deviations of offsets and phi of the heaviest load,
-            see `predicted_deviations`.
-        uses: of every limit, as checked, the largest first.
-        history: (K, 2) evaluations of the criterion, and its best value until then.
-        seconds: thread CPU time until the last of them, which no two designs have the same [s].
+        values: every criterion over one period at 1 kHz.
+        deviations: (16,) predicted standard deviations with the heaviest load.
+        uses: of every limit, largest first.
+        history: (K, 2) number of evaluations, best criterion so far.
+        seconds: thread CPU time of the design [s].
     """
 
     robot: Robot
@@ -75,18 +71,15 @@ def excite(
     seconds: float | None = None,
     progress: bool | Stage = True,
 ) -> Excitation:
-    """Designs an excitation trajectory and checks it.
+    """Design an excitation trajectory and check it.
 
     Args:
-        robot: from `RobotFromScenario` or `RobotFromModel`.
-        criterion: one of `criteria.CRITERIA`.
-        period: of the trajectory [s].
+        period: [s].
         harmonics: N of Eq. (9), at least 2.
         seed, starts, seconds: see `design`.
-        progress: whether bars are shown, or where: see `pages/progress.py`.
 
     Raises:
-        DrakeTeleopError: if nothing was found that respects all limits.
+        DrakeTeleopError: if no trajectory respects all limits.
     """
     task = Task(
         robot.arm.table,
@@ -121,15 +114,10 @@ def excite(
 def best_checked(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
 ) -> tuple[FourierTrajectory, list[Use]]:
-    """The best of `design` that passes the check, and what it uses of every limit.
-
-    Args:
-        robot: the arm in its surroundings.
-        found: from `design`.
-        progress: of each check.
+    """Return the best trajectory that passes the check, and its use of limits.
 
     Raises:
-        DrakeTeleopError: if nothing passes.
+        DrakeTeleopError: if none passes.
     """
     worst: Use | None = None
     for trajectory in _candidates(found, robot):
@@ -148,7 +136,7 @@ def best_checked(
 
 
 def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """The value of every criterion over one period at 1 kHz."""
+    """Return every criterion over one period at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
@@ -156,7 +144,7 @@ def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]
 
 
 def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
-    """s, omega, alpha of S, (T, 3) each, in S, of one period at 1 kHz."""
+    """Return s, omega, alpha of S in S, (T, 3) each, over one period at 1 kHz."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
     motions_of(robot.arm.table, *joints, motions)
@@ -172,10 +160,9 @@ def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
 
 
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
-    """What respects the limits between the optimiser's samples too, the best first.
+    """Yield trajectories within the limits at 1 kHz, best first.
 
-    The optimiser knows shapes as capsules and may pass a corner too near, along all of a descent's
-    end. So of each descent there are iterates at every `_WORSE`, as long as the check fails them.
+    A descent may end too close to a true shape, so its next candidate is worse by `_WORSE`.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)

@@ -1,4 +1,4 @@
-"""The film of an excitation: the arm as it will move, to be watched before a robot runs it."""
+"""3D replay of an excitation."""
 
 from __future__ import annotations
 
@@ -20,19 +20,14 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.film import Film, Reading, Show, add_shapes, frame_times, plain_room, rgba
 
 _TABLE, _BONE = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
-_THICKNESS = 0.03  # of the table that is drawn [m]
-_BONE_SHARE = 0.04  # radius of a bone, from joint to joint, as a share of its length
-# Where the camera is, seen from the middle of the motion, in sizes of the arm.
+_THICKNESS = 0.03  # of the drawn table [m]
+_BONE_SHARE = 0.04  # radius of a bone over its length
+# Camera position from the middle of the motion, in sizes of the arm.
 _VIEW = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_film(path: Path, found: Excitation) -> None:
-    """Writes the film of one period, in real time.
-
-    Args:
-        path: of the HTML file.
-        found: from `excite`.
-    """
+    """Write an HTML file with the 3D replay of one period."""
     robot, trajectory = found.robot, found.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
@@ -74,7 +69,6 @@ def write_motion_film(path: Path, found: Excitation) -> None:
 def _poses(
     robot: Robot, context: Context, posture: Array
 ) -> tuple[dict[BodyIndex, RigidTransform], RigidTransform]:
-    """X_WB of every body, and X_WS."""
     plant = robot.plant
     q = plant.GetPositions(context)
     q[robot.arm.position_index] = posture
@@ -85,10 +79,7 @@ def _poses(
 
 
 def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    """The shapes of every body. One that is not to be seen is shown as what it collides with.
-
-    That may be little or nothing: it has bones, too, to the joints that it carries.
-    """
+    """Add visual shapes; without them collision shapes and bones."""
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))
@@ -100,7 +91,7 @@ def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
 
 
 def _carried(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
-    """(3,) p_BJ of every joint that a body carries [m], and of S, but for those at its origin."""
+    """Yield (3,) p_BJ of joints on a body and of S [m]."""
     plant = robot.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
@@ -120,7 +111,6 @@ def _add_bone(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
 
 
 def _furnish(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
-    """Table, the sensor's way, light, and a camera that has all of it in sight."""
     plain_room(meshcat)
     seen = np.vstack([path_S, bodies, np.zeros((1, 3))])
     low, high = seen.min(axis=0), seen.max(axis=0)

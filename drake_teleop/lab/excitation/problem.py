@@ -1,4 +1,4 @@
-"""What is designed, as functions of the optimiser's unknowns, with analytic gradients."""
+"""Criterion and limits as functions of the optimiser's unknowns."""
 
 from __future__ import annotations
 
@@ -21,24 +21,22 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 Array = NDArray[np.float64]
 Bounds = list[tuple[float | None, float | None]]
-"""Of each unknown, least and largest; None: none."""
+"""Lower and upper bound of each unknown; None: unbounded."""
 
-# Samples of a period for each harmonic.
+# Samples of a period per harmonic.
 _SAMPLES = 24
-# Random motions have this share of the size that would use all of a speed or acceleration.
+# Size of random motions, as a share of the speed and acceleration limits.
 _SIZE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is designed.
+    """Specification of a design.
 
     Args:
         table: `ArmModel.table`, with the heaviest load.
-        limits: what must be respected.
-        criterion: what is minimised.
-        home: (n,) a posture around which half of the candidates are drawn [rad].
-        period: of the trajectory [s].
+        home: (n,) posture around which half of the candidates are drawn [rad].
+        period: [s].
         harmonics: N of Eq. (9), at least 2.
     """
 
@@ -52,13 +50,13 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Of one point.
+    """Criterion and limits at one point.
 
     Attributes:
         log_criterion: smooth logarithm of the criterion.
         uses: (7,) smooth largest use of each of `LIMITS`.
-        gradients: (8, unknowns) of these, the criterion's first.
-        largest_use: of any limit at any sample, not smooth.
+        gradients: (8, unknowns) of both, the criterion first.
+        largest_use: exact largest use of any limit.
     """
 
     log_criterion: float
@@ -68,11 +66,7 @@ class Evaluation:
 
 
 class Problem:
-    """The unknowns are x = [q0, sine, cosine], see `FourierTrajectory.at_rest`.
-
-    Args:
-        task: what is designed.
-    """
+    """Problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -89,13 +83,13 @@ class Problem:
         self._gradients = np.empty((1 + len(LIMITS), 3, samples, n))
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """The trajectory that x stands for."""
+        """Return the trajectory with the unknowns x."""
         n = len(self.task.home)
         sine, cosine = x[n:].reshape(2, n, -1)
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """A random motion of moderate size, around the home posture or any other."""
+        """Return a random motion around the home or a random posture."""
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
@@ -106,11 +100,11 @@ class Problem:
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
-        """Within which a descent from x stays; None: anywhere."""
+        """Return the bounds of a descent from x; None: unbounded."""
         return None
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """Criterion and limits at x; sharpness of the criterion and of the smooth maxima."""
+        """Evaluate at x with sharpness of criterion and smooth maxima."""
         task, n = self.task, len(self.task.home)
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         joints = self._basis @ coefficients
@@ -129,12 +123,11 @@ class Problem:
         return Evaluation(value, smooth, self._of_unknowns(), float(largest.max()))
 
     def value(self) -> float:
-        """The criterion itself at the point that was evaluated last, on the samples."""
+        """Return the exact criterion of the last evaluated point."""
         s, omega, alpha = self._vectors
         return self.task.criterion.value(s, omega, alpha, self.task.period)
 
     def _of_unknowns(self) -> Array:
-        """From gradients with respect to joint samples to gradients with respect to x."""
         g = self._gradients
         of_q0 = g[:, 0].sum(axis=1)
         # (8, free, n), summed over position, velocity, acceleration and time.

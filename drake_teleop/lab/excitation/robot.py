@@ -1,8 +1,4 @@
-"""The arm that is to be excited, its surroundings, and its limits.
-
-Of the station's slave, or of any model that Drake can read (URDF, SDF, MJCF, model directives).
-What a model lacks is assumed, and every assumption is named.
-"""
+"""Arm with surroundings and limits for the design."""
 
 from __future__ import annotations
 
@@ -35,41 +31,33 @@ from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_POSTURES = 1000  # random ones, in which distances of shapes are looked at
-# Of the joints' ranges, speeds and torques; the rest is for tracking errors and feedback.
+_POSTURES = 1000  # random postures for distances of shapes
+# Usable share of joint limits; the rest is for tracking errors and feedback.
 _JOINT_SHARE = 0.8
-# Of the weakest axis of the sensor; a grasped object lies farther out than the tool.
+# Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
-# The heaviest load to expect is this much heavier than the known one (a grasped object of 0.8 kg).
+# Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
 _LOAD_FACTOR = 1.3
-# What a payload of unknown shape looks like: centre of mass along z_S, radius of gyration [m].
+# Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
 _PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
 _PAYLOAD = 2.0
 _LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
 
-# The station's wrist centre and ball tip, and where both may be: in front of the arm, above the
-# table.
+# The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
 _BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """An arm with its surroundings, ready for a design and for a check.
+    """Arm with its surroundings.
 
     Attributes:
-        name: of the scenario or the model.
-        diagram: of plant and scene graph.
-        plant: with the heaviest load on the arm.
-        scene_graph: with everything that may collide.
+        plant: with the heaviest load.
         sensor_frame: S.
-        arm: the same as arrays.
-        limits: what an excitation must respect.
-        scales: what criteria divide by; with the heaviest load.
-        noise: of the sensor, for predictions.
-        home: (n,) a posture to begin from [rad].
-        assumptions: what was not in the model.
-        folders: with converted meshes, which live as long as this.
+        home: (n,) start posture of the search [rad].
+        assumptions: assumed values that the model lacks.
+        folders: temporary folders with converted meshes.
     """
 
     name: str
@@ -87,7 +75,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """The station's slave with its tool, what it has to touch, and a table at z = 0.
+    """Return the station's slave with tool, environment, and a table at z = 0.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the scenario's start.
@@ -134,22 +122,16 @@ def RobotFromModel(
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
 ) -> Robot:
-    """Any serial arm of revolute and prismatic joints.
-
-    A base that hangs on nothing is welded to the world, joints beyond the sensor are held.
+    """Return a serial arm from a model; bases are welded, joints beyond the sensor locked.
 
     Args:
-        path: of the model.
-        sensor_frame: name of the frame or link at which the sensor measures.
-        sensor: what it can measure.
-        estimation: from what the motion will be known; by default as in the station.
-        sensor_hz: rate of the sensor [Hz].
-        package_paths: folders in which `package://` addresses are looked up.
-        acceleration: limits [rad/s^2], one for all joints or one for each, if the model has none.
-        payload: mass of the heaviest load [kg], if it is not in the model.
+        sensor_frame: frame or link at which the sensor measures.
+        package_paths: folders for `package://` addresses.
+        acceleration: limits [rad/s^2], one or one for each joint, if the model has none.
+        payload: mass of the heaviest load [kg], if the model lacks it.
 
     Raises:
-        DrakeTeleopError: if the model cannot be read or is no such arm.
+        DrakeTeleopError: if the model is unreadable or not such an arm.
     """
     lacking: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
@@ -218,9 +200,9 @@ def _robot(
     assumptions: list[str],
     folders: Sequence[TemporaryDirectory[str]] = (),
 ) -> Robot:
-    """Limits and all else, see `Robot`; `box` is its middle and half size in W [m].
+    """Return the robot with its limits; `box` is middle and half size in W [m].
 
-    Where the arm is known to stand at home, what touches there may touch.
+    With `stands_there`, shapes that touch at home may touch.
     """
     arm = scene.arm
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
@@ -284,6 +266,5 @@ def _arm_of(parse: Parse) -> ArmModel:
 
 
 def _payload(mass: float) -> Array:
-    """(10,) phi of a compact load."""
     com = np.array([0.0, 0.0, _PAYLOAD_COM])
     return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION**2 * np.eye(3) * 2 / 3)

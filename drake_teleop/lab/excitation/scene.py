@@ -1,4 +1,4 @@
-"""Which shapes of an arm and its surroundings may collide, as shapes and as capsules."""
+"""Collision candidates of an arm and its surroundings, as shapes and as capsules."""
 
 from __future__ import annotations
 
@@ -38,26 +38,24 @@ from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
 from drake_teleop.station.slave.plant import finalize
 
-#: What the arm keeps between its links, and from everything else [m]. The flange of the RX90 passes
-#: its forearm at 6 mm.
+#: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
 CLEARANCE = 0.005
-# Pairs of shapes nearer than that in this share of random postures are neighbours by design, and so
-# are those whose distance varies by less than this [m].
+# Neighbours by design: pairs below the clearance in this share of random postures, or with a
+# smaller variation of distance than this [m].
 _NEIGHBOURS, _STILL = 0.95, 1e-3
-# Distances at which shapes are about to touch [m], the share of such postures in which capsules may
-# be too small by what is allowed for, and the share of free postures that they may block.
+# Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
+# postures that capsules may block.
 _BAND, _LEAST, _BLOCKED = (-0.02, 0.05), 0.25, 0.1
-# With fewer such postures nothing is allowed for.
+# Smallest number of postures near contact for a correction.
 _FEW = 5
-# Capsules that are near in less than this share of the postures may be so; in more, only if their
-# shapes are ever near.
+# Share of postures below which near capsules count although their shapes were never near.
 _SELDOM = 0.05
 
 _TABLE = "drake_teleop_table"
-# Stands for a plane, to which Drake gives no distances, and where below it; wider than any arm.
+# Replaces a half space, for which Drake has no distances; wider than any arm.
 _PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
-_LARGEST = 1e3  # of shapes [m]; with 1e4 Drake's distances abort, or never end
-# A plane as a ball of 1 km: 2 m away it is 2 mm too low, and the check has the plane.
+_LARGEST = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+# The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
 _Pair = tuple[GeometryId, GeometryId]
@@ -65,16 +63,14 @@ Parse = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
 
 
 class Scene:
-    """Plant and scene graph of the arm with its heaviest load, and which shapes may collide.
+    """Plant and scene graph of the arm with its heaviest load.
 
     Args:
-        parse: adds the arm and its surroundings to a plant.
-        reserve: (10,) phi of what may hang on the sensor besides.
-        visuals_count: whether links are as large as they are seen, too.
-        where: all this is from, for messages.
+        reserve: (10,) phi of an additional load on the sensor.
+        visuals_count: True: visual shapes also count as collision shapes.
 
     Raises:
-        DrakeTeleopError: for a shape that is too large to be one of an arm.
+        DrakeTeleopError: for a shape that is too large for an arm.
     """
 
     def __init__(
@@ -98,7 +94,7 @@ class Scene:
         self.diagram = builder.Build()
 
     def rows(self) -> dict[BodyIndex, int]:
-        """Of every body, the link of the arm that carries it, as a row of `link_motions`; or -1."""
+        """Return the link of every body, a row of `link_motions` (-1: world)."""
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -109,19 +105,14 @@ class Scene:
     def without_neighbours(
         self, rows: dict[BodyIndex, int], postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
-        """Pairs of shapes that may collide, with their distance in each posture (inf: far).
+        """Return pairs of shapes that may collide, with distances in each posture (inf: far).
 
-        Those on one link, those that are always near, and those whose distance does not vary no
-        longer count; nor do those that touch where the arm starts, because there it stands: they
-        are larger than what they stand for, as the convex hull of a mesh is.
+        Excluded are pairs on one link, always near or at a constant distance. Shapes that touch in
+        the start posture are excluded too, and their bodies are returned.
 
         Args:
-            rows: of `rows`.
-            postures: (T, n) random ones.
-            start: (n,) where the arm starts, if that is known.
-
-        Returns:
-            the pairs; and the names of those that touch at the start.
+            postures: (T, n).
+            start: (n,), if known.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(rows.values()):
@@ -145,7 +136,7 @@ class Scene:
             query = self.scene_graph.get_query_output_port().Eval(of_scene)
             for found in query.ComputeSignedDistancePairwiseClosestPoints(_BAND[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
-        # Another one: what a manager from before the context declares, no context gets to know.
+        # A new manager: declarations of a manager older than the context have no effect there.
         manager = self.scene_graph.collision_filter_manager()
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
@@ -172,11 +163,9 @@ class Scene:
         candidates: dict[_Pair, Array],
         postures: Array,
     ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
-        """Rows, capsules, pairs of them, and which distance each pair keeps.
+        """Return rows, capsules, pairs, and the minimum distance of each pair.
 
-        Left out are pairs that others stand for, those whose capsules are often near though their
-        shapes never are, and those whose capsules are near more often when their shapes are not.
-        The check looks at the shapes.
+        Excluded are pairs inside larger capsules, and distances unrelated to the shapes.
         """
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
@@ -223,11 +212,9 @@ class Scene:
 
 
 def _kept_distance(of_shapes: Array, of_capsules: Array) -> float:
-    """The distance that two capsules keep, of (T,) distances in random postures [m].
+    """Return the minimum distance of two capsules from (T,) distances [m].
 
-    Capsules are larger than their shapes. Where the shapes are about to touch, the least by which
-    most are is allowed for; but so much that the capsules are free in most postures in which the
-    shapes are.
+    It subtracts the lower quartile of their excess near contact, and leaves 90 % of free postures.
     """
     touching = (of_shapes > _BAND[0]) & (of_shapes < _BAND[1])
     excess = (of_shapes - of_capsules)[touching] if touching.sum() >= _FEW else np.zeros(1)
@@ -240,7 +227,7 @@ def _number(shape: GeometryId) -> int:
 
 
 def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
-    """The largest capsule on the same link that holds that of `shape`."""
+    """Return the shape of the largest capsule around that of `shape` on its link."""
     row, capsule = capsules[shape]
     holding = [
         (other.radius, -_number(name), name)
@@ -251,14 +238,12 @@ def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]
 
 
 def _pose(motion: Array) -> RigidTransform:
-    """X_WL of a link's motion (21,)."""
     return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
 
 
 def _add_load(
     plant: MultibodyPlant, instance: ModelInstanceIndex, frame: Frame, phi: Array
 ) -> None:
-    """Welds a body without shape to the sensor."""
     mass = float(phi[0])
     unit = inertia_about_origin(phi) / mass
     moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
@@ -270,10 +255,7 @@ def _add_load(
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
-    """Gives links the shapes they are seen with, if `visuals_count` or they have no other.
-
-    Plates take the place of planes.
-    """
+    """Add visual shapes where needed; replace half spaces by plates."""
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))
@@ -295,7 +277,7 @@ def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> 
         body = plant.get_body(BodyIndex(index))
         for solid in plant.GetCollisionGeometriesForBody(body):
             shape = inspector.GetShape(solid)
-            if isinstance(shape, HalfSpace):  # a plate stands for it
+            if isinstance(shape, HalfSpace):  # replaced by a plate
                 continue
             capsule = bounding_capsule(shape)
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius

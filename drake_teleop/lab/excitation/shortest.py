@@ -1,18 +1,12 @@
-"""The shortest motion after which a load is known as well as is asked: `excite --until`.
+"""Shortest motion that identifies a load within tolerances: `excite --until`.
 
-The unknowns are those of `problem.py` and log T, the period's: with the coefficients, q(t / T)
-stays, qd falls with T and qdd with T^2. log T is minimised, and what is asked is one more limit,
+log T of the period is one more unknown and is minimised; the tolerance is one more limit,
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with the standard deviations d_k of the asked numbers (`load.tolerance`) of all of one period's
-samples, offsets estimated too, and z such that all numbers are within their tolerances at once in
-`RELIABLE` of the records (Sidak's inequality). The optimiser sees the white noise of wrench and
-motion; what else `prediction.py` knows of (random walks, filters) is a factor for each number, from
-the motion that was found before, and the search is repeated with it, from there.
-
-There are many minima. Of fifty descents from random motions 40 % ended within 10 % of the best; so
-the first round makes `starts` of them.
+with standard deviations d_k after one period; z holds all tolerances together in `RELIABLE` of the
+records (Sidak). The optimiser models white noise. A factor for each number from `prediction.py`
+adds random walks and filters, and the search repeats with it.
 """
 
 from __future__ import annotations
@@ -50,37 +44,31 @@ from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
 from drake_teleop.load.trajectory import FourierTrajectory
 
 RELIABLE = 0.95
-"""Share of the records in which all asked numbers are to be within their tolerances at once."""
-# The longest period [s]; the highest harmonic of the shortest [Hz]: half of what the low-pass of
-# `identify` lets through, and more than most joint control follows.
+"""Share of the records in which all numbers are within their tolerances together."""
+# Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
 _LONGEST, _FASTEST = 20.0, 15.0
-# Of log T, in one descent: SLSQP, which sees straight lines, would go to nothing, and not return.
+# Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
 _STEP = 0.15
-# Rounds of the search at most; how many that reach what is asked may come without one that is
-# shorter by this share; and by how much more than needed is asked when one fell short.
+# Largest number of rounds; number of successful rounds without progress; required progress factor;
+# additional margin after a round that missed the tolerance.
 _ROUNDS, _IN_VAIN, _SHORTER, _MORE = 20, 1, 0.99, 1.005
-# Rounds that find nothing, after which there is nothing.
+# Number of rounds without any motion before the search fails.
 _LOST = 3
-# What misses by more is no place to begin from; else later rounds have so many starts around it.
+# Largest misfit of a motion that later rounds vary, and number of such starts.
 _NEAR, _STARTS_AROUND = 1.5, 4
-# Between the seeds of rounds: each has candidates of its own.
+# Difference between the seeds of rounds.
 _OTHER = 2**33
-# Later rounds look around what was found: share of the coefficients, and of the period.
+# Variation in later rounds: share of the coefficients, factor of the period.
 _AROUND, _PERIODS = 0.2, 1.3
-# The maximum over the asked numbers is sharper than that over eigenvalues: they are ten.
+# Sharpness of the maximum over tolerances, relative to that over eigenvalues.
 _SHARPER = 4.0
-# Of the balanced information, so that it can be inverted before anything moves.
+# Regularisation of the balanced information; it is singular without motion.
 _REGULAR = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """A motion that was found.
-
-    Attributes:
-        excitation: the motion, checked; its criterion is the period.
-        reached: (k,) z d_k over the tolerances, none above 1.
-    """
+    """Checked motion, and (k,) z d_k over the tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
@@ -95,17 +83,15 @@ def shortest(
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> Shortest:
-    """Designs and checks the shortest motion that reaches a tolerance.
+    """Design and check the shortest motion that reaches a tolerance.
 
     Args:
-        robot: the arm.
-        tolerance: of its heaviest load.
         harmonics: N of Eq. (9).
         seed, progress: see `design`.
-        starts: descents from anywhere, before those around what was found.
+        starts: random starts of the first round.
 
     Raises:
-        DrakeTeleopError: if nothing within the limits reaches it in `_LONGEST` seconds.
+        DrakeTeleopError: if no motion up to `_LONGEST` reaches it.
     """
     errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
@@ -145,7 +131,7 @@ def shortest(
                 break
         seen = problem.deviations(motion, trajectory.period)
         now = factor * (reached / seen)
-        # Not less than before, where a round fell short: else it might go to and fro.
+        # No decrease after a round that missed the tolerance, to avoid oscillation.
         factor = _MORE * np.maximum(now, factor) if worst > 1.0 and k > 0 else now
     if best is not None:
         return best
@@ -179,21 +165,20 @@ def _excitation(
 
 
 def reliable_factor(count: int) -> float:
-    """z: half-widths in standard deviations that hold `count` numbers at once in `RELIABLE`."""
+    """Return z for `count` numbers in `RELIABLE` of the records."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
 class ShortestProblem(Problem):
-    """The unknowns are x = [q0, sine, cosine, log T], see `Problem`.
+    """Problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        task: its period is 1 s, its criterion is not looked at.
-        errors: (k, 16) what has to be 1 or less in standard deviations.
-        robot: whose sensor measures.
-        around: unknowns to begin from, if there are some.
+        task: with a period of 1 s; its criterion is not used.
+        errors: (k, 16) rows with required deviations of 1.
+        around: unknowns of an earlier motion, if any.
 
     Attributes:
-        best: the unknowns with the least period of those whose `value` was asked for.
+        best: unknowns of the shortest period passed to `value`.
     """
 
     def __init__(self, task: Task, errors: Array, robot: Robot, around: Array | None) -> None:
@@ -208,11 +193,11 @@ class ShortestProblem(Problem):
         self._period, self._shortest = 1.0, task.harmonics / _FASTEST
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """The trajectory that x stands for."""
+        """Return the trajectory with the unknowns x."""
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """A random motion of moderate size for a random period; or like one that was found."""
+        """Return a random motion and period, or a variation of `around`."""
         if self._around is not None and near_home:
             other = _AROUND * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
@@ -220,20 +205,20 @@ class ShortestProblem(Problem):
             return x
         period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _LONGEST))))
         task = self.task
-        self.task = replace(task, period=period)  # how large it may be depends on it
+        self.task = replace(task, period=period)  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
         self.task = task
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Of log T."""
+        """Return bounds of log T near x."""
         least, largest = np.log(self._shortest), np.log(2.0 * _LONGEST)
         around = (np.clip(x[-1] + step, least, largest) for step in (-_STEP, _STEP))
         low, high = (float(each) for each in around)
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """log T, and eight limits: those of the arm, and what is asked."""
+        """Evaluate log T and eight limits: tolerance, then arm."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _LONGEST)))
         self._period = T = float(np.exp(log_period))
@@ -251,7 +236,7 @@ class ShortestProblem(Problem):
             task.table, q, qd, qdd, self._motions, task.limits, of_maxima, smooth, largest, g[2:]
         )
         of_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
-        # More samples, and log T itself.
+        # Longer periods have more samples; the objective is log T.
         of_period[1] -= 0.25
         of_period[0] = 1.0
         g[:, 1] /= T
@@ -262,27 +247,26 @@ class ShortestProblem(Problem):
         )
 
     def value(self) -> float:
-        """The period at the point that was evaluated last [s]."""
+        """Return the period of the last evaluated point [s]."""
         if self._period < self._least:
             self._least, self.best = self._period, self._at
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """(k,) standard deviations of what is asked in the noise that the search knows of."""
+        """Return (k,) standard deviations in white noise."""
         return np.sqrt(self._variances(self._rows(*motion), period)[0])
 
     def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
-        """(T, 6, 16) of the regression, over the roots of the densities of the wrench's noise."""
+        """Return (T, 6, 16) rows over root densities of the wrench noise."""
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
-        """(k,) variances d_k^2 = v_k^T B v_k of what is asked; v_k = G^-1 e_k, u_k = G^-1 B v_k.
+        """Return (k,) variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        G = sum of R^T R T / samples is the information that weighted least squares reckons with,
-        B = sum of R^T S R T / samples what there is, with the noise's densities S over those that
-        it weighs by (the sandwich of White, Econometrica 1980).
+        G = sum of R^T R T / samples is the information of weighted least squares; B = sum of
+        R^T S R T / samples has the noise densities S (sandwich, White, Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
@@ -295,10 +279,9 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _asked(self, sharpness: float) -> tuple[float, float, Array]:
-        """Use of what is asked, smooth and exact, and the gradient of the smooth one by V.
+        """Return smooth and exact use of the tolerance, and the gradient of the smooth one by V.
 
-        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), and half of it is the
-        use's.
+        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
         """
         rows = self._rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
@@ -313,10 +296,9 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """(6, 6) densities of the wrench's noise and of the motion's times the load.
+    """Return (6, 6) white noise densities of wrench and of motion times load.
 
-    Over the roots of the wrench's own. It is that of `predicted_covariance` without random walks,
-    and as if no filter corrected the accelerometer.
+    They are relative to the wrench's own densities, and do not include filters.
     """
     density = np.diag(noise.white[:6])
     if noise.filters is not None:
