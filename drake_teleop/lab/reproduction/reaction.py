@@ -1,9 +1,7 @@
-"""What elimination leaves of the wrench that the plant itself says the wrist transmits.
+"""Elimination from the plant's own reaction force in the wrist, as an independent check of V.
 
-The ideal sensor samples V phi, so what V phi leaves of its samples is zero whatever V is. Here the
-wrench is the reaction force of the weld that the tool hangs on, as Drake's plant has it, which
-knows nothing of V; the motion is the ideal sensor's sample of the same instant, which knows nothing
-of the plant's accelerations.
+The ideal sensor samples V phi, so elimination from its samples leaves zero for any V. Drake's
+reaction force of the tool's weld does not use V.
 """
 
 from __future__ import annotations
@@ -22,15 +20,10 @@ Array = NDArray[np.float64]
 
 
 def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
-    """Runs a free movement with an ideal sensor and eliminates the true load from the reaction.
-
-    Args:
-        scenario: without anything to touch; the sensor samples at the rate of its log.
-        progress: called with the fraction done.
+    """Run a free movement with an ideal sensor; eliminate the true load from the reaction force.
 
     Returns:
-        (N, 6) F - V phi at each sample after the settling time [N, N m]: rounding, if V and the
-        sensor's kinematics are those of rigid bodies.
+        (N, 6) F - V phi [N, N m] after the settling time; only rounding errors if V is correct.
     """
     rate, simulation = scenario.rates.log_hz, scenario.simulation
     phi = slave_arm(scenario).phi_load
@@ -43,7 +36,7 @@ def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
     place = list(plant.GetJointIndices()).index(weld.index())
     wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
     for k in range(len(wrenches)):
-        advance(simulator, k * (1 / rate))  # a product, as Drake's event times are
+        advance(simulator, k * (1 / rate))  # the same product as Drake's event times
         reaction = reactions.Eval(context)[place]
         wrenches[k] = *reaction.translational(), *reaction.rotational()
         if k % 256 == 0:

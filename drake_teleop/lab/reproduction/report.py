@@ -1,4 +1,4 @@
-"""The report of `drake-teleop reproduce`: one self-contained HTML page, and its tables."""
+"""Report of `drake-teleop reproduce`: one self-contained HTML page with tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.writing import write_text
 
-# Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
+# Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
@@ -27,7 +27,7 @@ _PARAMETERS = (
 
 
 _NOT_REPORTED = "not reported"
-# What a verdict is called if the figure is as accepted, and if it is not.
+# Verdicts for accepted and not accepted values.
 _AS_SET = ("as set", "not as set")
 _WITHIN_BOUND = ("within our bound", "beyond our bound")
 _AGREES = ("agrees", "differs")
@@ -35,16 +35,12 @@ _AGREES = ("agrees", "differs")
 
 @dataclass(frozen=True)
 class Comparison:
-    """One line of the paper-against-ours table.
+    """Row of the table of paper and reproduction.
 
     Args:
-        what: the quantity.
-        paper: what the paper says about it.
-        ours: our figure, with its unit.
-        origin: "set", if the movement, the place of the leaf or the scales were chosen such that
-            the figure is the paper's; "found", if it could have come out otherwise.
-        accepted: what we accept; empty if nothing can be compared.
-        holds: whether our figure is as accepted; None if nothing can be compared.
+        origin: "set" if the scenario was chosen to match the paper; else "found".
+        accepted: accepted range; empty if not comparable.
+        holds: True if accepted; None if not comparable.
     """
 
     what: str
@@ -56,11 +52,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """ "agrees" or "differs" only for what was found here and is reported in the paper.
-
-        What was set is "as set" or "not as set", what the paper does not report "within our bound"
-        or "beyond our bound"; "for the record" if nothing can be compared.
-        """
+        """Verdict; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
         words = _AS_SET if self.origin == "set" else _AGREES
@@ -70,7 +62,7 @@ class Comparison:
 
     @property
     def pill(self) -> str:
-        """How the page shows the verdict: "differs" is what cries, "" neutral."""
+        """CSS class of the verdict: "differs" is highlighted, "" is neutral."""
         if self.holds is False:
             return "differs"
         return "agrees" if self.verdict == "agrees" else ""
@@ -78,7 +70,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure with its title and the sentences below it."""
+    """Figure with title and caption."""
 
     title: str
     png: Path
@@ -87,7 +79,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One identified parameter next to its true value, all in `unit`, as printed."""
+    """Identified parameter beside its true value, all in `unit`."""
 
     symbol: str
     index: str
@@ -99,10 +91,10 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """The paper's figures next to ours.
+    """Return the table of paper and reproduction.
 
     Args:
-        summary: the figures of `reproduce` by full name ("free_force.peak_raw_N").
+        summary: values by full name ("free_force.peak_raw_N").
     """
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
@@ -144,11 +136,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The lines of the table that are not as accepted, in words; none in a good run.
-
-    Args:
-        summary: what `reproduce_command` returned.
-    """
+    """Return the table rows that are not accepted, for the summary of `reproduce_command`."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(flat(summary))
@@ -157,7 +145,7 @@ def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
+    """Return the values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value
         for part, figures in summary.items()
@@ -166,7 +154,7 @@ def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def captions(summary: Mapping[str, Any]) -> dict[str, str]:
-    """What one sees in each of the paper's figures, with this run's numbers: fig6, fig7, fig8."""
+    """Return the captions of fig6, fig7 and fig8 with the values of this run."""
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     tells = "a threshold on it tells" if s["contact.raw_detectable"] else "no threshold on it tells"
@@ -200,7 +188,7 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """The identification table.
+    """Return the identification table.
 
     Args:
         true, estimate, deviation: (16,) each, offsets then phi as in Eq. (7), SI units.
@@ -209,7 +197,7 @@ def parameter_rows(
     rows = []
     for (symbol, index, unit, scale), values in zip(_PARAMETERS, columns, strict=True):
         truth, found, sigma = scale * values
-        # Two digits of the uncertainty say how many digits of the value mean something.
+        # Two digits of the uncertainty determine the decimals of the value.
         decimals = 3 if sigma <= 0 else int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
         true_text, found_text, sigma_text = (f"{x:.{decimals}f}" for x in (truth, found, sigma))
         error = f"{found - truth:+.{decimals}f}"
@@ -218,7 +206,7 @@ def parameter_rows(
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the figures depend on, by distribution."""
+    """Return the versions of Python and of the numerical libraries."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -232,16 +220,12 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Writes the page; figures are inside it, so that it can be moved and mailed.
+    """Write the HTML page with embedded figures. Without a date, equal runs give equal pages.
 
     Args:
-        path: of the HTML file.
-        setup: what was run, as name -> text; versions are added. No date: the same run gives the
-            same page.
-        summary: the figures of `reproduce` by full name.
-        figures: in the order of the page.
-        parameters: the identification table.
-        replay: file name of the Meshcat replay next to the page, if there is one.
+        setup: description of the run, name to text.
+        summary: values by full name.
+        replay: file name of the 3D replay beside the page, if any.
     """
     page = render(
         "drake_teleop.lab.reproduction",
@@ -259,7 +243,6 @@ def write_report(
 
 
 def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(number, unit, what it is) of what a reader wants to know first."""
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),

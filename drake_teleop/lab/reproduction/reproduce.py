@@ -1,25 +1,11 @@
 """`drake-teleop reproduce`, Figs. 6, 7 and 8 (long: the paper's experiments in their order).
 
-1. Identification (section IV): the slave runs an excitation trajectory; load and offsets come from
-   the wrist sensor's samples alone, by the recursive estimator in the loop.
-2. Figs. 6 and 7: one free movement each with that estimate, sigma = 0 in the loop ("the forces in
-   the bottom plots serve as inputs for the haptic device"). The curves for sigma = 1, 0.5 and 0 are
-   computed from the recorded samples of that run with the kernel of the loop; sigma = 1 is F - F_o.
-3. The same movements with an ideal sensor and the true load, eliminated from the reaction force
-   that the plant itself has in the wrist (`reaction.py`): what is left is rounding.
-4. Fig. 8: the contact, and the same movement without the sheet spring, for the threshold.
+1. Identification (section IV) by the recursive estimator in the loop.
+2. Figs. 6 and 7: free movements with sigma = 0; curves of all sigmas from the recorded samples.
+3. The same movements with the plant's own reaction force (`reaction.py`).
+4. Fig. 8: contact, and the same movement without the sheet spring.
 
-What is measured, all of it at the rate at which the hand is served:
-
-- A component (f_z in Fig. 6, tau_x in Fig. 7) is the one that the figure shows; `residual_norm` is
-  the length of the whole vector. Values at the slave unless the name says master.
-- The threshold of the contact's detection is 1.5 times the largest contact force that was
-  calculated in the free movement, which therefore never crosses it. Detected is the first
-  crossing; a false alarm is a crossing after the touch, with the movement's second turn at 0.6 s.
-- The raw force would be enough to detect the contact if any component of it, or its length, left
-  the range that it has in the free movement while the touch lasts (and 10 ms after it, for the
-  filter). Each threshold on the raw force, upper or lower, is in one of these ranges or never met.
-- `identification`: against the model's true load, which nothing else uses (but 3).
+The raw force can detect contact if a component or the norm leaves its range of the free movement.
 """
 
 from __future__ import annotations
@@ -76,7 +62,7 @@ Figures = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)
 _THRESHOLD_OVER_FREE = 1.5
-# The film of the contact, which lasts 40 ms, is this much slower.
+# Slow motion of the replay; the contact lasts 40 ms.
 _SLOW_MOTION = 8.0
 _FORCE_Z, _TORQUE_X = 2, 3
 _AXES = ("f_x", "f_y", "f_z", "|f|")
@@ -84,7 +70,7 @@ _AXES = ("f_x", "f_y", "f_z", "|f|")
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """One of the free movements: the recorded run and its wrench for each sigma (N, 6)."""
+    """Free movement with its wrench for each sigma (N, 6)."""
 
     scenario: Scenario
     result: SimulationResult
@@ -93,14 +79,11 @@ class FreeMotion:
 
 @dataclass(frozen=True, eq=False)
 class ContactMotion:
-    """The contact transition, and the same movement without the sheet spring.
+    """Contact transition, and the same movement without the sheet spring.
 
     Attributes:
-        scenario: with the sheet spring.
-        touched, free: the two runs.
-        raw, calculated: (N, 6) F - F_o and the contact wrench of the first; raw_free,
-            calculated_free of the second.
-        contact: (N,) whether there was contact, by the simulation's truth.
+        raw, calculated: (N, 6) F - F_o and contact wrench.
+        contact: (N,) true contact.
         threshold: of the detection [N].
     """
 
@@ -118,26 +101,15 @@ class ContactMotion:
 def reproduce_command(
     out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
 ) -> Figures:
-    """Repeats the paper's experiments and writes what they show into `out`.
-
-    summary.json, table.md (the paper against this run), fig6.png, fig7.png, fig8.png, replay.html,
-    report.html, identification.json, and in logs/ the records, each with its scenario; all of them
-    the same bytes every time. What is not, the speed, is in session.json.
-
-    Args:
-        out: the folder.
-        seed: of all noise; 0 if left out.
-        quiet: no progress bars and no table.
-        progress: False for no progress bars alone.
+    """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Returns:
-        An object of figures for free_force, free_torque, contact, identification and speed; all
-        but the last are the summary.
+        The summary, and the speed (not reproducible).
     """
     seed = seed or 0
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
-        # Each run has noise of its own.
+        # Each run has another seed.
         force, torque, contact = (
             _at_the_hands_rate(LoadScenario(name), seed + k)
             for k, name in enumerate(
@@ -172,7 +144,7 @@ def reproduce_command(
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Runs a free movement with a load estimate (16,) and computes its wrench for each sigma."""
+    """Run a free movement; calculate its wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     return FreeMotion(
         scenario, result, {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
@@ -180,7 +152,7 @@ def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> Free
 
 
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Runs the contact transition with a load estimate (16,), with and without the sheet."""
+    """Run the contact transition with and without the sheet."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     without = _without_sheet(scenario)
     free = _simulate(without, estimate, stage("Fig. 8: the same without contact"))
@@ -199,9 +171,11 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
 
 
 def free_figures(run: FreeMotion, ideal: Array, component: int, unit: str) -> Figures:
-    """The figures of Figs. 6 and 7; `component` of the wrench, names end in `unit`.
+    """Return the values of Figs. 6 and 7 for one component of the wrench.
 
-    `ideal` (N, 6) is what `eliminated_reaction` left.
+    Args:
+        ideal: (N, 6) from `eliminated_reaction`.
+        unit: suffix of the names.
     """
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
@@ -219,7 +193,7 @@ def free_figures(run: FreeMotion, ideal: Array, component: int, unit: str) -> Fi
 
 
 def contact_figures(run: ContactMotion) -> Figures:
-    """The figures of Fig. 8; a time is null if it did not happen."""
+    """Return the values of Fig. 8."""
     t, size = run.touched.t, _force(run.calculated)
     over = size > run.threshold
     touch = _touch(run)
@@ -241,10 +215,7 @@ def contact_figures(run: ContactMotion) -> Figures:
 
 
 def raw_excess(run: ContactMotion) -> Array:
-    """(4,) by how much f_x, f_y, f_z and |f| leave, in the touch, their range of the free run [N].
-
-    Negative where they stay inside: then no threshold on them separates contact from free motion.
-    """
+    """Return (4,) excess of f_x, f_y, f_z, |f| over the free range [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force(raw)]) for raw in (run.raw[_touch(run)], run.raw_free)
     )
@@ -256,7 +227,7 @@ def raw_excess(run: ContactMotion) -> Array:
 
 
 def identification_figures(load: LoadIdentification, scenario: Scenario) -> Figures:
-    """How far the estimate is from the truth, and how well it could be known."""
+    """Return errors and expected accuracy of the estimate."""
     error = load.estimate - _truth(scenario)
     mass, moment = load.estimate[6], load.estimate[7:10]
     true_mass, true_moment = _truth(scenario)[6], _truth(scenario)[7:10]
@@ -279,7 +250,7 @@ def identification_figures(load: LoadIdentification, scenario: Scenario) -> Figu
 def draw(
     force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Figures
 ) -> dict[str, Figure]:
-    """Figs. 6, 7 and 8."""
+    """Draw Figs. 6, 7 and 8."""
     pictures = {
         name: scaling_figure(
             run.result.t,
@@ -353,7 +324,7 @@ def _speed(progress: Progress) -> Figures:
 
 
 def _touch(run: ContactMotion) -> NDArray[np.bool_]:
-    """(N,) from the first instant of contact to FILTER_TAIL after the last."""
+    """Return (N,) from first contact to FILTER_TAIL after the last."""
     t = run.touched.t
     if not run.contact.any():
         return run.contact
@@ -362,7 +333,6 @@ def _touch(run: ContactMotion) -> NDArray[np.bool_]:
 
 
 def _turn_without_contact(run: ContactMotion) -> float | None:
-    """When the raw force is largest after the touch: the movement turns there."""
     t, size = run.touched.t, _force(run.raw)
     touch = _touch(run)
     if not touch.any():
