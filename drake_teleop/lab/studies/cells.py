@@ -1,10 +1,7 @@
-"""What can be compared if runs fail: never a level here with another one elsewhere.
+"""Comparable levels and cells of a study with failed runs.
 
-Where all runs of a level fail at some combination of the other factors, its mean over the rest is
-no match for another level's mean over everything. So levels of a factor, and cells of two factors,
-are compared over those combinations of the other factors' levels at which every one of them has a
-successful run. If there is no such combination, they are as many levels as any combination has; the
-others have no value, and a reason why.
+Levels are compared over those combinations of other factors at which all have a successful run. If
+there is none, the largest comparable set is used.
 """
 
 from __future__ import annotations
@@ -16,21 +13,20 @@ from numpy.typing import NDArray
 
 Flags: TypeAlias = NDArray[np.bool_]
 
-#: Why a level or a cell has no value.
+#: Reasons for a level or cell without value.
 NO_RUN, NO_SUCCESS = "no run", "no successful run"
 NOT_COMPARABLE = "not comparable with the others"
 TOO_FEW = "too few points"
 
 
 def comparable(there: Flags) -> tuple[Flags, Flags]:
-    """The rows that have the same columns.
+    """Return the rows and columns of a complete block.
 
     Args:
-        there: (rows, columns) whether there is a value, of levels or cells and of combinations.
+        there: (rows, columns) True where level (or cell) and combination have a value.
 
     Returns:
-        (rows,) as many as any column has, of several such sets the one that most columns have; and
-        (columns,) those that have all these rows.
+        (rows,) the most frequent largest pattern; (columns,) all columns with these rows.
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -40,12 +36,6 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
 
 
 def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
-    """(n,) why levels or cells have no value; empty if they have.
-
-    Args:
-        compared: (n,) whether they have.
-        runs: (n,) of each.
-        good: (n,) those of them that have the measure.
-    """
+    """Return (n,) why levels or cells have no value; empty if `compared`."""
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()

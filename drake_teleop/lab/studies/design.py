@@ -1,4 +1,4 @@
-"""What a study varies, and by which design: the file, and the points that follow from it."""
+"""Study file, and the design points that follow from it."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import itertools
@@ -18,21 +18,21 @@ from drake_teleop.lab.studies.measures import MEASURES, default_measures
 Array = NDArray[np.float64]
 Value: TypeAlias = float | str | bool | list[float]
 Values: TypeAlias = dict[str, Value]
-"""The factors' values of one point of the design, by field."""
+"""Values of the factors at one point, by field."""
 
 MANY_RUNS = 10**5
-"""So many are days or weeks: somebody has to say that they are meant."""
+"""More runs take days or weeks and require consent."""
 MOST_RUNS = 10**6
-"""The design of so many needs 1 GB."""
+"""Maximum number of runs; their design needs 1 GB."""
 
-# Among so many points (a power of two) an adaptive design chooses the next ones.
+# Number of candidates of an adaptive design (a power of two).
 _CANDIDATES = 1024
 
 
 @settings
 @dataclass
 class Factor:
-    """A field of the scenario that the study varies: over a list of what it takes, or a range."""
+    """Scenario field that the study varies."""
 
     field: str = plain("", "`block.field`, as it stands in a scenario file")
     values: list[float] = plain([], "the numbers that it takes")
@@ -44,23 +44,22 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed(self) -> Sequence[Value]:
-        """The values of a factorial design."""
+        """Return the values of a factorial design."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
 
     def at(self, share: float) -> Value:
-        """The value at a share from 0 up to 1 of the way through the range or the list."""
+        """Return the value at a share (0 to 1) of the range or the list."""
         if self.low is not None and self.high is not None:
             return self.low + share * (self.high - self.low)
         listed = self.listed()
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
-        """Where a value is in the space of the design: numbers from 0 to 1.
+        """Return the coordinates of a value, each from 0 to 1.
 
-        Numbers by their size; of words, flags and vectors each has an axis of its own, because
-        none of them is between two others.
+        Words, flags and vectors have one for each value.
         """
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
@@ -72,10 +71,10 @@ class Factor:
         return [(value - low) / (high - low) if high > low else 0.0]
 
     def check(self, where: str) -> None:
-        """Checks all that can be checked without the scenario.
+        """Check the factor without the scenario.
 
         Raises:
-            DrakeTeleopError: naming `where`.
+            DrakeTeleopError: with `where`.
         """
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
@@ -101,7 +100,7 @@ class Factor:
 @settings
 @dataclass
 class Study:
-    """What a study varies, by which design, and what it measures."""
+    """Factors, design and measures of a study."""
 
     description: str = plain("", "what the study is about")
     scenario: str = plain(
@@ -125,10 +124,10 @@ class Study:
     force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "of time_above_force_s")
 
     def check(self, where: str) -> None:
-        """Checks all that can be checked without the scenario.
+        """Check the study without the scenario.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         check_ranges(self, where)
         for name in self.measures:
@@ -165,21 +164,16 @@ class Study:
             )
 
     def size(self) -> int:
-        """The number of points."""
+        """Return the number of points."""
         if self.design == "factorial":
             return math.prod(len(factor.listed()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Refuses a study that is too large, before there is anything as large as it.
-
-        Args:
-            where: its place, for messages.
-            yes: whether many runs are meant; or what answers, if there are many.
+        """Refuse a study that is too large, before its design is created.
 
         Raises:
-            DrakeTeleopError: for more than `MOST_RUNS`, or for more than `MANY_RUNS` that are not
-                meant, saying how many there are.
+            DrakeTeleopError: above `MOST_RUNS`, or above `MANY_RUNS` without consent (`yes`).
         """
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
@@ -193,30 +187,29 @@ class Study:
             raise DrakeTeleopError(f"{what} are many", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
-        """The design: the factors' values at each of its points; of an adaptive one, the first."""
+        """Return all points; for an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
             combinations = itertools.product(*(factor.listed() for factor in self.factors))
             return [dict(zip(names, values, strict=True)) for values in combinations]
         if self.design == "sobol":
             return self._sobol(self.samples, self.seed)
-        # Enough to begin with: a few for each factor.
+        # At least two points for each factor.
         first = max(self.batch, 2 * (len(self.factors) + 1))
         return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
-        """The points that an adaptive design tries next; none when there are enough, or no others.
+        """Return the next points of an adaptive design.
 
         Args:
-            points: that were tried, n of them.
-            objective: (n,) at each; nan if it has none.
+            objective: (n,) at the n points; nan if failed.
         """
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
             return []
         from drake_teleop.lab.studies.adaptive import propose
 
-        # Others in each batch, or the points would all be on one grid.
+        # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
         drawn = self._sobol(_CANDIDATES, self.seed + len(points))
         candidates = list(
@@ -228,10 +221,9 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """The runs of some points, without their measures; `first` is the first one's number.
+        """Return runs without measures; `first` numbers the first point.
 
-        All points have the same seeds: what differs between them is not the noise. Every second
-        seed is left to the identification that goes before a run.
+        Every second seed is reserved for the identification.
         """
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [
@@ -242,7 +234,7 @@ class Study:
     def _sobol(self, count: int, seed: int) -> list[Values]:
         from scipy.stats import qmc
 
-        # A generator as `seed`: the keyword of every version, with the meaning of the new one.
+        # All SciPy versions accept a generator as `seed`.
         sobol = qmc.Sobol(len(self.factors), seed=np.random.default_rng(seed))
         shares = sobol.random_base2(count.bit_length() - 1)
         return [
@@ -251,7 +243,6 @@ class Study:
         ]
 
     def _places(self, points: Sequence[Values]) -> Array:
-        """(n, d) coordinates of points."""
         rows = [
             list(itertools.chain(*(f.coordinates(point[f.field]) for f in self.factors)))
             for point in points

@@ -1,18 +1,7 @@
-"""What a study's rows say about its factors: means with confidence intervals; the Pareto front.
+"""Effects of factors with confidence intervals, and the Pareto front.
 
-All points of a design have the same seeds, and the seeds are what the runs are a sample of. In a
-factorial design every level of a factor meets the same combinations of the others. So each mean
-is one over runs, calculated for each seed alone, and its interval is Student's for the mean over
-seeds. Differences between levels are taken within each seed: what a seed does to all points
-cancels. One repeat says nothing about other seeds, and has no intervals (nan).
-
-The points of any other design are a sample, too, and its levels differ by chance in what else is
-varied. There the effects are those of a regression, and the intervals hold for the design and the
-seeds together; see `level_model.py`. With one repeat the intervals of effects are those of the
-design alone.
-
-If points fail with every seed, levels are compared over those combinations of the other factors at
-which all of them have a successful run, in any design; see `cells.py`.
+Factorial designs have plain means with Student's intervals over seeds, differences within each
+seed; other designs a regression. Without interval the half width is nan.
 """
 
 from __future__ import annotations
@@ -35,19 +24,17 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-#: What a designer of the loop gives and takes: the hand's effort against what it gets for it.
+#: Measures of the Pareto front.
 PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Means with their intervals.
+    """Means over seeds with half widths of their intervals.
 
     Attributes:
-        mean: (n,) over the seeds.
-        half: (n,) half the width of the interval of the mean.
-        effect_half: (n,) half the width of the interval of the mean's difference from the mean of
-            all n, which is the narrower one if seeds differ in the same way at every level.
+        mean, half: (n,).
+        effect_half: (n,) for the difference from the mean of all n.
     """
 
     mean: Array
@@ -57,19 +44,16 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class MainEffect:
-    """What one factor does to a measure; nan at a level that cannot be compared.
+    """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: of its n levels, or of parts of its range.
-        runs: (n,) at each that have the measure.
-        mean: (n,) over the other factors and the seeds.
-        half: (n,) half the width of the interval of the mean.
-        effect: (n,) the difference of the mean from that over all levels.
-        effect_half: (n,) half the width of its interval.
-        why: (n,) why a level has no value; empty if it has.
-        compared: over so many combinations of the other factors' levels.
-        left_out: so many more there are.
-        fitted: whether a regression found it, see `level_model.py`.
+        names: of the n levels or parts of the range.
+        runs: (n,) number of runs with the measure.
+        mean, half: (n,) over other factors and seeds.
+        effect, effect_half: (n,) difference from the mean of all levels.
+        why: (n,) reason of a missing value.
+        compared, left_out: number of combinations of other levels.
+        fitted: True if a regression found it.
     """
 
     names: list[str]
@@ -86,16 +70,12 @@ class MainEffect:
 
 @dataclass(frozen=True, eq=False)
 class PairMeans:
-    """The means of a measure over two factors; nan in a cell that cannot be compared.
+    """Means of a measure over two factors of n and m levels.
 
     Attributes:
-        fields: of the two, n and m levels.
-        names: of the levels.
-        mean: (n, m) over the other factors and the seeds.
-        why: (n, m) why a cell has no value; empty if it has.
-        compared: over so many combinations of the other factors' levels.
-        left_out: so many more there are.
-        fitted: whether a regression found it, see `level_model.py`.
+        mean: (n, m) over other factors and seeds; nan if not comparable.
+        why: (n, m) reason of a missing value.
+        compared, left_out, fitted: see `MainEffect`.
     """
 
     fields: tuple[str, str]
@@ -110,13 +90,7 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """The mean of each of `count` levels, over seeds.
-
-    Args:
-        values: (N,) of the rows; nan does not count.
-        levels: (N,) indices of the level.
-        seeds: (N,).
-    """
+    """Return the mean of each of `count` levels of (N,) values; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -125,13 +99,13 @@ def estimated(
     with np.errstate(invalid="ignore"):
         table = sums / runs
     mean, half = interval(table)
-    # Differences only between what is there: a seed that lacks a level would shift all others.
+    # Seeds without some level are excluded: they would shift all other levels.
     _, effect_half = interval(table - table.mean(axis=0))
     return Estimate(mean, half, effect_half)
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """The main effects: a row for each measure, factor and level."""
+    """Return the main effects as a table."""
     import polars as pl
 
     table = [
@@ -156,7 +130,7 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """What each factor does to a measure, by field; nothing if no run has it."""
+    """Return the effect of each factor on a measure."""
     data = _Data(study, rows, measure)
     return (
         {} if data.nothing else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
@@ -164,15 +138,13 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """The means of a measure over each pair of factors; none if there are too few points."""
+    """Return the means of a measure over each pair of factors."""
     data = _Data(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.nothing else [found for pair in pairs if (found := data.pair(*pair))]
 
 
 class _Data:
-    """One measure at the points of a design, and how its effects are found: see above."""
-
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied(study)
         points, values = _points_and_seeds(rows, measure)
@@ -224,7 +196,7 @@ class _Data:
         kept, over, weights = self.model.compared(first, second)
         mean = np.full(len(kept), np.nan)
         mean[kept] = self.model.means(self.table, weights)[0]
-        # A cell in which no point happens to lie is fitted, too, but nobody has been there.
+        # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
         kept &= np.bincount(cell, self.runs, len(kept)) > 0
         mean[~kept] = np.nan
@@ -240,18 +212,16 @@ class _Data:
         return not isinstance(self.model, Factorial)
 
     def _combinations(self, over: NDArray[Any], *shown: int) -> int:
-        """How many of the levels of the other factors there are at this share of them."""
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
         return round(np.mean(over) * math.prod(others))
 
     def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
-        """Why cells have no value; (n,) `cell` is that of each point."""
         runs = np.bincount(cell, minlength=len(compared))
         return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
 def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    """The points, and (n, seeds) the values of a measure; nan where there is none."""
+    """Return points, and (n, seeds) values; nan where missing."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
@@ -261,13 +231,9 @@ def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, A
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Every point with the means of `PARETO`, their intervals, and whether it is on the front.
+    """Return every point with means of `PARETO`, or None without these measures.
 
-    On the front is a point to which no other is better or equal in everything. A point at which not
-    every run has all three is not compared: a mean over the runs that went well would flatter it.
-
-    Returns:
-        A row for each point, or None if the study does not measure all three.
+    Only points with all three measures at every run can be on the front.
     """
     import polars as pl
 
@@ -292,7 +258,7 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) which of the complete points no other complete one dominates; (n, k), small is good."""
+    """Return (n,) non-dominated complete points of (n, k) values; small is good."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -302,12 +268,12 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def varied(study: Study) -> list[Factor]:
-    """The factors that have more than one value."""
+    """Return the factors with more than one value."""
     return [factor for factor in study.factors if len(factor.listed()) > 1]
 
 
 def numbers(rows: pl.DataFrame, measure: str) -> Array:
-    """(N,) a measure, nan where a run has none."""
+    """Return (N,) a measure; nan where missing."""
     import polars as pl
 
     column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -1,4 +1,4 @@
-"""The pictures of a study: main effects, interactions, and the Pareto front."""
+"""Pictures of a study."""
 
 from __future__ import annotations
 
@@ -23,18 +23,14 @@ from drake_teleop.lab.studies.level_model import CONFIDENCE
 if TYPE_CHECKING:
     import polars as pl
 
-_LABELLED = 24  # points of the front that have room for their names
-_WIDTH = 24  # letters that have room below a picture
-# What has no value is hatched, by the reason.
+_LABELLED = 24  # largest number of labelled points
+_WIDTH = 24  # letters that fit below a picture
+# Hatches of cells without value.
 _HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
-    """Writes those pictures that mean something for this study into the folder.
-
-    Returns:
-        Their files; of an earlier study of this folder none remain.
-    """
+    """Write the applicable pictures; remove earlier ones."""
     for old in out.glob("*.png"):
         old.unlink()
     measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
@@ -53,11 +49,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """The mean of each measure at each level of each factor; dotted, that of all levels.
-
-    Bars are intervals of the level's difference from the mean of all, which is what a factor does.
-    A level that cannot be compared is hatched.
-    """
+    """Draw the mean of each measure at each level; bars are effect intervals."""
     factors, fitted, reasons = varied(study), False, set[str]()
     with house_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -104,19 +96,16 @@ def _name(axes: Axes, levels: list[str]) -> None:
 
 
 def _combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    """What is left of the other factors, if something is left out."""
     if not found.left_out:
         return ""
     return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
 
 
 def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
-    """A hatched cell of width and height 1."""
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
 
 
 def _legend(figure: Figure, reasons: Iterable[str]) -> None:
-    """Of the reasons for hatched cells, if there are any."""
     names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
     if names:
         patches = [_hatched(why, (0.0, 0.0)) for why in names]
@@ -124,10 +113,7 @@ def _legend(figure: Figure, reasons: Iterable[str]) -> None:
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """The mean of a measure over each pair of factors; None if there are too few points for it.
-
-    A cell without a value is hatched.
-    """
+    """Draw the mean of a measure over pairs of factors, or return None."""
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -157,7 +143,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
 
 
 def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Effort against task time and overshoot of the contact force; None if not measured."""
+    """Draw effort over time and force overshoot, or return None."""
     points = pareto(study, rows)
     if points is None or not points["complete"].any():
         return None
