@@ -1,4 +1,4 @@
-"""Identified loads that are kept: the same bits, never stale, and no harm from damaged files."""
+"""Cache of identified loads: same bits, never stale, robust to damaged files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
-# Numbers that no short decimal stands for, of a load that is about the tool.
+# A load near the tool, with numbers without short decimals.
 RNG = np.random.default_rng(1)
 COVARIANCE = np.diag(RNG.uniform(1e-9, 1e-7, 16))
 COVARIANCE[9, 9] = np.inf
@@ -42,7 +42,7 @@ DETECTS = replace(Scenario(), contact_detection=ContactDetectionConfig())
 
 @pytest.fixture
 def identifications(monkeypatch, tmp_path):
-    """The list of the scenarios that were identified; nothing is simulated for it."""
+    """Return the list of identified scenarios; no simulation runs."""
     asked = []
 
     def identify(scenario, stage):
@@ -55,7 +55,7 @@ def identifications(monkeypatch, tmp_path):
 
 
 def same_bits(a, b) -> bool:
-    """Whether two dataclasses have the same types and bytes throughout."""
+    """Return whether two dataclasses have equal types and bytes."""
     return type(a) is type(b) and all(
         type(x) is type(y) and np.asarray(x).dtype == np.asarray(y).dtype
         and np.asarray(x).tobytes() == np.asarray(y).tobytes()
@@ -167,8 +167,8 @@ def test_a_write_that_fails_leaves_nothing_and_is_no_error(identifications, tmp_
     monkeypatch.setattr(np, "savez", full)
     assert not identified_load(Scenario(), fresh=True).from_cache
     assert list((tmp_path / "cache").iterdir()) == [path]
-    assert identified_load(Scenario()).from_cache  # who reads meanwhile finds the whole of the old
-    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file, where the folder should be
+    assert identified_load(Scenario()).from_cache  # concurrent readers get the complete old file
+    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file instead of a folder
     assert not identified_load(Scenario()).from_cache
 
 

@@ -1,4 +1,4 @@
-"""`drake-teleop new`: what it writes is a station that works, for an arm of one's own."""
+"""`drake-teleop new`: working stations for custom arms."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARM = models_dir() / "rx90.sdf"
 
 @pytest.fixture
 def runs(monkeypatch):
-    """What would have been run."""
+    """Record run commands instead of running them."""
     calls = []
 
     def run(scenario, out, **options):
@@ -52,11 +52,11 @@ def test_a_station_is_written_and_run(tmp_path, runs, capsys):
     assert "6: joint_1" in capsys.readouterr().out
     plan = plan_station(ARM, "sensor", device="omega_6")
     scale = scenario.kinematic_scaling.translation_scale
-    # The device's workspace is within what the arm reaches, and the hand's way within the device's.
+    # The scaled device workspace is reachable, and the hand stays inside the device workspace.
     assert 0.055 * scale <= plan.place.half
     way = 1.5 * plan.swing + 0.01
     assert way / scale <= 0.113 / 2
-    # From the tool's lowest point down onto the wall, and no further than a centimetre into it.
+    # From the tool's lowest point onto the wall, at most 1 cm deep.
     tip = NominalSlave(scenario.slave).start_tip
     wall = scenario.environment[0].position[2]
     assert wall == pytest.approx(tip[2] - 1.5 * plan.swing, abs=1e-3)
@@ -90,7 +90,7 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
 
 @pytest.mark.parametrize("device", ["phantom_premium_15", "geomagic_touch", "omega_6", "falcon"])
 def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device):
-    """So that `analyze`, which cuts the loops at their common instants, takes the station."""
+    """`analyze` requires common sampling instants."""
     new_command(tmp_path / "mine", ARM, "sensor", device=device)
     scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
     assert scenario.master.own_period(scenario.rates.hand_hz) is None
@@ -110,7 +110,7 @@ def test_a_small_cube_is_better_than_a_joint_at_its_limit():
 
 
 def turned(rpy, tmp_path):
-    """The RX90 with a frame on its sensor that is turned."""
+    """Write the RX90 with a rotated frame on its sensor."""
     text = ARM.read_text()
     frame = f'<frame name="turned" attached_to="sensor"><pose>0 0 0 {rpy}</pose></frame>'
     path = tmp_path / "turned.sdf"
@@ -127,7 +127,7 @@ def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys
         capsys.readouterr().out.split()
     )
     assert plan_station(ARM, "sensor").about_z == ""
-    behind = tmp_path / "behind.sdf"  # the last joint's origin
+    behind = tmp_path / "behind.sdf"  # origin of the last joint
     behind.write_text(
         turned("0 0 0", tmp_path).read_text().replace("<pose>0 0 0 ", "<pose>0 0 -0.4 ")
     )
@@ -135,7 +135,7 @@ def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys
 
 
 def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, runs):
-    """Its last joint cannot bring x_S forwards, but to a side."""
+    """Its last joint cannot turn x_S forward."""
     text = ARM.read_text()
     joint = text.index('name="joint_6"')
     lower, upper = (text.index(f"<{tag}>", joint) for tag in ("lower", "upper"))
@@ -187,7 +187,7 @@ def odd_names(count: int) -> list[str]:
 
 
 def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, runs, monkeypatch):
-    """As the name of the arm's file or folder, of packages, the tool, the sensor's frame."""
+    """Names of the arm's file and folder, packages, tool, sensor frame."""
     plan = plan_station(ARM, "sensor")
     monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
     equal = 0
@@ -215,7 +215,9 @@ def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, 
 def test_a_station_of_an_odd_name_is_that_of_this_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()
     path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
-    (tmp_path / "arm.sdf").write_text(text.replace("<mass>", "<mass>1"))  # another one beside it
+    (tmp_path / "arm.sdf").write_text(
+        text.replace("<mass>", "<mass>1")
+    )  # a different arm beside it
     new_command(tmp_path / "mine", path, "1e-3", quiet=True)
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     assert (slave.path, slave.sensor_frame) == (path, "1e-3")

@@ -1,4 +1,4 @@
-"""`drake-teleop run`: what it writes, that it warns, and that it is the same every time."""
+"""`drake-teleop run`: files, warnings, reproducibility."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.signals import SIGNALS
 
-# Learns while it moves, so that no identification comes first.
+# The estimator runs in the loop, so no identification is needed.
 QUICK = """
 simulation: {duration: 0.15, settle: 0.05, seed: 4}
 load_estimator: {enabled: true}
@@ -35,7 +35,7 @@ operator:
 
 @pytest.fixture(scope="module")
 def typed(tmp_path_factory):
-    """Where what the README and the page for beginners show of `run` has been typed."""
+    """Run the commands of README and beginners' page; return their output folder."""
     folder = tmp_path_factory.mktemp("typed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -61,7 +61,7 @@ def identification(tmp_path_factory):
 
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
-    """Runs QUICK, with further lines, into a new folder, without its picture: that takes longer."""
+    """Return a function that runs QUICK with further lines, without its picture."""
     monkeypatch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
 
     def run(name: str, more: str = "", seed: int | None = None, quiet: bool = True):
@@ -114,14 +114,14 @@ def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
 
 @pytest.mark.slow
 def test_the_peg_is_put_into_the_slot(typed):
-    """With everything as it is shipped; `tests/operator/test_task.py` has what goes otherwise."""
+    """The shipped scenario; other outcomes: `tests/operator/test_task.py`."""
     summary = summary_of(typed / "insert")
     assert summary["success"] == 1 and summary["false_notices"] == 0
 
 
 @pytest.mark.slow
 def test_the_shipped_identification_is_the_identification(identification):
-    """Its sensor log gives the same load to the tools for recorded logs."""
+    """Its sensor log gives the same load with the log tools."""
     summary, out = identification
     assert summary["duration_s"] == 6.0
     assert (out / "replay.html").exists()
@@ -130,7 +130,7 @@ def test_the_shipped_identification_is_the_identification(identification):
     again = identify_log(out / "sensor_log.parquet", cutoff_hz=None, delay=0.0).identification
     found = np.concatenate([load.offsets, load.phi])
     from_log = np.concatenate([again.offsets, again.phi])
-    # One weights the channels by their noise, the other does not know it.
+    # Only one estimator weights the channels by their noise.
     assert np.all(np.abs(found - from_log) < 5 * again.standard_deviations)
 
 
@@ -149,7 +149,7 @@ def test_the_load_is_known_as_well_as_it_says(identification):
     assert np.all(error < [0.1, 0.1, 0.1, 0.005, 0.005, 0.005])
     low, high = intervals(load)
     truth = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
-    # Of 16 intervals of 95 % four or more miss once in a hundred times.
+    # With 16 intervals of 95 %, four or more misses have a probability of 1 %.
     assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 

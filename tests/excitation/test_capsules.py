@@ -1,4 +1,4 @@
-"""Capsules around shapes: they hold them, and not much more."""
+"""Tight bounding capsules of shapes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_capsule_around_a_beam_lies_along_it(long):
     capsule = bounding_capsule(Box(size))
     for corner in product(*[(-s / 2, s / 2) for s in size]):
         assert capsule.holds(Capsule(np.array([corner, corner]), 0.0))
-    # The beam's edges are 0.071 m from its axis; a ball about it would have 0.505 m.
+    # The beam's edges are 0.071 m from its axis; a ball would need 0.505 m.
     assert 0.0707 <= capsule.radius < 0.15
     ends = np.delete(capsule.ends, long, axis=1)
     np.testing.assert_array_equal(ends, 0.0)
@@ -28,7 +28,7 @@ def test_a_capsule_around_a_beam_lies_along_it(long):
 
 
 def test_a_short_beam_has_the_smallest_of_some_capsules():
-    """Ends at 0.9 of its half length: 3 % less volume than at the whole, 6 % less than at 0.8."""
+    """Ends at 0.9 of the half length: 3 % less volume than at 1.0, 6 % less than at 0.8."""
     capsule = bounding_capsule(Box(0.1, 0.1, 0.3))
     np.testing.assert_allclose(np.abs(capsule.ends[:, 2]), 0.9 * 0.15)
     assert capsule.radius == pytest.approx(np.linalg.norm([0.05, 0.05, 0.015]))
@@ -54,11 +54,11 @@ def test_a_capsule_holds_another_with_all_of_its_thickness(aside, radius, held):
 
 
 def test_what_capsules_keep_allows_for_three_quarters_of_what_they_are_too_large():
-    """Shapes that nearly touch, capsules 0 to 100 mm nearer: 25 mm are allowed for."""
+    """Shapes near contact, capsules 0 to 100 mm nearer: the correction is 25 mm."""
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
     nearer = touching - np.linspace(0.0, 0.1, 101)
     kept = _kept_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
     assert kept == pytest.approx(CLEARANCE - 0.025)
-    # But where shapes are free, capsules stay so in nine of ten postures.
+    # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
     assert _kept_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)

@@ -1,4 +1,4 @@
-"""Designs for the station's arm and for others: feasible, checked by other means, and of use."""
+"""Excitations of the station's arm and of other arms: feasibility, check, identification."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def designed(slave):
 
 @pytest.fixture(scope="module")
 def short(slave):
-    """A quick one, for what asks nothing of its quality."""
+    """Return a quick design, for tests that do not need its quality."""
     return excite(slave, starts=1, period=2.4, harmonics=2)
 
 
@@ -83,7 +83,7 @@ def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed)
         "position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance"
     }  # fmt: skip
     assert all(0 < use.share <= 1 for use in designed.uses)
-    # Some limit is what stops it, or more would have been better.
+    # A limit must be active, otherwise the optimum would be larger.
     assert designed.uses[0].share > 0.97
     assert slave.limits.phi[0] == pytest.approx(1.3 * 3.13)
 
@@ -99,18 +99,17 @@ def test_same_seed_same_trajectory_other_seed_another(slave, short):
 
 @pytest.mark.slow
 def test_the_executed_motion_keeps_the_limits(slave):
-    """The shipped trajectory in the whole simulation, with the station's joint control."""
     found = identify_load(LoadScenario("identification"))
     t, state = found.result.t, found.result["slave_state"]
     assert np.all(np.diff(t) < 1.001e-3)
     q, qd = state[:, :6], state[:, 6:]
     asked, _, _ = found.trajectory.evaluate(t)
-    # What was executed is not what was asked for: the control follows it with a lag.
+    # The control follows the trajectory with a lag.
     assert 0.01 < np.abs(q - asked).max() < 0.2
     uses = check_motion(slave, t, q, qd, np.gradient(qd, t, axis=0))
     assert len(uses) == len(LIMITS)
     assert all(use.share < 0.995 for use in uses)
-    # The motors' own torque, and what the sensor itself has read.
+    # Torque of the motors, and samples of the sensor.
     limits, wrench = slave.limits, found.result["measured_wrench_S"]
     assert np.all(np.abs(found.result["joint_torque"]) < limits.effort)
     norms = [np.linalg.norm(wrench[:, part], axis=1).max() for part in (slice(0, 3), slice(3, 6))]
@@ -120,7 +119,6 @@ def test_the_executed_motion_keeps_the_limits(slave):
 
 @pytest.mark.slow
 def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, monkeypatch):
-    """The link with the sensor is where the arm's own kinematics has it."""
     shown = {}
 
     class Canvas:
@@ -155,7 +153,7 @@ def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, mon
 
 @njit
 def record(constants, memory, estimator, remembered, table, truth, noise, samples):
-    """The sensor's chain and the motion estimation, over a whole record."""
+    """Return a record through sensor chain and motion estimation."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
         read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
@@ -165,10 +163,7 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
 def test_predicted_and_observed_scatter_agree(slave, short, source):
-    """200 records of one motion: noise, walks, quantisation, filter, estimated motion.
-
-    What the sensor is given is the same each time, so it is calculated once.
-    """
+    """200 noisy records of one motion; the noise-free sensor input is calculated once."""
     sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(source), 1 / 2000
     table, phi = slave.arm.table, slave.limits.phi / 1.3
     t = np.arange(0.0, 2.4, period)
@@ -199,7 +194,7 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
     motion = sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
-    # The accelerometer alone makes it worse than corrected by the encoders, these alone better.
+    # Deviations: encoders only < fused < accelerometer only.
     encoders, fused, accelerometer = (
         predicted_deviations(
             *motion,
@@ -215,10 +210,10 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
 
 @pytest.mark.slow
 def test_the_check_finds_every_kind_of_violation(slave, short):
-    """The same motion in a world where each limit in turn is a little less than what it uses."""
+    """Each limit in turn is a little below its use by the same motion."""
     uses = {use.limit: use.share for use in short.uses}
     limits = slave.limits
-    # Nothing may be so near that the check looks at it; with this clearance it does.
+    # Without this clearance all pairs could be beyond the search distance.
     wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
     distance = (
         0.2 / next(use for use in check(wide, short.trajectory) if use.limit == "clearance").share
@@ -263,7 +258,7 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
 
 
 def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
-    """A shape larger than its link, as the convex hull of a mesh is."""
+    """A shape larger than its link, such as the convex hull of a mesh."""
     text = urdf.read_text()
     assert text.count('size="0.2 0.2 0.1"') == 1
     slave = Slave(
@@ -281,13 +276,12 @@ def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
     assert "l0 and l2" not in named  # they touch in all postures
     still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
     assert all(use.share < 1 for use in check(found, still))
-    assert len(found.limits.pairs) > 0  # of the others
+    assert len(found.limits.pairs) > 0  # other pairs
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
 def test_what_a_scenario_has_to_touch_is_not_touched(name):
-    """The sheet spring, or the slot, stands in the room in which the tool moves."""
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
     assert all(use.share <= 1 for use in found.uses)
@@ -347,7 +341,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
     assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path" in words
-    # 80 % of what the model says; the gripper with its finger is the load, and 30 % more.
+    # 80 % of the model's limits; the load is gripper and finger plus 30 %.
     np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
     np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
     assert robot.limits.phi[0] == pytest.approx(1.3 * 0.9)
@@ -370,7 +364,7 @@ def test_a_mesh_that_cannot_be_read_is_named(urdf):
 
 
 def test_links_that_always_touch_are_neighbours(urdf):
-    """Two pairs, not next to each other in the chain: it is not Drake that leaves them out."""
+    """The two pairs are not adjacent, so Drake's own filter does not exclude them."""
     text = urdf.read_text()
     for shape in (
         '<mesh filename="package://absent/wrist.stl"/>',
@@ -454,7 +448,7 @@ def _joint(parent, child):
     ],
 )
 def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
-    """Drake reads what a model includes, after `check_model`."""
+    """Drake reads included models after `check_model`."""
     (tmp_path / "inside.sdf").write_text(_SDF.format(_LINKS + "".join(_joint(*e) for e in ends)))
     model = tmp_path / "model.sdf"
     model.write_text(_SDF.format(f"<include><uri>{tmp_path.as_uri()}/inside.sdf</uri></include>"))
@@ -507,10 +501,7 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
 
 
 def test_a_floor_without_end_is_kept_clear_of(tmp_path):
-    """A pendulum of 0.4 m above it, of which nobody knows how far it may swing.
-
-    While 1001 samples are looked at, it is said how far that is, now and then.
-    """
+    """A pendulum of 0.4 m above the floor."""
     model = tmp_path / "pendulum.xml"
     model.write_text("""<mujoco model="m"><worldbody><geom type="plane" size="0 0 1" pos="0 0 0.8"/>
     <body name="base" pos="0 0 1"><geom type="sphere" size="0.01" mass="1"/><body name="l1">
@@ -588,7 +579,7 @@ def test_options_of_models_need_one(capsys, tmp_path):
     scope="module", params=[(write_urdf, "l6", 6), (write_sdf, "wrist", 7)], ids=["urdf", "sdf"]
 )
 def foreign(request, tmp_path_factory):
-    """An arm, its trajectory by the command line, and how it ran it with 1.2 kg on the sensor."""
+    """Return an arm, its trajectory from the command line, and its execution with 1.2 kg."""
     write, frame, joints = request.param
     folder = tmp_path_factory.mktemp("arm")
     path, out = write(folder), folder / "excite"
@@ -614,13 +605,13 @@ def test_what_is_written_for_any_arm(foreign):
     q = table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy()
     trajectory = FourierTrajectory.load(out / "excitation.yaml")
     np.testing.assert_allclose(trajectory.evaluate(table["t"].to_numpy())[0], q, atol=1e-12)
-    # It was run, but not exactly.
+    # Executed with tracking errors.
     executed = recording.q[200:-200]
     assert 1e-4 < np.abs(executed - q).max() < 0.01
 
 
 def write_canonical(folder, t, readings, recording):
-    """Wrench and IMU by one clock."""
+    """Write wrench and IMU with one clock."""
     rng = np.random.default_rng(1)
     omega = recording.truth[:, 9:12] + 2e-3 * rng.standard_normal((len(t), 3))
     parts = {
@@ -637,7 +628,7 @@ def write_canonical(folder, t, readings, recording):
 
 
 def write_described(folder, t, readings, recording):
-    """Wrench of the other sign, and the pose that the arm's controller gives, at 500 Hz."""
+    """Write the opposite wrench, and the controller's pose at 500 Hz."""
     names = ["fx", "fy", "fz", "tx", "ty", "tz"]
     pl.DataFrame({"t": t} | dict(zip(names, -readings[:, :6].T, strict=True))).write_csv(
         folder / "wrench.csv"
@@ -660,7 +651,7 @@ def write_described(folder, t, readings, recording):
 @pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
 def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
-    """Excited, executed, measured with a noisy sensor, written as a log, identified."""
+    """Design, execution, noisy measurement, log file, identification."""
     _, joints, recording = foreign
     sensor = dataclasses.replace(
         without(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
@@ -678,7 +669,7 @@ def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
     assert stop.value.code == 0
     found = Identification.load(tmp_path / "load" / "identification.json")
     assert found.identifiable.all()
-    # A motion differentiated from poses has errors of its own, about as large as the stated ones.
+    # Differentiated poses add errors of about the stated size.
     deviations = found.standard_deviations[6:] * (1.0 if write_log is write_canonical else 2.0)
     assert np.abs((found.phi - recording.phi) / deviations).max() < 3.9  # 99.9 % for all ten
     mass, com, inertia = mass_com_inertia(recording.phi)

@@ -1,4 +1,4 @@
-"""Criteria and limits: what their docstrings say, and gradients against finite differences."""
+"""Criteria and limits: documented values, and gradients against finite differences."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_condition_numbers_are_what_their_docstring_says():
 
 
 def test_the_floor_of_kappa10_is_reached_and_never_passed():
-    """sqrt(8/3) for any motion; reached by isotropic, uncorrelated s and alpha, alpha^2 = 3 s^2."""
+    """The bound sqrt(8/3) needs isotropic, uncorrelated s and alpha with alpha^2 = 3 s^2."""
     axes = np.vstack([np.eye(3), -np.eye(3)])
     s = np.repeat(axes, 6, axis=0)
     alpha = np.sqrt(3) * np.tile(axes, (6, 1))
@@ -85,7 +85,7 @@ def test_an_unknown_criterion_lists_the_known_ones():
 
 
 def test_predicted_deviations_are_those_of_white_noise():
-    """Spread of weighted least squares over 400 draws, and A16 and D16 from the same covariance."""
+    """Scatter of weighted least squares over 400 draws; A16 and D16 from the same covariance."""
     samples = motion(200, seed=2)
     sigma = np.repeat(SCALES.noise, 3)
     rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
@@ -106,8 +106,8 @@ def test_predicted_deviations_are_those_of_white_noise():
 
 
 def test_what_the_filter_leaves_of_an_accelerations_noise_has_the_filters_poles():
-    """Of the station's filter, a step of which predicts by (1, T, T^2 / 2) and then corrects."""
-    T = 1 / 32000  # so short that the filter is nearly the continuous one
+    """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
+    T = 1 / 32000  # the filter is then nearly continuous
     for filter_ in motion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
         numerator, denominator = _correction(filter_, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
@@ -115,7 +115,7 @@ def test_what_the_filter_leaves_of_an_accelerations_noise_has_the_filters_poles(
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
         found = np.sort_complex(np.roots(denominator).astype(complex))
         np.testing.assert_allclose(found, poles, rtol=0.015)
-        # All of it at high frequencies, nothing at rest: there the encoders are believed.
+        # High frequencies pass; at zero frequency the encoders replace the accelerometer.
         assert numerator[0] == denominator[0] and numerator[-1] == 0.0
 
 
@@ -128,7 +128,7 @@ def test_the_length_is_never_above_the_radius_of_gyration():
 
 
 def limits_of(arm) -> Limits:
-    """All of them in reach of a moderate motion, three capsules, one of them still."""
+    """Return limits near a moderate motion, with three capsules, one of them fixed."""
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
     return Limits(
         q_middle=middle,
@@ -165,7 +165,7 @@ def arm():
     ("name", "sliding"), [*((name, []) for name in CRITERIA), ("kappa_w10", [0, 3])]
 )
 def test_gradients_of_criterion_and_limits(arm, name, sliding):
-    # With damping, which the station's arm has not; and as if some of its joints slid.
+    # Add damping, and make some joints prismatic.
     table = arm.table.copy()
     table[:-1, 23] = 0.5
     table[sliding, SLIDES] = 1.0
@@ -206,7 +206,7 @@ def test_the_largest_use_of_each_limit_is_that_of_its_definition(arm):
         "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
-    # 1 is where two capsules keep just what they have to.
+    # A use of 1 is the minimum distance.
     assert (found["clearance"] > 1.0) == (distances < limits.distances).any()
 
 
@@ -222,7 +222,6 @@ def test_candidates_begin_all_over_the_middle_of_the_range(arm):
 
 
 def test_slow_candidates_are_large_as_the_square_of_their_period(arm):
-    """Of the same accelerations, where velocities and the range have room."""
     wide = np.full(6, 1e3)
     limits = limits_of(arm)._replace(q_half=wide, velocity=wide, acceleration=np.ones(6))
     coefficients = []
@@ -234,8 +233,7 @@ def test_slow_candidates_are_large_as_the_square_of_their_period(arm):
 
 
 def test_the_best_candidates_within_the_limits_are_followed_first():
-    """Slack in the limits is worth nothing, but what is beyond them costs."""
-    numbers = count(-1)  # the search evaluates one before it begins
+    numbers = count(-1)  # the search evaluates one in advance
     uses = {0: 1.5, 60: 0.1}
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.array([next(numbers)]),
@@ -265,7 +263,7 @@ def test_what_is_better_is_noted_with_its_start_and_its_evaluations():
 
 
 def test_distances_of_capsules():
-    """Crossing lines, parallel segments, end to end, and points."""
+    """Crossing lines, parallel segments, collinear segments, points."""
     ends = np.array(
         [
             [[-1.0, 0, 0], [1, 0, 0]],

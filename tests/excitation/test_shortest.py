@@ -1,4 +1,4 @@
-"""The shortest motion that makes a load known."""
+"""Shortest motion for a tolerance of the load."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ def test_gradients_are_differences(slave: Robot) -> None:
 
 
 def test_what_is_asked_is_the_deviation_over_the_period(slave: Robot) -> None:
-    """Of the samples of the grid, all of which white noise of the sensor's density falls on."""
     problem = problem_of(slave)
     x = problem.candidate(np.random.default_rng(1), near_home=True)
     x[-1] = np.log(2.0)
@@ -71,7 +70,7 @@ def test_it_reaches_what_is_asked_within_all_limits(
 
 
 def test_the_search_knows_what_is_predicted(slave: Robot) -> None:
-    """But for random walks; without the accelerometer's noise it would be wrong 2 to 5 times."""
+    """Without the accelerometer's noise the factor would be 2 to 5."""
     problem, errors = problem_of(slave), errors_of(ASKED, slave.limits.phi)
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)

@@ -1,4 +1,4 @@
-"""The figures' layout: one scale, the master's axis, what is marked where."""
+"""Layout of the figures: equal scales, axis of the master, marks."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_all_subplots_have_the_same_scale_and_show_everything():
 @pytest.mark.pictures
 def test_the_right_hand_axis_is_the_masters():
     figure = scaling()
-    render(figure)  # secondary axes get their limits when they are drawn
+    render(figure)  # drawing sets the limits of secondary axes
     (right,) = figure.axes[0].child_axes
     np.testing.assert_allclose(np.array(right.get_ylim()) * 17.5, figure.axes[0].get_ylim())
     assert right.get_ylabel() == "at the master [N]"

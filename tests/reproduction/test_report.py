@@ -1,4 +1,4 @@
-"""The report: verdicts follow from the numbers, the page stands alone, nothing is made up."""
+"""Report: verdicts from numbers, self-contained page."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_parameters_are_printed_to_the_digits_that_mean_something():
     assert (rows[0].true, rows[0].estimate) == ("1.000", "1.010")
     assert (rows[0].error, rows[0].deviation) == ("+0.010", "0.012")
     assert (rows[6].symbol, rows[6].unit, rows[6].true) == ("m", "kg", "7.000")
-    # Moments and inertias are printed in g m and g m^2.
+    # Printed in g m and g m^2.
     assert (rows[7].true, rows[7].error) == ("8000", "+10")
     assert [row.index for row in rows[10:]] == ["xx", "xy", "xz", "yy", "yz", "zz"]
 

@@ -1,4 +1,4 @@
-"""`drake-teleop reproduce`: the figures of the paper, and that they follow from the physics."""
+"""`drake-teleop reproduce`: values of the paper's figures, and their dependence on physics."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_the_load_is_found_from_the_sensors_samples(run):
 
 @pytest.mark.slow
 def test_the_speed_was_measured(run):
-    """No bound: a test is never timed."""
+    """Without bound: tests do not measure time."""
     speed = run[0]["speed"]
     assert speed["real_time_factor"] > 0
     assert speed["cost_over_bare_plant"] > 1
@@ -116,7 +116,7 @@ def test_everything_is_written(run):
     assert page.count("data:image/png;base64,") == 3
     assert "contact.true_s" in page
     assert (out / "replay.html").stat().st_size > 1e6
-    # With each record its scenario, for `replay`.
+    # Each record has its scenario, for `replay`.
     scenarios = sorted(path.stem for path in (out / "logs").glob("*.yaml"))
     assert [f"{name}.parquet" for name in scenarios] == sorted(
         path.name for path in (out / "logs").glob("*.parquet") if "sensor_log" not in path.name
@@ -131,7 +131,6 @@ def test_everything_is_written(run):
 
 @pytest.mark.slow
 def test_the_bottom_plots_are_what_the_hand_gets(run):
-    """Computed afterwards from the samples, they are the loop's own output, scaled."""
     _, out = run
     load = Identification.load(out / "identification.json")
     for name in ("free_motion_force", "free_motion_torque", "contact_transition"):
@@ -153,7 +152,7 @@ def test_the_bottom_plots_are_what_the_hand_gets(run):
 
 @pytest.mark.slow
 def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
-    """The identification's log, without the states of the plant, gives the same load."""
+    """The log without states of the plant gives the same load."""
     _, out = run
     result = log(out, "identification")
     assert "contact_wrench_S" not in result
@@ -164,7 +163,7 @@ def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
     )
 
 
-# What the figures do when something is wrong.
+# Values for synthetic motions.
 
 
 def force(*components: float) -> np.ndarray:
@@ -173,7 +172,7 @@ def force(*components: float) -> np.ndarray:
 
 @pytest.fixture
 def motion() -> ContactMotion:
-    """100 N of swing, and 15 N of contact at 0.22 s, at 2 kHz without noise but for 0.5 N."""
+    """Return 100 N of motion and 15 N of contact at 0.22 s, at 2 kHz, with 0.5 N of noise."""
     t = np.arange(0.0, 0.8, 5e-4)
     free = np.zeros((len(t), 6))
     free[:, 2] = -30 + 70 * np.cos(2 * np.pi * (t - 0.05) / 0.38)
@@ -215,7 +214,7 @@ def test_any_axis_of_the_raw_force_that_tells_the_contact_counts(motion, axis):
 
 
 def test_the_length_of_the_raw_force_counts_too(motion):
-    """Each component inside its range, but never so long all together."""
+    """Each component is inside its range, but not the norm."""
     free, told = motion.raw_free.copy(), motion.raw.copy()
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.contact, 0] = 80.0
@@ -248,7 +247,7 @@ def test_without_contact_there_is_no_time_of_it(motion):
 
 
 def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn():
-    """Rotations about all axes, so that each term of V is in it; a little of the load is not."""
+    """Rotations about all axes excite each term of V."""
     sine = Sine(
         duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
     )
@@ -264,7 +263,7 @@ def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn(
 
 
 def test_a_wrong_mass_is_seen_in_what_is_left():
-    """The figures follow from the physics: 10 % of mass too much leaves 10 % of the force."""
+    """A mass error of 10 % leaves 10 % of the force."""
     scenario = replace(
         LoadScenario("free_motion_force"), simulation__settle=0.7, simulation__duration=0.4
     )

@@ -1,4 +1,4 @@
-"""Where all runs fail nothing is shown, and nothing else is averaged over what is not there."""
+"""Effects and pictures of studies with failed runs."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ TOUCH = Study(
 
 
 def fails(sigma: float, gamma: float) -> bool:
-    """As in `scaling_touch`: a large gamma needs a large sigma. 16 never works."""
+    """Return failures as in `scaling_touch`: a large gamma needs a large sigma; 16 always fails."""
     return gamma > 8 or sigma < {4.0: 0.5, 8.0: 1.0}.get(gamma, 0.0)
 
 
 def effort(sigma: float, gamma: float) -> float:
-    """Steepest where both are small, so that no straight line goes on beyond."""
+    """Return a nonlinear effort, so that a linear extrapolation is wrong."""
     return 1.0 + 10.0 * sigma**2 / gamma + np.log2(gamma) ** 2
 
 
@@ -61,10 +61,9 @@ def test_a_cell_without_a_successful_run_stays_empty():
 
 
 def test_no_effect_is_averaged_over_what_is_not_there():
-    """Levels differ by what they do at the same combinations; the table says at how many."""
     found = main_effects(TOUCH, rows_of(TOUCH, noise=0.1), EFFORT)
     sigma, gamma = found["force_scaling.sigma"], found["force_scaling.gamma"]
-    # All sigmas have gamma 0.25 and 1; sigma 1 alone has every gamma that any has.
+    # All sigmas have gamma 0.25 and 1; sigma 1 has all successful gammas.
     assert (sigma.compared, sigma.left_out) == (2, 3)
     assert (gamma.compared, gamma.left_out) == (1, 3)
     truth = np.array([np.mean([effort(s, g) for g in GAMMAS[:2]]) for s in SIGMAS])
@@ -101,7 +100,7 @@ def test_pictures_hatch_what_is_empty_and_say_why():
         assert [text.get_text() for text in figure.legends[0].get_texts()] == [NO_SUCCESS]
     words = [axes.get_title(loc="right") for axes in main.axes]
     assert words == ["over 2 of 5 combinations of the rest", "over 1 of 4 combinations of the rest"]
-    # Colours are of runs that there were.
+    # Only cells with runs have colours.
     assert pairs.axes[0].images[0].get_clim() == pytest.approx((1.9, effort(1.0, 0.25) + 0.9))
 
 
@@ -115,7 +114,7 @@ def test_the_levels_are_as_many_as_any_combination_has():
 
 
 def test_levels_that_never_meet_are_not_compared():
-    """One sigma has only small gammas, the other one only large ones."""
+    """One sigma has only small gammas, the other only large ones."""
     factors = [Factor("a.x", values=[0.0, 1.0]), Factor("a.y", values=[0.0, 1.0, 2.0])]
     study = Study(factors=factors, measures=[EFFORT])
     rows = pl.DataFrame(study.rows(study.points()))
@@ -128,7 +127,7 @@ def test_levels_that_never_meet_are_not_compared():
 
 
 def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
-    """A point with one run of six is as uncertain as that run, not as six of its like."""
+    """A point with one run of six is as uncertain as one run."""
     random, inside, narrow = np.random.default_rng(2), [], []
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = np.ones((6, 6), dtype=bool)
@@ -144,7 +143,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
 
 
 def test_their_widths_are_those_of_least_squares():
-    """With a column for each point and each seed, and what Student's interval shows of it."""
+    """Reference: regression with a column for each point and each seed."""
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
@@ -179,13 +178,13 @@ def test_a_regression_does_not_go_on_beyond_the_edge_of_failures():
     lost = model.failed[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())
-    # The edge goes through one of them: one of its four points is on this side.
+    # The edge of failures crosses one cell: one of its four points succeeded.
     x, y = (model.factors[k].index for k in (0, 1))
     assert known[(x == 3) & (y == 1)].sum() == 1
 
 
 def looked(design: str) -> tuple[Study, pl.DataFrame]:
-    """A study whose points leave out a corner, and more cells by chance."""
+    """Return a study without points in a corner and in some random cells."""
     factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
     study = Study(factors=factors, design=design, samples=32, objective=EFFORT, measures=[EFFORT])
     points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(5)

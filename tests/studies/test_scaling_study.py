@@ -1,4 +1,4 @@
-"""The answer: what is put into the rows comes out of it, and it says how sure it is."""
+"""Answer of the scaling study for synthetic rows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
 
 
 def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndarray]]:
-    """Effort rises with both, force falls with gamma, time has its least in the middle."""
+    """Effort rises with both scales, force falls with gamma, time has a minimum in the middle."""
     noise = np.random.default_rng(0)
     sigma, gamma = np.meshgrid([0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8], indexing="ij")
     means = {
@@ -43,7 +43,7 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
 
 
 def test_the_best_point_of_each_way_of_counting():
-    # (sigma, gamma) as indices: no inertia always; little, medium and much contact.
+    # Indices of (sigma, gamma).
     for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
         found = answer(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
@@ -52,7 +52,7 @@ def test_the_best_point_of_each_way_of_counting():
         assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
         assert found.best.sum() == pytest.approx(1.0)
     assert answer(tables(), ("effort",)).best[0, 0] > 0.95
-    # Nothing there depends on sigma, and it does not pretend to know.
+    # Without dependence on sigma the choice must be uncertain.
     assert answer(tables(), ("force",)).best.max() < 0.95
 
 
@@ -120,7 +120,7 @@ def test_they_are_a_thousand_runs_over_the_same_scales():
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_the_answer_of_a_folder(tmp_path, monkeypatch):
-    """The studies are not run here; their rows are made up."""
+    """With synthetic rows instead of runs."""
 
     def made_up(name, out, *, repeats, **others):
         study = LoadStudy(name)

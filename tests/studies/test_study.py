@@ -1,4 +1,4 @@
-"""`drake-teleop study`: the design, the store that survives a kill, the same rows everywhere."""
+"""`drake-teleop study`: design, crash-safe store, reproducible rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.signals import SIGNALS
 
-# Learns while it moves, so that no identification comes first.
+# The estimator runs in the loop, so no identification is needed.
 SCENARIO = """
 simulation: {duration: 0.05, settle: 0.02}
 operator:
@@ -48,7 +48,7 @@ factors:
   - {field: simulation.max_step, values: [1e-3]}
 repeats: 2
 """
-# A study without a station, killed 8 times; its runs take 1 ms, and every seventh fails.
+# A study without a station is killed 8 times; runs take 1 ms, every seventh fails.
 FAKE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
@@ -112,9 +112,9 @@ def serial(files):
 
 @pytest.fixture
 def two_runs(monkeypatch):
-    """A study has one seed and two points, and this process alone; one load serves all.
+    """Reduce a study to one seed, two points and this process; one load serves all.
 
-    That each slave, sensor and seed has its own is tested in test_identified_load.py.
+    `test_identified_load.py` tests the loads of slaves, sensors and seeds.
     """
     loads: list[IdentifiedLoad] = []
 
@@ -142,7 +142,7 @@ def two_runs(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
-    """Down to two runs each, they come to their end."""
+    """With two runs each."""
     monkeypatch.chdir(tmp_path)
     page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
     (file,) = re.findall("```yaml\n(scenario: .*?)```", page, re.S)
@@ -150,7 +150,7 @@ def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
     type_in("docs/studies.md", "drake-teleop study")
     (script,) = re.findall("```python\n(from pathlib.*?)```", page, re.S)
     names: dict = {}
-    exec(compile(script, "studies.md", "exec"), names)  # and finds that all is done
+    exec(compile(script, "studies.md", "exec"), names)  # all runs are complete
     assert names["summary"] == json.loads(Path("out/study/summary.json").read_text())
     type_in("README.md", ".venv/bin/drake-teleop study")
     for out in ("study", "touch"):
@@ -176,10 +176,10 @@ def test_a_row_for_each_run(serial):
     assert summary["runs"] == 12
     assert summary["points"] == 6
     assert summary["failed"] == rows["error"].count() == 0
-    # Seeds are those of the repeats, for every point; another one gives other noise.
+    # All points share the seeds of the repeats; another seed gives other noise.
     assert rows["seed"].to_list() == [0, 2] * 6
     assert rows["rms_force_to_master_N"].n_unique() == 12
-    # A load that is felt in full is heavier than one that is not.
+    # The full load gives a larger force.
     mean = rows.group_by("force_scaling.sigma").agg(pl.col("rms_force_to_master_N").mean())
     assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
 
@@ -238,7 +238,7 @@ def test_kills_lose_and_double_no_row(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
     script, killed, whole, report = (tmp_path / name for name in names)
     script.write_text(FAKE)
-    # What it prints is also what processes of its own print whose parent is killed.
+    # The output also contains that of its child processes after a kill.
     answer = subprocess.run(
         [sys.executable, *map(str, (script, killed, whole, report))],
         capture_output=True,
@@ -283,7 +283,6 @@ def test_another_study_does_not_mix_with_the_rows(serial, files):
 
 @pytest.mark.parametrize("damage", ["empty", "no rows", "damaged"])
 def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, damage):
-    """In the folder of a study that is complete but for that."""
     study = Study(factors=[Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0])], measures=[])
     calls: list[int] = []
 
@@ -334,11 +333,11 @@ def test_an_interrupt_says_what_is_kept(tmp_path):
     with pytest.raises(KeyboardInterrupt, match="keeps 2 of 4 runs"):
         run_study(study, tmp_path, work, {}, jobs=1)
     assert run_study(study, tmp_path, work, {}, jobs=1).height == 4
-    assert len(calls) == 5  # the third one again
+    assert len(calls) == 5  # the third run again
 
 
 def dying(own: int, at: float):
-    """A run that ends its process at one value; a closure, so that nobody has to import this."""
+    """Return a run that ends its process at one value; a closure needs no import."""
 
     def work(values, seed):
         assert os.getpid() != own
@@ -371,7 +370,7 @@ def test_processes_that_never_begin_are_an_error(tmp_path):
 
 
 class Unreadable:
-    """A work that ends each process that receives it."""
+    """Work that ends each process that unpickles it."""
 
     def __reduce__(self):
         return os._exit, (1,)
@@ -410,7 +409,7 @@ def alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # One that has ended and that nobody has buried yet.
+    # A zombie process.
     return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
 
 
@@ -423,7 +422,6 @@ def wait_for(condition, seconds=60.0):
 
 @pytest.mark.slow
 def test_factors_over_flags_and_vectors(files, tmp_path):
-    """They reach the scenario, and the table has a column of their kind."""
     path = files / "kinds.yaml"
     path.write_text("""
 scenario: tiny.yaml
@@ -441,12 +439,12 @@ factors:
     )
     assert rows["rms_force_to_master_N"].n_unique() == 8
     heavy = rows.filter(pl.col("wrist_sensor.ideal"))["rms_force_to_master_N"].to_list()
-    # All that is felt of a load that is being learnt is in proportion to it, offsets apart.
+    # The displayed force is proportional to the load, without offsets.
     assert heavy[1] / heavy[0] == pytest.approx((3.13 + 2) / 3.13, rel=0.1)
 
 
 def bowl(values, seed):
-    """Smallest at (0.3, "b"), with noise that is the same at all points."""
+    """Minimum at (0.3, "b"), with equal noise at all points."""
     away = (values["a.x"] - 0.3) ** 2 + (values["a.w"] != "b")
     if values["a.w"] == "c" and values["a.x"] > 0.9:
         raise ValueError("out of reach")
@@ -479,7 +477,7 @@ def test_an_adaptive_design_finds_the_best_point(searched):
     )
     assert best["a.w"] == "b"
     assert best["a.x"] == pytest.approx(0.3, abs=0.01)
-    # It looks where it is good: chance would have a third of the points there.
+    # The search concentrates there; random points would have one third.
     late = rows.filter(pl.col("point") >= 20)
     assert (late["a.w"] == "b").mean() > 0.5
     assert len(rows.select("a.x", "a.w").unique()) == 40
@@ -491,7 +489,7 @@ def test_an_adaptive_design_goes_on_after_any_stop(tmp_path, searched):
 
     def stopping(values, seed):
         calls.append(values)
-        if len(calls) % 15 == 0:  # of every batch of 8 at another run
+        if len(calls) % 15 == 0:  # at another run of each batch of 8
             raise KeyboardInterrupt
         return bowl(values, seed)
 
@@ -516,7 +514,7 @@ def test_sobol_points_are_balanced():
     study = Study(factors=factors, design="sobol", samples=64, seed=5)
     points = study.points()
     numbers = np.array([point["a.b"] for point in points])
-    # One in each of 64 equal parts of the range, and every half has as many of both words.
+    # One point in each of 64 parts of the range, and equal words in each half.
     np.testing.assert_array_equal(np.sort((numbers + 1) / 4 * 64 // 1), np.arange(64))
     words = np.array([point["a.c"] for point in points])
     assert [sum(words[numbers < 1] == word) for word in "xy"] == [16, 16]
@@ -533,7 +531,7 @@ def test_a_factorial_design_has_every_combination_once():
 
 
 def test_measures_of_a_known_motion():
-    """A hand pulls with (3, 4, 0) N at 0.2 m/s along x; the display shows 2 sin t along z."""
+    """The hand pulls (3, 4, 0) N at 0.2 m/s along x; the display has 2 sin t along z."""
     t = np.linspace(0.0, 2 * math.pi, 20001)
     signals = {name: np.zeros((len(t), 6)) for name in ("hand_wrench_E", "twist_master")}
     signals |= {
@@ -543,7 +541,7 @@ def test_measures_of_a_known_motion():
     signals["hand_wrench_E"][:, 5] = 0.1
     signals["twist_master"][:, 0], signals["twist_master"][:, 5] = 0.2, 0.5
     signals["force_to_master"][:, 2] = 2 * np.sin(t)
-    signals["force_to_master"][:, 3] = 9.0  # torques do not count
+    signals["force_to_master"][:, 3] = 9.0  # torques are ignored
     signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
     result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
     found = measured(result, Scenario(), default_measures(), 1.0)
@@ -560,7 +558,6 @@ def test_measures_of_a_known_motion():
 
 
 def test_a_preset_brings_its_values():
-    """A factor acts as if it stood in the file: a preset is more than its name."""
     work = studies.StationWork({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
@@ -678,7 +675,7 @@ def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_proc
 
 
 def test_the_time_that_is_left_follows_from_the_last_runs():
-    """Runs take two seconds, four at once; the first two identify a load, too."""
+    """Runs take 2 s, four in parallel; the first two also identify a load."""
     shown = []
     told = Told(100)
     told.start(lambda fraction, words="": shown.append((fraction, words)), 4)
@@ -705,7 +702,6 @@ def test_loads_that_every_run_identifies_are_counted_in_the_end():
 
 
 def test_rows_of_a_large_study_come_one_by_one_at_first(tmp_path):
-    """A chunk of eight runs would be the first thing to be seen of it."""
     factor = Factor("a.b", low=0.0, high=1.0, levels=1000)
     study = Study(factors=[factor], repeats=5, measures=["hand_work_J"])
     sizes = []

@@ -1,4 +1,4 @@
-"""What a study's rows say: intervals that hold what they promise, the front, the pictures."""
+"""Statistics of a study: coverage of intervals, Pareto front, pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STUDY = Study(
 
 
 def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
-    """Effort falls with sigma and time rises; gamma does nothing; each seed moves all points."""
+    """Effort falls with sigma and time rises; gamma has no effect; each seed shifts all points."""
     rows, noise = study.rows(study.points()), np.random.default_rng(0)
     for row in rows:
         sigma, seed = row.get("force_scaling.sigma", 0.0), row["seed"]
@@ -39,7 +39,7 @@ def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
 
 
 def test_intervals_hold_what_they_promise():
-    """Of 2000 studies of 5 seeds, 95 % have the true mean, and the true effect, in the interval."""
+    """95 % of 2000 studies with 5 seeds contain true mean and true effect."""
     noise, levels = np.random.default_rng(1), np.tile([0, 1, 2], 5)
     seeds, truth = np.repeat(np.arange(5.0), 3), np.array([1.0, 2.0, 6.0])
     inside, effect_inside, widths = [], [], []
@@ -52,7 +52,7 @@ def test_intervals_hold_what_they_promise():
         widths.append(found.effect_half / found.half)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert np.mean(effect_inside) == pytest.approx(0.95, abs=0.01)
-    assert np.median(widths) < 0.3  # what a seed does to all levels cancels
+    assert np.median(widths) < 0.3  # common shifts of a seed cancel
 
 
 def test_what_is_not_a_number_does_not_count():
@@ -90,7 +90,7 @@ def test_points_with_failures_are_not_on_the_front():
     found = pareto(STUDY, table(failing=5))
     assert found["complete"].to_list() == [True] * 5 + [False]
     assert not found["front"][5]
-    assert found["front"].sum() >= 3  # each sigma has a point there
+    assert found["front"].sum() >= 3  # one point of each sigma
     assert pareto(Study(factors=STUDY.factors, measures=["success"]), table()) is None
 
 
