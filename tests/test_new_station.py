@@ -42,7 +42,7 @@ def runs(monkeypatch):
     return calls
 
 
-def test_a_station_is_written_and_run(tmp_path, runs, capsys):
+def test_station_is_written_and_run(tmp_path, runs, capsys):
     new_command(tmp_path / "mine", ARM, "sensor", device="omega_6", sensor="ati_gamma_imu")
     path = tmp_path / "mine" / "station.yaml"
     assert runs == [(path, tmp_path / "mine" / "first_run", {"quiet": False})]
@@ -66,7 +66,7 @@ def test_a_station_is_written_and_run(tmp_path, runs, capsys):
         new_command(tmp_path / "mine", ARM, "sensor")
 
 
-def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatch):
+def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch):
     (tmp_path / "models").symlink_to(ARM.parent)
     monkeypatch.chdir(tmp_path)
     type_in("docs/start.md", ".venv/bin/drake-teleop new")
@@ -74,7 +74,7 @@ def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatc
     assert runs == [(Path("out/mine/station.yaml"), Path("out/mine/first_run"), {"quiet": False})]
 
 
-def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
+def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
     place, half = find_place(arm).position, find_place(arm).half
     assert place[0] > abs(place[1]) and place[2] > 0.1
@@ -89,7 +89,7 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
 
 
 @pytest.mark.parametrize("device", ["phantom_premium_15", "geomagic_touch", "omega_6", "falcon"])
-def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device):
+def test_rates_match_the_device(tmp_path, runs, device):
     """`analyze` requires common sampling instants."""
     new_command(tmp_path / "mine", ARM, "sensor", device=device)
     scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
@@ -98,7 +98,7 @@ def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device)
     linearize(scenario.without_environment(), load_estimate=true_load(scenario))
 
 
-def test_a_small_cube_is_better_than_a_joint_at_its_limit():
+def test_joint_margin_counts_more_than_cube_size():
     place = new_station.Place(np.zeros(7), True, np.zeros(6), half=0.05, room=0.2)
     worse = [
         place._replace(half=0.3, room=0.01),
@@ -118,23 +118,23 @@ def turned(rpy, tmp_path):
     return path
 
 
-def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys):
+def test_note_about_another_axis_along_the_last_joint(tmp_path, runs, capsys):
     for rpy, axis, back in (("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")):
         plan = plan_station(turned(rpy, tmp_path), "turned")
-        assert f"{axis}_S is along" in plan.about_z and f'rpy="{back}"' in plan.about_z
+        assert f"{axis}_S is along" in plan.axis_note and f'rpy="{back}"' in plan.axis_note
     new_command(tmp_path / "mine", turned("3.1416 0 0", tmp_path), "turned")
     assert "note: z_S points to the tool, and here -z_S" in " ".join(
         capsys.readouterr().out.split()
     )
-    assert plan_station(ARM, "sensor").about_z == ""
+    assert plan_station(ARM, "sensor").axis_note == ""
     behind = tmp_path / "behind.sdf"  # origin of the last joint
     behind.write_text(
         turned("0 0 0", tmp_path).read_text().replace("<pose>0 0 0 ", "<pose>0 0 -0.4 ")
     )
-    assert "-z_S is along" in plan_station(behind, "turned").about_z
+    assert "-z_S is along" in plan_station(behind, "turned").axis_note
 
 
-def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, runs):
+def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
     """Its last joint cannot turn x_S forward."""
     text = ARM.read_text()
     joint = text.index('name="joint_6"')
@@ -154,8 +154,8 @@ def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, 
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
-def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(new_station, "_HALVES", (2.0, *new_station._HALVES))
+def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_CUBE_HALVES_M", (2.0, *new_station._CUBE_HALVES_M))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     new_command(tmp_path / "mine", path, "sensor")
@@ -186,7 +186,7 @@ def odd_names(count: int) -> list[str]:
     return [*PIECES, *drawn][:count]
 
 
-def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, runs, monkeypatch):
+def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     """Names of the arm's file and folder, packages, tool, sensor frame."""
     plan = plan_station(ARM, "sensor")
     monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
@@ -212,7 +212,7 @@ def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, 
 
 
 @pytest.mark.parametrize("name", ["arm.sdf #2", "arm: v2", "*arm", "a\nb", "010", "%41", "\udcff"])
-def test_a_station_of_an_odd_name_is_that_of_this_arm(name, tmp_path, runs):
+def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()
     path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
     (tmp_path / "arm.sdf").write_text(
@@ -224,8 +224,8 @@ def test_a_station_of_an_odd_name_is_that_of_this_arm(name, tmp_path, runs):
     assert NominalSlave(slave).arm.num_joints == 6
 
 
-def test_what_is_read_as_another_station_leaves_nothing(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(new_station, "_from", lambda folder, path: "tool.sdf")
+def test_misread_station_leaves_no_files(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_relative_path", lambda folder, path: "tool.sdf")
     with pytest.raises(DrakeTeleopError, match="is read as another station"):
         new_command(tmp_path / "a" / "mine", ARM, "sensor")
     assert list(tmp_path.iterdir()) == [] and runs == []
@@ -240,7 +240,7 @@ def test_what_is_read_as_another_station_leaves_nothing(tmp_path, runs, monkeypa
         ({"frame": "wrist"}, "wrist"),
     ],
 )
-def test_what_is_not_known_is_one_line_and_nothing_is_written(options, says, tmp_path, runs):
+def test_unknown_name_is_one_line_and_writes_no_files(options, says, tmp_path, runs):
     frame = options.pop("frame", "sensor")
     with pytest.raises(DrakeTeleopError, match=says):
         new_command(tmp_path / "mine", ARM, frame, **options)

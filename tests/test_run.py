@@ -73,7 +73,7 @@ def quick(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_contact_is_run_with_an_identified_load(contact):
+def test_contact_scenario_uses_an_identified_load(contact):
     summary, out = contact
     assert summary["warnings"] == []
     assert summary["mass_error_percent"] < 0.2
@@ -105,7 +105,7 @@ def test_everything_is_written(contact):
 
 
 @pytest.mark.slow
-def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
+def test_written_scenario_is_the_one_that_was_run(typed):
     contact, mine = (
         sorted((typed / name / "log.parquet").iterdir()) for name in ("contact", "mine")
     )
@@ -113,14 +113,14 @@ def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
 
 
 @pytest.mark.slow
-def test_the_peg_is_put_into_the_slot(typed):
+def test_peg_task_succeeds(typed):
     """The shipped scenario; other outcomes: `tests/operator/test_task.py`."""
     summary = summary_of(typed / "insert")
     assert summary["success"] == 1 and summary["false_notices"] == 0
 
 
 @pytest.mark.slow
-def test_the_shipped_identification_is_the_identification(identification):
+def test_shipped_identification_matches_the_log_tools(identification):
     """Its sensor log gives the same load with the log tools."""
     summary, out = identification
     assert summary["duration_s"] == 6.0
@@ -135,7 +135,7 @@ def test_the_shipped_identification_is_the_identification(identification):
 
 
 @pytest.mark.slow
-def test_the_load_is_known_as_well_as_it_says(identification):
+def test_load_errors_match_their_stated_deviations(identification):
     _, out = identification
     load = Identification.load(out / "identification.json")
     scenario = LoadScenario("identification")
@@ -154,7 +154,7 @@ def test_the_load_is_known_as_well_as_it_says(identification):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
+def test_files_are_reproducible_for_a_seed(quick):
     _, first = quick("first")
     _, again = quick("again")
     summary, other = quick("other", seed=5)
@@ -168,7 +168,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
 
 
 @pytest.mark.slow
-def test_a_scenario_that_learns_needs_no_identification_before(quick):
+def test_enabled_load_estimator_needs_no_identification(quick):
     summary, out = quick("learning")
     assert not (out / "identification.json").exists()
     assert summary["seed"] == 4
@@ -176,7 +176,7 @@ def test_a_scenario_that_learns_needs_no_identification_before(quick):
 
 
 @pytest.mark.slow
-def test_saturation_and_why_a_task_failed_are_said_in_the_table_too(quick, capsys):
+def test_table_contains_saturation_and_reason_of_failure(quick, capsys):
     more = "  task: !Reach {t_start: 0.1}\nwrist_sensor: {force_range: [100, 100, 31]}"
     summary, _ = quick("saturated", more, quiet=False)
     assert summary["success"] == 0.0
@@ -217,7 +217,7 @@ def test_bounces_belong_to_one_contact():
 
 
 @pytest.mark.slow
-def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, capsys):
+def test_detector_notices_contact_before_the_operator(tmp_path, capsys):
     text = (scenarios_dir() / "touch.yaml").read_text()
     path = tmp_path / "touch.yaml"
     path.write_text(text + "contact_detection: {}\n")
@@ -234,7 +234,7 @@ def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, c
     assert "task_time_s" in printed
 
 
-def test_where_nothing_was_touched_there_is_no_time_of_notice():
+def test_detection_delay_is_empty_without_contact():
     noticed = np.array([0.0, 1.0, 1.0, 0.0])
     signals = {"contact": noticed, "contact_at_hand": noticed}
     specs = [SIGNALS[name] for name in signals]

@@ -18,7 +18,7 @@ from drake_teleop.station.slave.slave_config import Slave
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])
-def test_how_far_the_offsets_have_wandered_does_not_depend_on_the_rate(rate_hz):
+def test_offset_drift_does_not_depend_on_the_rate(rate_hz):
     """The mean of a walk K sqrt(t) over T is K sqrt(T / 3) from its start (Wiener)."""
     duration = 10.0
     sensor = WristSensorConfig(
@@ -37,7 +37,7 @@ def test_how_far_the_offsets_have_wandered_does_not_depend_on_the_rate(rate_hz):
     np.testing.assert_allclose(found.standard_deviations[:6], expected, rtol=0.05)
 
 
-def test_a_motion_is_designed_once_for_all_seeds_and_anew_for_another_sensor(monkeypatch):
+def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monkeypatch):
     designs = []
 
     def excite(robot, *, period, **_):
@@ -45,7 +45,7 @@ def test_a_motion_is_designed_once_for_all_seeds_and_anew_for_another_sensor(mon
         found = FourierTrajectory(np.zeros(6), *np.full((2, 6, 3), len(designs)), 1 / period)
         return SimpleNamespace(trajectory=found)
 
-    monkeypatch.setattr(identification, "_DESIGNS", {})
+    monkeypatch.setattr(identification, "_DESIGN_CACHE", {})
     monkeypatch.setattr(identification, "excite", excite)
     monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
     monkeypatch.setattr(identification, "criteria_of", lambda *_: {"kappa_w10": 4.0})

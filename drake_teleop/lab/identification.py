@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 # The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0
 #: Trajectory and its kappa_w10 by a hash of all inputs of the design.
-_DESIGNS: dict[str, tuple[FourierTrajectory, float]] = {}
+_DESIGN_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -157,13 +157,13 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _designed(scenario, stage)
+            trajectory, kappa = _design_trajectory(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
-            _check_given(robot, trajectory, simulation.duration)
+            _check_trajectory(robot, trajectory, simulation.duration)
             kappa = criteria_of(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
-        result, factor = timed(station, simulation, stage("Identify the load"), log)
+        result, factor = simulate_with_timing(station, simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
@@ -200,18 +200,18 @@ def batch_identification(
     return found.identification
 
 
-def _designed(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
-    same = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
+def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
+    design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]
-    key = sha256(repr((dataclasses.asdict(same), models)).encode()).hexdigest()
-    if key not in _DESIGNS or scenario.environment:  # its files may change
+    key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
+    if key not in _DESIGN_CACHE or scenario.environment:  # its files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
-        _DESIGNS[key] = found, criteria_of(robot, found)["kappa_w10"]
-    return copy.deepcopy(_DESIGNS[key])
+        _DESIGN_CACHE[key] = found, criteria_of(robot, found)["kappa_w10"]
+    return copy.deepcopy(_DESIGN_CACHE[key])
 
 
-def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
+def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         raise DrakeTeleopError(
             f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
@@ -228,7 +228,7 @@ def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -
         raise DrakeTeleopError(f"it uses {worst}", where="trajectory")
 
 
-def timed(
+def simulate_with_timing(
     station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
     """Simulate a station; return result and real-time factor."""

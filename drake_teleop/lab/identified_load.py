@@ -30,7 +30,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 """Environment variable with the cache folder."""
-LARGEST_NUMBER = 2000
+MAX_FILES = 2000
 """Maximum number of cached files of 5 kB each."""
 
 _LIBRARIES = ("drake", "numpy", "scipy", "numba")
@@ -72,9 +72,9 @@ def identified_load(
     # Another seed: noise of identification and run must be independent.
     before = identification_scenario(scenario, scenario.simulation.seed + 1)
     detects = scenario.contact_detection is not None
-    path = (folder or cache_folder()) / f"load-{_key(before, detects)}.npz"
-    if not fresh and (kept := read_load(path)) is not None:
-        return kept
+    path = (folder or cache_folder()) / f"load-{_cache_key(before, detects)}.npz"
+    if not fresh and (cached := read_load(path)) is not None:
+        return cached
     found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
@@ -90,7 +90,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))
 
 
-def _sources(package: Path, models: Path) -> str:
+def _hash_sources(package: Path, models: Path) -> str:
     files = {path.relative_to(package).as_posix(): path for path in package.rglob("*.py")}
     files |= {path.relative_to(models).as_posix(): path for path in models.rglob("*.*")}
     contents = (f"{name} {sha256(files[name].read_bytes()).hexdigest()}" for name in sorted(files))
@@ -98,14 +98,14 @@ def _sources(package: Path, models: Path) -> str:
 
 
 # Hashed at import: the sources may be edited while this process runs the old ones.
-_SOURCES = _sources(Path(__file__).parents[1], models_dir())
+_SOURCES_HASH = _hash_sources(Path(__file__).parents[1], models_dir())
 
 
-def _key(before: Scenario, detects: bool) -> str:
+def _cache_key(before: Scenario, detects: bool) -> str:
     from llvmlite.binding import get_host_cpu_name
 
     computed_by = [f"{name} {version(name)}" for name in _LIBRARIES]
-    computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES]
+    computed_by += [f"python {platform.python_version()}", get_host_cpu_name(), _SOURCES_HASH]
     models = [sha256(path.read_bytes()).hexdigest() for path in before.slave.files()]
     what = (__version__, dataclasses.asdict(before), detects, computed_by, models)
     return sha256(repr(what).encode()).hexdigest()
@@ -123,7 +123,7 @@ def write_load(path: Path, load: IdentifiedLoad) -> None:
     with whole_file(path, shared=True) as unfinished, unfinished.open("wb") as file:
         np.savez(file, **columns)
     files = [(each.stat().st_mtime_ns, each) for each in path.parent.glob("load-*")]
-    for _, old in sorted(files)[:-LARGEST_NUMBER]:
+    for _, old in sorted(files)[:-MAX_FILES]:
         old.unlink(missing_ok=True)
 
 

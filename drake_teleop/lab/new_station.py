@@ -36,31 +36,36 @@ from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
-_PHANTOMS = 0.08
+_PHANTOM_HALF_M = 0.08
 #: Placeholder of a tool [kg, m].
-_STAND_IN = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])])
-_HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
-_POSTURES, _PLACES = 20_000, 24  # random postures; examined places
-_TURNS = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
+_PLACEHOLDER_TOOL = Tool(
+    mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])]
+)
+_CUBE_HALVES_M = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
+_NUM_POSTURES, _NUM_PLACES = 20_000, 24  # random postures; examined places
+_TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 # URDF rpy of the rotation from z to another axis.
-_ONTO_Z = {
+_RPY_ONTO_Z = {
     "x": "0 1.5708 0",
     "-x": "0 -1.5708 0",
     "y": "-1.5708 0 0",
     "-y": "1.5708 0 0",
     "-z": "3.1416 0 0",
 }
-_ASIDE = 0.1  # position error of an arm of few joints, over the displacement
-_ROOM = 0.1  # sufficient distance to a joint limit, over half the range
-_STEEP = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
-_LIKED = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
-_SWING, _PRESS = 0.04, 0.01  # of the slave: largest amplitude, largest depth in the wall [m]
+_MAX_RELATIVE_ERROR = 0.1  # position error of an arm of few joints, over the displacement
+_SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
+_MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
+_PREFERRED_POSITION = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
+_MAX_SWING_M, _MAX_DEPTH_M = (
+    0.04,
+    0.01,
+)  # of the slave: largest amplitude, largest depth in the wall [m]
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
-_CONTACT = 30.0
+_CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
 # 680 N/m with medium grip.
-_WALL, _FELT = 2000.0, 400.0
-_FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
+_WALL_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+_SWING_HZ, _MAX_SPEED_USE = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
 
 
 class Place(NamedTuple):
@@ -112,7 +117,7 @@ class Plan:
     swing: float
     lowest: NDArray[np.float64]
     assumptions: tuple[str, ...]
-    about_z: str
+    axis_note: str
 
 
 def new_command(
@@ -155,10 +160,12 @@ def new_command(
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
-    paths = [_from(folder, path) for path in package_paths]
-    tools = None if tool is None else _from(folder, tool)
+    paths = [_relative_path(folder, path) for path in package_paths]
+    tools = None if tool is None else _relative_path(folder, tool)
     try:
-        text = _text(plan, _from(folder, arm), sensor_frame, paths, tools, device, sensor)
+        text = _scenario_text(
+            plan, _relative_path(folder, arm), sensor_frame, paths, tools, device, sensor
+        )
         with whole_file(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
@@ -188,33 +195,37 @@ def plan_station(
         model=str(arm),
         sensor_frame=sensor_frame,
         package_paths=[str(path) for path in package_paths],
-        tool=_STAND_IN if tool is None else Tool(model=str(tool)),
+        tool=_PLACEHOLDER_TOOL if tool is None else Tool(model=str(tool)),
     )
-    model, assumptions = _read(slave)
-    own_tool = tool is None and float(model.phi_load[0]) > _STAND_IN.mass + 1e-6
+    model, assumptions = _read_arm(slave)
+    own_tool = tool is None and float(model.phi_load[0]) > _PLACEHOLDER_TOOL.mass + 1e-6
     if own_tool:
         slave.tool = None
-        model, assumptions = _read(slave)
+        model, assumptions = _read_arm(slave)
     place = find_place(model)
     slave.position, slave.home = place.position.tolist(), place.home
     figures = FIGURES.get(device)
-    room = _PHANTOMS if figures is None else min(figures.size) / 2.0
+    room = _PHANTOM_HALF_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
     mass = float(model.phi_load[0])
-    translation_scale = _rounded(min(place.half / room, 1.0))
-    most = min(peak / (1.5 * 9.81 * mass + _CONTACT), _FELT / (_WALL * translation_scale), 1.0)
-    swing = min(_SWING, place.half / 2.0, room * translation_scale / 2.0)
+    translation_scale = _round_down(min(place.half / room, 1.0))
+    force_scale = min(
+        peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
+        _MAX_DISPLAYED_STIFFNESS / (_WALL_STIFFNESS * translation_scale),
+        1.0,
+    )
+    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
     return Plan(
         joints=tuple(model.joint_names),
         tool_mass=mass,
         own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
-        force_scale=_rounded(most),
-        swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, place, swing))),
+        force_scale=_round_down(force_scale),
+        swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
         lowest=lowest_point(slave),
         assumptions=tuple(assumptions),
-        about_z=_about_z(model),
+        axis_note=_axis_advice(model),
     )
 
 
@@ -225,37 +236,42 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
         DrakeTeleopError: if there is none.
     """
     random = np.random.default_rng(seed)
-    postures = random.uniform(arm.lower, arm.upper, (_POSTURES, arm.num_joints))
-    poses = np.empty((_POSTURES, 7))
+    postures = random.uniform(arm.lower, arm.upper, (_NUM_POSTURES, arm.num_joints))
+    poses = np.empty((_NUM_POSTURES, 7))
     for q, pose in zip(postures, poses, strict=True):
         pose_into(arm.table, q, pose)
     x, y = poses[:, 1], poses[:, 2]
     down_z = 1.0 - 2.0 * (x * x + y * y)  # z_W of z_S
-    down = down_z < -_STEEP
+    down = down_z < -_MIN_COS_TILT
     reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
-    fit = np.flatnonzero(down & _before(poses[:, 4:], reach))
-    away = np.linalg.norm(poses[fit, 4:] - reach * _LIKED, axis=1)
+    fit = np.flatnonzero(down & _is_in_front(poses[:, 4:], reach))
+    distances = np.linalg.norm(poses[fit, 4:] - reach * _PREFERRED_POSITION, axis=1)
     if arm.num_joints < 6:  # position and orientation are coupled
-        steepest = fit[np.argsort(down_z[fit])[:_PLACES]]
-        found = [_of_few(arm, postures[k], poses[k]) for k in steepest]
+        steepest = fit[np.argsort(down_z[fit])[:_NUM_PLACES]]
+        found = [_place_of_short_arm(arm, postures[k], poses[k]) for k in steepest]
     else:
-        looked_at = fit[np.argsort(away)][:: max(len(fit) // _PLACES, 1)]
-        found = [_place(arm, np.round(poses[k, 4:], 2), turn) for turn in _TURNS for k in looked_at]
+        looked_at = fit[np.argsort(distances)][:: max(len(fit) // _NUM_PLACES, 1)]
+        found = [
+            _place_with_cube(arm, np.round(poses[k, 4:], 2), turn)
+            for turn in _TOOL_YAWS_DEG
+            for k in looked_at
+        ]
     best = max(found, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             "nowhere can the arm hold its sensor with z downwards and move to all sides",
             where="new",
-            remedy=_about_z(arm) or "check the joints' limits, and which way sensor_frame points",
+            remedy=_axis_advice(arm)
+            or "check the joints' limits, and which way sensor_frame points",
         )
     return best
 
 
 def _merit(place: Place) -> tuple[float, bool, float]:
-    return min(place.room, _ROOM), place.by_position, place.half
+    return min(place.room, _SUFFICIENT_MARGIN), place.by_position, place.half
 
 
-def _about_z(arm: ArmModel) -> str:
+def _axis_advice(arm: ArmModel) -> str:
     """Return advice if another axis of S is along the last joint."""
     n = arm.num_joints
     # Axis of the last joint in S, directed away from the joint.
@@ -263,30 +279,30 @@ def _about_z(arm: ArmModel) -> str:
     along = along * (-1.0 if arm.table[n, TRANSLATION + 2] < 0.0 else 1.0)
     k = int(np.argmax(np.abs(along)))
     axis = ("-" if along[k] < 0.0 else "") + "xyz"[k]
-    if axis not in _ONTO_Z:
+    if axis not in _RPY_ONTO_Z:
         return ""
     return (
         f"z_S points to the tool, and here {axis}_S is along the last joint: if the tool is, fix a"
-        f' link to sensor_frame by <origin rpy="{_ONTO_Z[axis]}"/>, and name that'
+        f' link to sensor_frame by <origin rpy="{_RPY_ONTO_Z[axis]}"/>, and name that'
     )
 
 
-def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+def _is_in_front(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
     x, y, z = places.T / reach
     r = np.hypot(x, y)
     result: NDArray[np.bool_] = (r > 0.35) & (r < 0.85) & (x > 0.9 * r) & (z > 0.15) & (z < 0.8)
     return result
 
 
-def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
-    """Return a place with the largest reachable cube of `_HALVES`."""
+def _place_with_cube(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
+    """Return a place with the largest reachable cube of `_CUBE_HALVES_M`."""
     R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
     q, status = tool_down(arm, position, R_WS)
-    place = Place(np.array([*w, *position]), turn == 0.0, q, 0.0, _room(arm, q))
+    place = Place(np.array([*w, *position]), turn == 0.0, q, 0.0, _joint_margin(arm, q))
     if status != IkStatus.OK:
         return place._replace(room=0.0)
-    for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*position[:2])):
+    for half in (half for half in _CUBE_HALVES_M if 2.0 * half <= np.hypot(*position[:2])):
         corners = (position + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
         if all(
             find_posture(arm, np.array([*w, *corner]), q)[1] == IkStatus.OK for corner in corners
@@ -295,32 +311,39 @@ def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
     return place._replace(room=0.0)
 
 
-def _of_few(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
+def _place_of_short_arm(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
     """Return a place of an arm with at most five joints."""
     reached = np.empty(7)
 
-    def goes(way: NDArray[np.float64]) -> bool:
-        target = pose + np.append(np.zeros(4), way)
+    def is_reachable(displacement: NDArray[np.float64]) -> bool:
+        target = pose + np.append(np.zeros(4), displacement)
         pose_into(arm.table, find_posture(arm, target, q)[0], reached)
-        return bool(np.linalg.norm(reached[4:] - target[4:]) < _ASIDE * np.linalg.norm(way))
+        return bool(
+            np.linalg.norm(reached[4:] - target[4:])
+            < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement)
+        )
 
-    ways = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
-    halves = (half for half in _HALVES if all(goes(half * way) for way in ways))
-    return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_room(arm, q))
+    displacements = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    halves = (
+        half
+        for half in _CUBE_HALVES_M
+        if all(is_reachable(half * displacement) for displacement in displacements)
+    )
+    return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_joint_margin(arm, q))
 
 
-def _room(arm: ArmModel, q: NDArray[np.float64]) -> float:
+def _joint_margin(arm: ArmModel, q: NDArray[np.float64]) -> float:
     return float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
 
 
 def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
     above = place.pose.copy()
     above[6] += swing
-    way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
-    return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
+    displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
+    return float((2.0 * np.pi * _SWING_HZ * displacement / arm.velocity_limit).max())
 
 
-def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
+def _read_arm(slave: Slave) -> tuple[ArmModel, list[str]]:
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
     finalize(plant)
@@ -328,17 +351,17 @@ def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
     return arm, [*parsed.assumptions, *assumed]
 
 
-def _rounded(value: float) -> float:
+def _round_down(value: float) -> float:
     """Round down to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
 
 
-def _from(folder: Path, path: Path) -> str:
+def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _text(
+def _scenario_text(
     plan: Plan,
     arm: str,
     sensor_frame: str,
@@ -349,9 +372,9 @@ def _text(
 ) -> str:
     s, swing = plan.translation_scale, plan.swing
     x, y, z = plan.lowest
-    down = 1.5 * swing + min(_PRESS, swing / 4.0)
+    down = 1.5 * swing + min(_MAX_DEPTH_M, swing / 4.0)
     home, packages = plan.place.home, {"package_paths": package_paths} if package_paths else {}
-    start = {"home": home} if home else {"position": _rounded_row(plan.place.position)}
+    start = {"home": home} if home else {"position": _round_row(plan.place.position)}
     slave: dict[str, Any] = {"model": arm, **packages, "sensor_frame": sensor_frame, **start}
     comments = {
         "slave.position": "of the sensor at the start, tool down [m]",
@@ -366,37 +389,41 @@ def _text(
     elif plan.own_tool:
         slave["tool"], comments["slave.tool"] = None, "what the model has beyond the sensor"
     else:
-        slave["tool"] = {"mass": _STAND_IN.mass, "com": _STAND_IN.com}
-        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_STAND_IN.shapes[0])]}
+        slave["tool"] = {"mass": _PLACEHOLDER_TOOL.mass, "com": _PLACEHOLDER_TOOL.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_PLACEHOLDER_TOOL.shapes[0])]}
         comments["slave.tool"] = "a stand-in: put your tool's file (model: ...) or its numbers here"
-    swings = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
-    swings |= {"frequency": _FREQUENCY, "translation": _rounded_row([0.0, 0.0, swing / s])}
-    presses = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
-    presses |= {"translation": _rounded_row([0.0, 0.0, -down / s])}
-    wall = {"_tag": "!Wall", "position": _rounded_row([x, y, z - 1.5 * swing]), "stiffness": _WALL}
+    swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
+    swing_motion |= {"frequency": _SWING_HZ, "translation": _round_row([0.0, 0.0, swing / s])}
+    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
+    press_motion |= {"translation": _round_row([0.0, 0.0, -down / s])}
+    wall = {
+        "_tag": "!Wall",
+        "position": _round_row([x, y, z - 1.5 * swing]),
+        "stiffness": _WALL_STIFFNESS,
+    }
     data = {
         "description": f"{Path(arm).stem} led by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
-        **_rates(device),
+        **_device_rates(device),
         "slave": slave,
         "master": {"model": device},
         **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
         "kinematic_scaling": {"translation_scale": s},
         "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
         "environment": [wall],
-        "operator": {"grip": "medium", "intent": [swings, presses]},
+        "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
     }
     head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
     return yaml_text(data, head=[head], comments=comments)
 
 
-def _rates(device: str) -> dict[str, Any]:
+def _device_rates(device: str) -> dict[str, Any]:
     """Return slow rates for a slow device, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
-def _rounded_row(values: Any) -> list[float]:
+def _round_row(values: Any) -> list[float]:
     return [float(f"{value:.4g}") for value in values]
 
 
@@ -409,13 +436,13 @@ def _print(plan: Plan, scenario: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
-        ("Start", f"sensor at {_rounded_row(plan.place.position)} m, tool down"),
+        ("Start", f"sensor at {_round_row(plan.place.position)} m, tool down"),
         ("Room around it", f"{1e3 * plan.place.half:g} mm to all sides"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)
     console = Console()
     console.print(table)
-    notes = [f"note: {plan.about_z}"] if plan.about_z else []
+    notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
     for line in [*notes, *(f"assumed: {assumed}" for assumed in plan.assumptions)]:
         console.print(line, highlight=False, markup=False)

@@ -26,7 +26,7 @@ from drake_teleop.common.writing import (
 )
 from drake_teleop.lab.identification import (
     identify_load,
-    timed,
+    simulate_with_timing,
 )
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
@@ -38,8 +38,8 @@ from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-_LEARNT = "learnt while it ran"
-_WRITTEN_AT_THE_END = (
+_DURING_RUN = "learnt while it ran"
+_FINAL_FILES = (
     "sensor_log.parquet",
     "identification.json",
     "overview.png",
@@ -101,7 +101,7 @@ def run_command(
         setup = replace(setup, simulation__seed=seed)
     with output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = _logged(setup, out, stage, fresh, drive)
+            run = _run_with_log(setup, out, stage, fresh, drive)
             written = stage("Write pictures and film")
             write_picture(out / "overview.png", overview(run.result))
             written(0.3)
@@ -119,30 +119,30 @@ def run_command(
     return summary | session
 
 
-def _logged(
+def _run_with_log(
     setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
-    log, its_scenario = out / "log.parquet", out / "scenario.yaml"
+    log, scenario_file = out / "log.parquet", out / "scenario.yaml"
     # After an interruption, old files must not look like results of this run.
     remove_log(log)
-    for name in _WRITTEN_AT_THE_END:
+    for name in _FINAL_FILES:
         with naming(out / name):
             (out / name).unlink(missing_ok=True)
-    earlier = its_scenario.exists()
-    write_scenario(its_scenario, setup)
+    had_scenario = scenario_file.exists()
+    write_scenario(scenario_file, setup)
     try:
         if drive is not None:
-            return _repeated(drive, stage, log)
+            return _repeat_drive(drive, stage, log)
         return run_scenario(setup, stage, log, fresh=fresh)
     except BaseException as error:
         if log.is_dir() and not any(log.iterdir()):
             log.rmdir()
-        if not log.exists() and not earlier:
-            its_scenario.unlink(missing_ok=True)
+        if not log.exists() and not had_scenario:
+            scenario_file.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(_kept(log)) from error
+            raise KeyboardInterrupt(_describe_log(log)) from error
         if isinstance(error, CannotWrite):
-            raise DrakeTeleopError(str(error), remedy=_kept(log)) from error
+            raise DrakeTeleopError(str(error), remedy=_describe_log(log)) from error
         raise
 
 
@@ -163,28 +163,30 @@ def run_scenario(
     if learns and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
-            scenario, found.result, found.identification, _LEARNT, found.real_time_factor
+            scenario, found.result, found.identification, _DURING_RUN, found.real_time_factor
         )
-    identification, estimate, floor, source = None, None, None, _LEARNT
+    identification, estimate, floor, source = None, None, None, _DURING_RUN
     with show_progress(progress) as stage:
         if not learns:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
+        result, factor = simulate_with_timing(
+            station, scenario.simulation, stage("Run the scenario"), log
+        )
     return ScenarioRun(scenario, result, identification, source, factor)
 
 
-def _repeated(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
-    begin = time.perf_counter()
+def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
+    start = time.perf_counter()
     result = drive.repeat(progress("Repeat the drive"), log)
-    factor = drive.scenario.simulation.duration / (time.perf_counter() - begin)
+    factor = drive.scenario.simulation.duration / (time.perf_counter() - start)
     identification = None if drive.load is None else drive.load.identification
     return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
 
 
-def _kept(log: Path) -> str:
+def _describe_log(log: Path) -> str:
     if not log.exists():
         return ""
     return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
@@ -209,7 +211,7 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         noticed = ""
         if "contact_noticed_ms" in summary:
             slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
-            noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
+            noticed = f", noticed after {_format_ms(slave)}, at the hand after {_format_ms(hand)}"
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     if "contact_by" in summary:
         console.print(f"contact by {summary['contact_by']}", highlight=False)
@@ -227,5 +229,5 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     )
 
 
-def _ms(delay: float | None) -> str:
+def _format_ms(delay: float | None) -> str:
     return "never" if delay is None else f"{delay:.1f} ms"

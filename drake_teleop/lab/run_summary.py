@@ -45,7 +45,7 @@ from drake_teleop.station.task_measures import task_failure, task_measures
 Array = NDArray[np.float64]
 
 # Settling time of the sensor's filter after a contact [s].
-FILTER_TAIL = 0.01
+FILTER_TAIL_S = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +66,11 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) true contact; gaps below FILTER_TAIL are closed."""
+    """Return (N,) true contact; gaps below FILTER_TAIL_S are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL
+    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL_S
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
@@ -93,8 +93,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
     calculated = calculated_contact_wrench(result)
     contact = in_contact(result)
     # The first bounce of a contact may be between two samples.
-    free = _time_since(contact, result.t) > FILTER_TAIL
-    free &= _time_until(contact, result.t) > FILTER_TAIL
+    free = _time_since(contact, result.t) > FILTER_TAIL_S
+    free &= _time_until(contact, result.t) > FILTER_TAIL_S
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -107,8 +107,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         **_peaks("peak_contact", "", calculated),
         **_peaks("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
-        "joint_speed_use": _use(result["slave_state"][:, n:], arm.velocity_limit),
-        "joint_torque_use": _use(result["joint_torque"], arm.effort_limit),
+        "joint_speed_use": _largest_use(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _largest_use(result["joint_torque"], arm.effort_limit),
         "mass_error_percent": 100 * abs(mass / true_mass - 1),
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
@@ -116,9 +116,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
-    if beyond := _beyond(run.scenario):
+    if beyond := _unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
-    summary |= _moved(result)
+    summary |= _body_displacements(result)
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
@@ -131,10 +131,10 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
 
 def overview(result: SimulationResult) -> Figure:
     """Draw wrenches, motion and force to the master."""
-    wanted = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
+    signals = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
     if "contact_wrench_S" not in result:
-        wanted = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
-    figure = result.plot(*wanted, contact=in_contact(result))
+        signals = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
+    figure = result.plot(*signals, contact=in_contact(result))
     figure.align_ylabels()
     return figure
 
@@ -155,11 +155,11 @@ def _detection_figures(
             for times, (start, _) in zip(found, spans, strict=True)
         ]
     onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
-    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL_S for a, b in spans)]
     return summary | {"false_contacts": len(false)}
 
 
-def _beyond(scenario: Scenario) -> str:
+def _unmodelled_contact(scenario: Scenario) -> str:
     """Return the surroundings that the compiled contact law lacks."""
     surroundings = scenario.surroundings
     if surroundings is None:
@@ -168,7 +168,7 @@ def _beyond(scenario: Scenario) -> str:
     return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
 
 
-def _moved(result: SimulationResult) -> dict[str, dict[str, float]]:
+def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
     moved, turned = {}, {}
     for signal in (name for name in result.signals if name.startswith(POSE_OF)):
         name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
@@ -201,5 +201,5 @@ def _mass_and_com(phi: Array) -> tuple[float, Array]:
     return float(phi[0]), phi[1:4] / phi[0]
 
 
-def _use(values: Array, limit: Array) -> float:
+def _largest_use(values: Array, limit: Array) -> float:
     return float(np.max(np.abs(values) / limit))
