@@ -73,7 +73,7 @@ def urdf(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed):
+def test_design_for_the_slave_has_a_good_criterion_within_all_limits(slave, designed):
     assert designed.values["kappa_w10"] < 4.3
     assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
     _, qd, qdd = designed.trajectory.evaluate(np.array([0.0, 6.0]))
@@ -89,7 +89,7 @@ def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed)
 
 
 @pytest.mark.slow
-def test_same_seed_same_trajectory_other_seed_another(slave, short):
+def test_trajectory_depends_on_the_seed_only(slave, short):
     again, other = (
         excite(slave, starts=1, period=2.4, harmonics=2, seed=seed).trajectory for seed in (0, 1)
     )
@@ -98,7 +98,7 @@ def test_same_seed_same_trajectory_other_seed_another(slave, short):
 
 
 @pytest.mark.slow
-def test_the_executed_motion_keeps_the_limits(slave):
+def test_executed_motion_respects_the_limits(slave):
     found = identify_load(LoadScenario("identification"))
     t, state = found.result.t, found.result["slave_state"]
     assert np.all(np.diff(t) < 1.001e-3)
@@ -118,7 +118,7 @@ def test_the_executed_motion_keeps_the_limits(slave):
 
 
 @pytest.mark.slow
-def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, monkeypatch):
+def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
     shown = {}
 
     class Canvas:
@@ -190,7 +190,7 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
 
 
 @pytest.mark.slow
-def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, designed):
+def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     motion = sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
@@ -209,7 +209,7 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
 
 
 @pytest.mark.slow
-def test_the_check_finds_every_kind_of_violation(slave, short):
+def test_check_finds_a_violation_of_each_limit(slave, short):
     """Each limit in turn is a little below its use by the same motion."""
     uses = {use.limit: use.share for use in short.uses}
     limits = slave.limits
@@ -235,7 +235,7 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("axis", range(3))
-def test_a_box_is_left_on_either_side(slave, axis, side):
+def test_check_finds_both_sides_of_the_box(slave, axis, side):
     limits, still = slave.limits, np.zeros((1, 6))
     aside = limits.box_middle + 5 * side * limits.box_half * np.eye(3)[axis]
     moved = dataclasses.replace(slave, limits=limits._replace(box_middle=aside))
@@ -245,7 +245,7 @@ def test_a_box_is_left_on_either_side(slave, axis, side):
 
 
 @pytest.mark.slow
-def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
+def test_check_finds_self_collision_and_table_contact(slave):
     t = np.zeros((6, 2))
     for q, bodies in (
         ([0, -1.9, -2.4, 0, -1.5, 0], {"tool", "link_1", "base", "link_2", "link_6", "link_5"}),
@@ -257,7 +257,7 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         assert bodies & set(clearance.what.split(" and "))
 
 
-def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
+def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
     """A shape larger than its link, such as the convex hull of a mesh."""
     text = urdf.read_text()
     assert text.count('size="0.2 0.2 0.1"') == 1
@@ -281,7 +281,7 @@ def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
-def test_what_a_scenario_has_to_touch_is_not_touched(name):
+def test_environment_of_the_scenario_is_avoided(name):
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
     assert all(use.share <= 1 for use in found.uses)
@@ -297,7 +297,7 @@ def test_what_a_scenario_has_to_touch_is_not_touched(name):
 
 
 @pytest.mark.slow
-def test_what_the_readme_shows(tmp_path, monkeypatch):
+def test_readme_output(tmp_path, monkeypatch):
     (tmp_path / "models").symlink_to(models_dir())
     monkeypatch.chdir(tmp_path)
     type_in("README.md", ".venv/bin/drake-teleop excite")
@@ -307,7 +307,7 @@ def test_what_the_readme_shows(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, capsys):
+def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))
     with pytest.raises(DrakeTeleopError, match="no trajectory was found that respects all limits"):
         excite(dataclasses.replace(slave, limits=box), harmonics=2, starts=1)
@@ -321,7 +321,7 @@ def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, cap
 
 
 @pytest.mark.slow
-def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
+def test_identification_refuses_an_unsuitable_trajectory(short):
     scenario = LoadScenario("identification")
     with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
         identify_load(scenario, trajectory=short.trajectory)
@@ -333,7 +333,7 @@ def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 
 
-def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
+def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     robot = RobotFromModel(urdf, "l6", WristSensorConfig())
     assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
     words = "; ".join(robot.assumptions)
@@ -354,7 +354,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert found.limits.phi[0] == pytest.approx(3.0)
 
 
-def test_a_mesh_that_cannot_be_read_is_named(urdf):
+def test_error_names_an_unreadable_mesh(urdf):
     parts = urdf.parent / "somewhere" / "parts"
     (parts / "forearm.obj").rename(parts / "forearm.dae")
     urdf.write_text(urdf.read_text().replace("forearm.obj", "forearm.dae"))
@@ -363,7 +363,7 @@ def test_a_mesh_that_cannot_be_read_is_named(urdf):
     assert "shapes are missing of l3: .dae meshes cannot be read (convert them to .obj" in words
 
 
-def test_links_that_always_touch_are_neighbours(urdf):
+def test_links_that_always_touch_are_excluded(urdf):
     """The two pairs are not adjacent, so Drake's own filter does not exclude them."""
     text = urdf.read_text()
     for shape in (
@@ -387,7 +387,7 @@ def test_links_that_always_touch_are_neighbours(urdf):
         ('"floating">', "l3 floats on l2"),
     ],
 )
-def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
+def test_chain_with_an_unsupported_joint_is_refused(urdf, joint, expected):
     text = urdf.read_text().replace('name="j3" type="revolute">', f'name="j3" type={joint}')
     urdf.write_text(text)
     with pytest.raises(DrakeTeleopError, match=expected):
@@ -416,7 +416,7 @@ def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
         ('izz="0.015"', 'izz="-0.015"', "link l3: no body has this inertia"),
     ],
 )
-def test_what_cannot_be_true_of_an_arm_is_refused(urdf, old, new, expected):
+def test_implausible_model_is_refused(urdf, old, new, expected):
     text = urdf.read_text()
     assert old in text
     urdf.write_text(text.replace(old, new, 1))
@@ -424,7 +424,7 @@ def test_what_cannot_be_true_of_an_arm_is_refused(urdf, old, new, expected):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
 
-def test_an_sdf_is_checked_too(tmp_path):
+def test_implausible_sdf_is_refused(tmp_path):
     path = write_sdf(tmp_path)
     path.write_text(path.read_text().replace("<izz>0.04</izz>", "<izz>4</izz>", 1))
     with pytest.raises(DrakeTeleopError, match="link l0: no body has this inertia"):
@@ -447,7 +447,7 @@ def _joint(parent, child):
         (("ab", "cb"), "m::m::b hangs on two joints, ab and cb"),
     ],
 )
-def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
+def test_included_models_are_checked(tmp_path, ends, expected):
     """Drake reads included models after `check_model`."""
     (tmp_path / "inside.sdf").write_text(_SDF.format(_LINKS + "".join(_joint(*e) for e in ends)))
     model = tmp_path / "model.sdf"
@@ -456,7 +456,7 @@ def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
         ParseModel(MultibodyPlant(0.0), model, "c")
 
 
-def test_models_inside_a_model_have_names_of_their_own(tmp_path):
+def test_nested_models_may_repeat_names(tmp_path):
     joints = _joint("a", "b") + _joint("b", "c")
     inside = [f"<model name='{name}'>{_LINKS}{joints}</model>" for name in ("n", "o")]
     inside += ["<link name='hand'/>", _joint("o::b", "hand"), _joint("n::c", "o::a")]
@@ -468,19 +468,19 @@ def test_models_inside_a_model_have_names_of_their_own(tmp_path):
 @pytest.mark.parametrize(
     "entity", ["<!DOCTYPE robot SYSTEM 'a.dtd'>", "<!DOCTYPE robot [<!ENTITY e SYSTEM 'a.txt'>]>"]
 )
-def test_no_part_of_a_model_is_left_out_unsaid(urdf, entity):
+def test_undefined_xml_entity_is_refused(urdf, entity):
     urdf.write_text(entity + urdf.read_text().replace("</robot>", "&e;</robot>"))
     with pytest.raises(DrakeTeleopError, match=r"is not XML \(the entity e is not in this file"):
         ParseModel(MultibodyPlant(0.0), urdf, "l6")
 
 
-def test_the_world_hangs_on_nothing(urdf):
+def test_world_as_child_of_a_joint_is_refused(urdf):
     urdf.write_text(urdf.read_text().replace('"l6"', '"world"'))
     with pytest.raises(DrakeTeleopError, match="world hangs on j6"):
         ParseModel(MultibodyPlant(0.0), urdf, "l3")
 
 
-def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
+def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
@@ -489,7 +489,7 @@ def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
 
-def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
+def test_package_may_have_the_name_drake(tmp_path):
     (tmp_path / "drake").mkdir()
     (tmp_path / "drake" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     shape = "<geometry><mesh><uri>package://drake/a.obj</uri></mesh></geometry>"
@@ -500,7 +500,7 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
     assert not any("shapes" in words for words in found.assumptions)
 
 
-def test_a_floor_without_end_is_kept_clear_of(tmp_path):
+def test_clearance_to_a_plane_is_checked(tmp_path):
     """A pendulum of 0.4 m above the floor."""
     model = tmp_path / "pendulum.xml"
     model.write_text("""<mujoco model="m"><worldbody><geom type="plane" size="0 0 1" pos="0 0 0.8"/>
@@ -518,7 +518,7 @@ def test_a_floor_without_end_is_kept_clear_of(tmp_path):
         assert (share <= 1) == is_free
 
 
-def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
+def test_drake_elements_are_read_with_any_namespace(tmp_path):
     path, plant = write_sdf(tmp_path), MultibodyPlant(0.0)
     path.write_text(path.read_text().replace('"drake.mit.edu"', f'"{tmp_path}"'))
     ParseModel(plant, path, "wrist")
@@ -526,7 +526,7 @@ def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
     np.testing.assert_array_equal(plant.GetAccelerationUpperLimits(), 10.0 + 2.0 * np.arange(7))
 
 
-def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
+def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     text = urdf.read_text().replace('lower="0.1" upper="2.6"', 'lower="0" upper="0"')
     nothing = re.sub(r'"0.3"/>(<inertia .*?/>)', '"0"/>', text, count=1)
     urdf.write_text(nothing)
@@ -547,7 +547,7 @@ def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
         ([], "--sensor-frame"),
     ],
 )
-def test_a_model_that_cannot_be_used_is_one_error_line(urdf, tmp_path, capsys, options, expected):
+def test_unusable_model_gives_one_error_line(urdf, tmp_path, capsys, options, expected):
     out = str(tmp_path / "out")
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--model", str(urdf), *options, "--quiet", "--out", out])
@@ -559,7 +559,7 @@ def test_a_model_that_cannot_be_used_is_one_error_line(urdf, tmp_path, capsys, o
 
 @pytest.mark.parametrize("text", ["", "<robot", "<robot name='r'><link name='a'/>", "hello"])
 @pytest.mark.parametrize("name", ["a.urdf", "a.sdf", "a.txt"])
-def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text):
+def test_file_without_robot_gives_one_error_line(tmp_path, capsys, name, text):
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(SystemExit) as stop:
@@ -569,7 +569,7 @@ def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text)
     assert error.startswith("error: ") and error.count("\n") == 1 and name in error
 
 
-def test_options_of_models_need_one(capsys, tmp_path):
+def test_model_options_require_a_model(capsys, tmp_path):
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
     assert (stop.value.code, capsys.readouterr().err) == (2, "error: --payload: needs --model\n")
@@ -594,7 +594,7 @@ def foreign(request, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_written_for_any_arm(foreign):
+def test_files_for_other_arms(foreign):
     out, joints, recording = foreign
     summary = json.loads((out / "summary.json").read_text())
     assert all(use["share"] <= 1 for use in summary["limit_use"].values())
@@ -650,7 +650,7 @@ def write_described(folder, t, readings, recording):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
-def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
+def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
     """Design, execution, noisy measurement, log file, identification."""
     _, joints, recording = foreign
     sensor = dataclasses.replace(

@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 #: Sample rate [Hz].
 RATE = 1000.0
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
-_STEP = 1e-4
+_STEP_S = 1e-4
 # Search distance beyond the clearance [m].
-_NEAR = 0.01
+_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def check(
 ) -> list[Use]:
     """Return the use of every limit by one period, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
-    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP, 0.0, _STEP))
-    qd, qdd = (after - before) / (2 * _STEP), (after - 2 * q + before) / _STEP**2
+    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
+    qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
     return check_motion(robot, t, q, qd, qdd, progress)
 
 
@@ -75,15 +75,15 @@ def check_motion(
         q, qd, qdd: (T, n) [rad, s].
     """
     names, limits = robot.arm.joint_names, robot.limits
-    motion = _bodies(robot, q, qd, qdd, progress)
+    motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [
-        _use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
-        _use("velocity", np.abs(qd) / limits.velocity, t, names),
-        _use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _use("torque", np.abs(motion.torque) / limits.effort, t, names),
-        _use("sensor", motion.sensor / limits.sensor, t, _SENSOR),
-        _use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
+        _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
+        _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
+        _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
+        _largest_use("torque", np.abs(motion.torque) / limits.effort, t, names),
+        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORMS),
+        _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
     nearest = motion.nearest[int(np.argmax(motion.clearance))]
     uses[-1] = Use("clearance", uses[-1].share, uses[-1].time, nearest)
@@ -92,10 +92,10 @@ def check_motion(
     return sorted(uses, key=lambda use: -use.share)
 
 
-_SENSOR = ("force", "torque", "specific force", "angular acceleration")
+_SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
 
 
-def _use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
+def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
     when, which = np.unravel_index(np.argmax(shares), shares.shape)
     return Use(limit, float(shares[when, which]), float(t[when]), names[which])
 
@@ -119,17 +119,17 @@ class _Motion:
     nearest: list[str]
 
 
-def _bodies(
+def _evaluate_bodies(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
 ) -> _Motion:
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
-    of_scene = robot.scene_graph.GetMyContextFromRoot(root)
+    scene_context = robot.scene_graph.GetMyContextFromRoot(root)
     gravity = plant.gravity_field().gravity_vector()
     position, velocity = plant.GetPositions(context), np.zeros(plant.num_velocities())
     acceleration = velocity.copy()
-    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard(plant, frame_S))
+    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard_bodies(plant, frame_S))
     body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
     torque, kinematics = np.empty(q.shape), np.empty((len(q), 3, 3))
     workspace = np.empty((len(q), limits.points_S.size))
@@ -151,8 +151,8 @@ def _bodies(
         kinematics[k] = kinematics[k] @ X_WS.rotation().matrix()
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
-        query = robot.scene_graph.get_query_output_port().Eval(of_scene)
-        distance, words = _nearest(robot, query, limits.clearance + _NEAR)
+        query = robot.scene_graph.get_query_output_port().Eval(scene_context)
+        distance, words = _nearest(robot, query, limits.clearance + _SEARCH_MARGIN_M)
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
@@ -171,7 +171,7 @@ def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> 
     return np.linalg.norm([force, torque, s, alpha], axis=2).T
 
 
-def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
+def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     found = [frame_S.body().index()]
     for body in found:

@@ -31,10 +31,10 @@ RATE = 1000.0
 
 # Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
 # [N], [N m].
-_MASS, _COM, _INERTIA = 0.01, 1e-3, 0.1
-_OFFSETS = (0.1, 0.005)
+_MASS_ERROR, _COM_ERROR_M, _INERTIA_ERROR = 0.01, 1e-3, 0.1
+_OFFSET_ERRORS = (0.1, 0.005)
 # Smallest eigenvalue of an excited parameter, over the largest.
-_TINY = 1e-13
+_MIN_EIGENVALUE_RATIO = 1e-13
 
 
 class Scales(NamedTuple):
@@ -80,7 +80,7 @@ class Criterion:
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable(scales.phi)
+            columns = _acceptable_errors(scales.phi)
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
@@ -95,11 +95,11 @@ class Criterion:
         """Return the criterion of (T, 3) samples over `duration` [s]; inf if singular."""
         _, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        if eigenvalues[0] <= _TINY * eigenvalues[-1]:
+        if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
-        log_value, _ = self._of_spectrum(eigenvalues, vectors, 0.0)
+        log_value, _ = self._log_and_gradient(eigenvalues, vectors, 0.0)
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
     def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
@@ -110,8 +110,8 @@ class Criterion:
         """
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        eigenvalues = np.maximum(eigenvalues, _TINY * eigenvalues[-1])
-        value, weights = self._of_spectrum(eigenvalues, vectors, sharpness)
+        eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
+        value, weights = self._log_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = (vectors * weights) @ vectors.T
         if self.name == "A16":
             g_gram = weights
@@ -119,7 +119,7 @@ class Criterion:
         g_V = g_rows * self._rows[:, np.newaxis] * self._columns
         return value, np.ascontiguousarray(g_V[:, :, -10:])
 
-    def _of_spectrum(
+    def _log_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
         """Return the log, and its gradient by eigenvalues (A16: by Gram)."""
@@ -132,9 +132,9 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, of_top = _smooth_max(logs, sharpness)
-        bottom, of_bottom = _smooth_max(-logs, sharpness)
-        return top + bottom, 0.5 * (of_top - of_bottom) / eigenvalues
+        top, top_weights = _smooth_max(logs, sharpness)
+        bottom, bottom_weights = _smooth_max(-logs, sharpness)
+        return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
 @njit(cache=True)
@@ -159,10 +159,10 @@ def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
     g_omega[2] = 2 * z * zz + x * xz + y * yz
 
 
-def _acceptable(phi: Array) -> Array:
-    inertia = _INERTIA * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_OFFSETS, 3)
-    return np.array([*offsets, _MASS * phi[0], *3 * [_COM * phi[0]], *6 * [inertia]])
+def _acceptable_errors(phi: Array) -> Array:
+    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_OFFSET_ERRORS, 3)
+    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
 
 
 def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:

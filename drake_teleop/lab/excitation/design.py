@@ -22,20 +22,20 @@ Array = NDArray[np.float64]
 #: Share of each limit; the grid misses up to 0.9 % of a fifth harmonic's peak.
 MARGIN = 0.985
 # Largest use of a feasible iterate on the grid.
-_FEASIBLE = 0.9885
+_MAX_FEASIBLE_USE = 0.9885
 
 # Size of a batch of candidates, and number of followed ones.
-_CANDIDATES, _FOLLOWED = 128, 8
+_NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
-_APPROACH = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
+_LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
 # (sharpness of the criterion, of the maxima, iterations) of SLSQP.
-_DESCENT = ((12.0, 200.0, 80), (40.0, 400.0, 120))
+_SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
 _TOLERANCE = 1e-5
 # A start ends without a feasible iterate after so many evaluations, or after the first stage of
 # SLSQP outside this factor of the best.
-_PATIENCE, _PROMISING = 250, 1.08
+_MAX_INFEASIBLE_EVALUATIONS, _MAX_RATIO_TO_BEST = 250, 1.08
 # A bounded descent is repeated while it improves the criterion by this factor.
-_WORTH = 0.995
+_MIN_IMPROVEMENT = 0.995
 
 
 @dataclass(frozen=True)
@@ -66,21 +66,21 @@ def design(
         progress: called with completed share and best criterion.
     """
     search = _Search(problem, starts, seconds, progress)
-    with one_blas_thread(), suppress(_TimeIsUpError):
+    with one_blas_thread(), suppress(_TimeOutError):
         for candidate in search.candidates(np.random.default_rng(seed)):
             if seconds is None and search.start == starts:
                 break
-            with suppress(_HopelessError):
+            with suppress(_InfeasibleStartError):
                 search.follow(candidate)
             search.start += 1
     return search.found
 
 
-class _TimeIsUpError(Exception):
+class _TimeOutError(Exception):
     """Ends all optimisers."""
 
 
-class _HopelessError(Exception):
+class _InfeasibleStartError(Exception):
     """Ends a start that does not become feasible."""
 
 
@@ -97,7 +97,7 @@ class _Search:
         self.start = 0
         self.found: list[Iterate] = []
         self._best = self._best_of_start = float("inf")
-        self._evaluations = self._of_all_starts = 0
+        self._evaluations = self._all_evaluations = 0
         self._key = b""
         from scipy.optimize import minimize
 
@@ -106,50 +106,52 @@ class _Search:
         self._last = problem.evaluate(
             self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
         )
-        self._began = time.thread_time()
+        self._start_time = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
         """Yield random motions, the best of each batch first."""
         while True:
-            batch = [self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_CANDIDATES)]
+            batch = [
+                self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)
+            ]
             merit = []
             for x in batch:
-                self._tick()
-                point = self._problem.evaluate(x, *_APPROACH[0][:2])
+                self._count_evaluation()
+                point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
                 merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
-            for k in np.argsort(merit)[:_FOLLOWED]:
+            for k in np.argsort(merit)[:_NUM_FOLLOWED]:
                 yield batch[k]
 
     def follow(self, x: Array) -> None:
         """Descend from x."""
         self._evaluations, self._best_of_start = 0, float("inf")
-        for of_criterion, of_maxima, weight, iterations in _APPROACH:
+        for of_criterion, of_maxima, weight, iterations in _LBFGS_STAGES:
             options = {"maxiter": iterations}
             stage = (of_criterion, of_maxima, weight)
             x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
-        step_by_step = self._problem.bounds(x) is not None
-        for k, stage_of in enumerate(_DESCENT):
-            hopeless = self._best_of_start > _PROMISING * self._best
-            if k > 0 and hopeless and not step_by_step:
+        is_bounded = self._problem.bounds(x) is not None
+        for k, stage in enumerate(_SLSQP_STAGES):
+            hopeless = self._best_of_start > _MAX_RATIO_TO_BEST * self._best
+            if k > 0 and hopeless and not is_bounded:
                 return
-            x = self._descended(x, *stage_of)
+            x = self._run_slsqp(x, *stage)
         before = float("inf")
-        while step_by_step and self._best_of_start < _WORTH * before:
+        while is_bounded and self._best_of_start < _MIN_IMPROVEMENT * before:
             before = self._best_of_start
-            x = self._descended(x, *_DESCENT[-1])
+            x = self._run_slsqp(x, *_SLSQP_STAGES[-1])
 
-    def _descended(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
+    def _run_slsqp(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
         found: Array = self._minimize(
-            lambda x, *sharpness: self._at(x, *sharpness).log_criterion,
+            lambda x, *sharpness: self._evaluate_once(x, *sharpness).log_criterion,
             x,
             (of_criterion, of_maxima),
             "SLSQP",
-            jac=lambda x, *sharpness: self._at(x, *sharpness).gradients[0],
+            jac=lambda x, *sharpness: self._evaluate_once(x, *sharpness).gradients[0],
             bounds=self._problem.bounds(x),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, *sharpness: MARGIN - self._at(x, *sharpness).uses,
-                "jac": lambda x, *sharpness: -self._at(x, *sharpness).gradients[1:],
+                "fun": lambda x, *sharpness: MARGIN - self._evaluate_once(x, *sharpness).uses,
+                "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
                 "args": (of_criterion, of_maxima),
             },
             options={"maxiter": iterations, "ftol": _TOLERANCE},
@@ -159,40 +161,44 @@ class _Search:
     def _penalised(
         self, x: Array, of_criterion: float, of_maxima: float, weight: float
     ) -> tuple[float, Array]:
-        point = self._at(x, of_criterion, of_maxima)
+        point = self._evaluate_once(x, of_criterion, of_maxima)
         excess = np.maximum(point.uses - MARGIN, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
-    def _at(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
+    def _evaluate_once(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
         """Evaluate a point once; SLSQP requests its parts separately."""
         key = np.array([*x, of_criterion, of_maxima]).tobytes()
         if key != self._key:
-            self._tick()
+            self._count_evaluation()
             self._last = self._problem.evaluate(x, of_criterion, of_maxima)
             self._key = key
-            if self._last.largest_use <= _FEASIBLE:
-                self._remember(x)
-            elif self._evaluations > _PATIENCE and self._best_of_start == float("inf"):
-                raise _HopelessError
+            if self._last.largest_use <= _MAX_FEASIBLE_USE:
+                self._record_iterate(x)
+            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
+                "inf"
+            ):
+                raise _InfeasibleStartError
         return self._last
 
-    def _remember(self, x: Array) -> None:
+    def _record_iterate(self, x: Array) -> None:
         value = self._problem.value()
         if value < self._best_of_start:
             self._best_of_start = value
             self._best = min(value, self._best)
-            seconds = time.thread_time() - self._began
+            seconds = time.thread_time() - self._start_time
             trajectory = self._problem.trajectory(x)
-            self.found.append(Iterate(seconds, self._of_all_starts, self.start, value, trajectory))
+            self.found.append(
+                Iterate(seconds, self._all_evaluations, self.start, value, trajectory)
+            )
 
-    def _tick(self) -> None:
+    def _count_evaluation(self) -> None:
         self._evaluations += 1
-        self._of_all_starts += 1
+        self._all_evaluations += 1
         done = self.start / self._starts
         if self._seconds is not None:
-            done = (time.thread_time() - self._began) / self._seconds
+            done = (time.thread_time() - self._start_time) / self._seconds
             if done >= 1:
-                raise _TimeIsUpError
+                raise _TimeOutError
         if self._evaluations % 20 == 0:
             self._progress(done, self._best)

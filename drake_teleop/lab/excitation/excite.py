@@ -29,10 +29,10 @@ from drake_teleop.load.trajectory import FourierTrajectory
 Array = NDArray[np.float64]
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
-_REPAIRS = (1.0, 0.995, 0.99, 0.98)
+_SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Factor of the criterion between candidates of one descent; largest number of checks.
-_WORSE, _CHECKED = 1.05, 30
-_HULLS = (
+_CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
+_HULL_ADVICE = (
     "; or, if it is the hulls of meshes that touch, excite a station (drake-teleop new): what"
     " touches where its arm starts is let off"
 )
@@ -90,13 +90,15 @@ def excite(
         harmonics,
     )
     with show_progress(progress) as stage:
-        told = stage("Design the trajectory")
+        report = stage("Design the trajectory")
 
-        def designing(done: float, best: float) -> None:
-            told(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
+        def report_best(done: float, best: float) -> None:
+            report(done, f"{criterion} {best:.4g}" if np.isfinite(best) else "")
 
-        found = design(Problem(task), seed=seed, starts=starts, seconds=seconds, progress=designing)
-        designing(1.0, min((iterate.value for iterate in found), default=np.inf))
+        found = design(
+            Problem(task), seed=seed, starts=starts, seconds=seconds, progress=report_best
+        )
+        report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
         trajectory, uses = best_checked(robot, found, stage("Check it at 1 kHz"))
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
@@ -104,7 +106,7 @@ def excite(
         trajectory,
         criterion,
         criteria_of(robot, trajectory),
-        _deviations(robot, trajectory),
+        _predicted_deviations(robot, trajectory),
         uses,
         np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]),
         found[-1].seconds,
@@ -131,7 +133,7 @@ def best_checked(
         + (f": the best uses {worst}" if worst else ""),
         where=robot.name,
         remedy="take more time, a longer period or another seed"
-        + (_HULLS if worst is not None and worst.limit == "clearance" else ""),
+        + (_HULL_ADVICE if worst is not None and worst.limit == "clearance" else ""),
     )
 
 
@@ -154,7 +156,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     return s, omega, alpha
 
 
-def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
+def _predicted_deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
     motion = sensor_motion(robot, trajectory)
     return predicted_deviations(*motion, 1 / RATE, robot.noise, robot.limits.phi)
 
@@ -162,22 +164,23 @@ def _deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     """Yield trajectories within the limits at 1 kHz, best first.
 
-    A descent may end too close to a true shape, so its next candidate is worse by `_WORSE`.
+    A descent may end too close to a true shape, so the next candidate is
+    worse by `_CANDIDATE_RATIO`.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)
-    offered = 0
+    checks = 0
     for iterate in ranked:
-        if iterate.value < _WORSE * last[iterate.start]:
+        if iterate.value < _CANDIDATE_RATIO * last[iterate.start]:
             continue
         last[iterate.start] = iterate.value
-        for factor in _REPAIRS:
+        for factor in _SHRINK_FACTORS:
             trajectory = iterate.trajectory.scaled(factor)
             if _largest_use(robot, trajectory) <= 1:
                 yield trajectory
-                offered += 1
+                checks += 1
                 break
-        if offered == _CHECKED:
+        if checks == _MAX_CHECKS:
             return
 
 

@@ -29,9 +29,9 @@ LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace
 #: Distance beyond the clearance at which its use is 0 [m].
 CLEARANCE_SCALE = 0.1
 # Smallest weight in the gradient of a smooth maximum.
-_NEGLIGIBLE = 1e-7
+_MIN_WEIGHT = 1e-7
 # Value of all distances beyond clearance plus scale [m].
-_FAR = 1.0
+_FAR_DISTANCE_M = 1.0
 
 
 class Limits(NamedTuple):
@@ -127,7 +127,7 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
             for j in range(n):
                 x = values[t, j] - limits.q_middle[j] if k == 0 else values[t, j]
                 use[t, j], sign[t, j] = abs(x) / scale[j], np.sign(x) / scale[j]
-        largest[k], smooth[k] = _soften(use, sharpness)
+        largest[k], smooth[k] = _smooth_maximum(use, sharpness)
         for t in range(T):
             for j in range(n):
                 gradient[k, k, t, j] = use[t, j] * sign[t, j]
@@ -141,7 +141,7 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
 
 
 @njit(cache=True)
-def _soften(use, sharpness):
+def _smooth_maximum(use, sharpness):
     """Return exact and smooth maximum of `use` (T, m), which becomes the gradient."""
     top = use.max()
     total = 0.0
@@ -166,9 +166,9 @@ def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, grad
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):
             use[t, j] = abs(tau[t, j]) / limits.effort[j]
-    largest[3], smooth[3] = _soften(use, sharpness)
+    largest[3], smooth[3] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for j in range(n):
@@ -177,11 +177,11 @@ def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, grad
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
         seed_joint_torque(table, motions[t], c, virtual, seeds)
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _pull(table, motions, qd, qdd, t, gradient, work):
+def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
     pull_back(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
@@ -206,10 +206,10 @@ def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradien
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
             size[t, k] = np.sqrt(a * a + b * b + c * c)
             use[t, k] = size[t, k] / limits.sensor[k]
-    largest[4], smooth[4] = _soften(use, sharpness)
+    largest[4], smooth[4] = _smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(4):
@@ -221,7 +221,7 @@ def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradien
         seed_wrench(motion, limits.phi, force, torque, seeds[-1])
         seed_vector(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
         seed_vector(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -237,9 +237,9 @@ def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 x = motion[9 + i] + p[i] - limits.box_middle[i]
                 use[t, 3 * k + i] = abs(x) / limits.box_half[i]
                 sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
-    largest[5], smooth[5] = _soften(use, sharpness)
+    largest[5], smooth[5] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(P):
@@ -250,7 +250,7 @@ def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 use[t, i + 2] * sign[t, i + 2],
             )
             seed_point(motions[t, -1], limits.points_S[k], g, seeds[-1])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -263,24 +263,24 @@ def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
     use, nearest = np.empty((T, K)), np.empty(5)
     ends = np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
-        _place(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
+        _transform_capsules(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
         for k in range(K):
             a, b = limits.pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance = _FAR
+            distance = _FAR_DISTANCE_M
             if not _is_far(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE):
-                distance = _between(ends[t, a], ends[t, b], nearest) - reach
+                distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
             use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE
-    largest[6], smooth[6] = _soften(use, sharpness)
+    largest[6], smooth[6] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _NEGLIGIBLE:
+            if use[t, k] < _MIN_WEIGHT:
                 continue
             a, b = limits.pairs[k]
-            _between(ends[t, a], ends[t, b], nearest)
+            _segment_distance(ends[t, a], ends[t, b], nearest)
             for side in range(2):
                 capsule = limits.pairs[k, side]
                 row = limits.capsule_row[capsule]
@@ -293,7 +293,7 @@ def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 seed_point(motions[t, row], point, g, seeds[row])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -302,15 +302,15 @@ def capsule_distances(motions, rows, ends, radii, pairs):
     distances = np.empty((len(motions), len(pairs)))
     placed, nearest = np.empty(ends.shape), np.empty(5)
     for t in range(len(motions)):
-        _place(motions[t], rows, ends, placed)
+        _transform_capsules(motions[t], rows, ends, placed)
         for k in range(len(pairs)):
             a, b = pairs[k]
-            distances[t, k] = _between(placed[a], placed[b], nearest) - radii[a] - radii[b]
+            distances[t, k] = _segment_distance(placed[a], placed[b], nearest) - radii[a] - radii[b]
     return distances
 
 
 @njit(cache=True)
-def _place(motions, rows, ends, placed):
+def _transform_capsules(motions, rows, ends, placed):
     for k in range(len(rows)):
         row = rows[k]
         for e in range(2):
@@ -335,7 +335,7 @@ def _is_far(first, second, enough):
 
 
 @njit(cache=True)
-def _between(first, second, nearest):
+def _segment_distance(first, second, nearest):
     """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
     Output `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.

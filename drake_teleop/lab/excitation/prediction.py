@@ -54,7 +54,7 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = motion_gains(estimation, sensor, num_joints, period)
-        filters = _correction(linear, period), _correction(angular, period)
+        filters = _error_filter(linear, period), _error_filter(angular, period)
     place = sensor.accelerometer()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -103,7 +103,7 @@ def _products(influence: Array, variances: Array) -> Array:
     return rows.T @ rows
 
 
-def _correction(filter_: SteadyState, period: float) -> tuple[Array, Array]:
+def _error_filter(filter_: SteadyState, period: float) -> tuple[Array, Array]:
     """Return the transfer function from acceleration noise to filtered error."""
     denominator = np.array([1.0, *(filter_.gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]

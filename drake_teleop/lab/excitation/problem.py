@@ -24,9 +24,9 @@ Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 
 # Samples of a period per harmonic.
-_SAMPLES = 24
+_SAMPLES_PER_HARMONIC = 24
 # Size of random motions, as a share of the speed and acceleration limits.
-_SIZE = 0.35
+_RELATIVE_SIZE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Problem:
     def __init__(self, task: Task) -> None:
         self.task = task
         n, free = len(task.home), 2 * (task.harmonics - 1)
-        samples = _SAMPLES * task.harmonics
+        samples = _SAMPLES_PER_HARMONIC * task.harmonics
         unit = np.eye(free)
         basis = FourierTrajectory.at_rest(
             np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period
@@ -93,7 +93,9 @@ class Problem:
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
-        spread = np.tile(np.repeat(_SIZE * np.minimum(size, limits.q_half), task.harmonics - 1), 2)
+        spread = np.tile(
+            np.repeat(_RELATIVE_SIZE * np.minimum(size, limits.q_half), task.harmonics - 1), 2
+        )
         q0 = task.home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
             q0 = limits.q_middle + 0.6 * limits.q_half * rng.uniform(-1, 1, len(size))
@@ -120,18 +122,20 @@ class Problem:
             task.table, *joints, self._motions, task.limits, of_maxima,
             smooth, largest, self._gradients[1:],
         )  # fmt: skip
-        return Evaluation(value, smooth, self._of_unknowns(), float(largest.max()))
+        return Evaluation(value, smooth, self._gradients_by_unknowns(), float(largest.max()))
 
     def value(self) -> float:
         """Return the exact criterion of the last evaluated point."""
         s, omega, alpha = self._vectors
         return self.task.criterion.value(s, omega, alpha, self.task.period)
 
-    def _of_unknowns(self) -> Array:
+    def _gradients_by_unknowns(self) -> Array:
         g = self._gradients
-        of_q0 = g[:, 0].sum(axis=1)
+        by_q0 = g[:, 0].sum(axis=1)
         # (8, free, n), summed over position, velocity, acceleration and time.
-        of_free = (self._basis.transpose(0, 2, 1) @ g).sum(axis=1)
-        count, free, n = of_free.shape
-        of_free = of_free.reshape(count, 2, free // 2, n).swapaxes(2, 3).reshape(count, -1)
-        return np.hstack([of_q0, of_free])
+        by_coefficients = (self._basis.transpose(0, 2, 1) @ g).sum(axis=1)
+        count, free, n = by_coefficients.shape
+        by_coefficients = (
+            by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3).reshape(count, -1)
+        )
+        return np.hstack([by_q0, by_coefficients])

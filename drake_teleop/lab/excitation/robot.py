@@ -31,7 +31,7 @@ from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_POSTURES = 1000  # random postures for distances of shapes
+_NUM_POSTURES = 1000  # random postures for distances of shapes
 # Usable share of joint limits; the rest is for tracking errors and feedback.
 _JOINT_SHARE = 0.8
 # Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
@@ -39,9 +39,9 @@ _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
 # Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
 _LOAD_FACTOR = 1.3
 # Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
-_PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
-_PAYLOAD = 2.0
-_LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
+_PAYLOAD_COM_M, _PAYLOAD_GYRATION_M = 0.08, 0.05
+_DEFAULT_PAYLOAD_KG = 2.0
+_MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
@@ -96,14 +96,14 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     lower, upper = np.array(_BOX_W)
     box = (upper + lower) / 2, (upper - lower) / 2
     endless = np.zeros(3), np.full(3, np.inf)
-    return _robot(
+    return _make_robot(
         scene,
         "the station's slave",
         scenario.wrist_sensor,
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
         home=slave.start,
-        stands_there=True,
+        starts_at_home=True,
         points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
         box=endless if own else box,
         assumptions=["a table at z = 0", *slave.assumptions],
@@ -133,27 +133,27 @@ def RobotFromModel(
     Raises:
         DrakeTeleopError: if the model is unreadable or not such an arm.
     """
-    lacking: list[str] = []
+    missing: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
-        lacking[:] = model.assumptions
+        missing[:] = model.assumptions
         folders.append(model.folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
     with drakes_errors_said(path):
-        arm = _arm_of(parse)
+        arm = _read_arm(parse)
     check_size(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load
     else:
-        mass = _PAYLOAD if payload is None else payload
-        if not _LEAST_PAYLOAD <= mass <= _MOST_PAYLOAD:
+        mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
+        if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
             raise DrakeTeleopError(
-                f"{mass:g} kg is outside {_LEAST_PAYLOAD:g} to {_MOST_PAYLOAD:g} kg",
+                f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg",
                 where="--payload",
             )
         if payload is None:
@@ -164,21 +164,21 @@ def RobotFromModel(
                 where="--payload",
                 remedy="give the mass of all that may hang there",
             )
-        reserve = _payload(mass - load[0])
+        reserve = _compact_load(mass - load[0])
     with drakes_errors_said(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
-    assumptions += lacking
+    assumptions += missing
     scene.arm, completed = with_all_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
     )
-    return _robot(
+    return _make_robot(
         scene,
         path.name,
         sensor,
         estimation or MotionEstimationConfig(),
         sensor_hz,
         home=(scene.arm.lower + scene.arm.upper) / 2,
-        stands_there=False,
+        starts_at_home=False,
         points_S=np.zeros((1, 3)),
         box=(np.zeros(3), np.full(3, np.inf)),
         assumptions=assumptions + completed,
@@ -186,7 +186,7 @@ def RobotFromModel(
     )
 
 
-def _robot(
+def _make_robot(
     scene: Scene,
     name: str,
     sensor: WristSensorConfig,
@@ -194,7 +194,7 @@ def _robot(
     sensor_hz: float,
     *,
     home: Array,
-    stands_there: bool,
+    starts_at_home: bool,
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
@@ -202,13 +202,13 @@ def _robot(
 ) -> Robot:
     """Return the robot with its limits; `box` is middle and half size in W [m].
 
-    With `stands_there`, shapes that touch at home may touch.
+    With `starts_at_home`, shapes that touch at home may touch.
     """
     arm = scene.arm
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
-    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_POSTURES, len(half)))
+    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
     bodies = scene.rows()
-    start = home if stands_there else None
+    start = home if starts_at_home else None
     candidates, touching = scene.without_neighbours(bodies, postures, start)
     if touching:
         assumptions.append(
@@ -258,13 +258,13 @@ def _robot(
     )
 
 
-def _arm_of(parse: Parse) -> ArmModel:
+def _read_arm(parse: Parse) -> ArmModel:
     plant = MultibodyPlant(0.0)
     instance, frame = parse(plant)
     finalize(plant)
     return ArmModelFromPlant(plant, instance, frame.name())
 
 
-def _payload(mass: float) -> Array:
-    com = np.array([0.0, 0.0, _PAYLOAD_COM])
-    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION**2 * np.eye(3) * 2 / 3)
+def _compact_load(mass: float) -> Array:
+    com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
+    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

@@ -42,19 +42,19 @@ from drake_teleop.station.slave.plant import finalize
 CLEARANCE = 0.005
 # Neighbours by design: pairs below the clearance in this share of random postures, or with a
 # smaller variation of distance than this [m].
-_NEIGHBOURS, _STILL = 0.95, 1e-3
+_NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
-_BAND, _LEAST, _BLOCKED = (-0.02, 0.05), 0.25, 0.1
+_CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
 # Smallest number of postures near contact for a correction.
-_FEW = 5
+_MIN_POSTURES = 5
 # Share of postures below which near capsules count although their shapes were never near.
-_SELDOM = 0.05
+_RARE_SHARE = 0.05
 
 _TABLE = "drake_teleop_table"
 # Replaces a half space, for which Drake has no distances; wider than any arm.
 _PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
-_LARGEST = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
 # The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
 _TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
 
@@ -125,24 +125,24 @@ class Scene:
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(together)))
         candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
         context = self.diagram.CreateDefaultContext()
-        of_plant = self.plant.GetMyMutableContextFromRoot(context)
-        of_scene = self.scene_graph.GetMyContextFromRoot(context)
-        q = self.plant.GetPositions(of_plant)
-        looked_at = postures if start is None else np.vstack([postures, start])
-        distances = {pair: np.full(len(looked_at), np.inf) for pair in candidates}
-        for k, posture in enumerate(looked_at):
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        scene_context = self.scene_graph.GetMyContextFromRoot(context)
+        q = self.plant.GetPositions(plant_context)
+        all_postures = postures if start is None else np.vstack([postures, start])
+        distances = {pair: np.full(len(all_postures), np.inf) for pair in candidates}
+        for k, posture in enumerate(all_postures):
             q[self.arm.position_index] = posture
-            self.plant.SetPositions(of_plant, q)
-            query = self.scene_graph.get_query_output_port().Eval(of_scene)
-            for found in query.ComputeSignedDistancePairwiseClosestPoints(_BAND[1]):
+            self.plant.SetPositions(plant_context, q)
+            query = self.scene_graph.get_query_output_port().Eval(scene_context)
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
                 distances[found.id_A, found.id_B][k] = found.distance
         # A new manager: declarations of a manager older than the context have no effect there.
         manager = self.scene_graph.collision_filter_manager()
         touching = list[str]()
         for (a, b), of_all in list(distances.items()):
             of_pair = distances[a, b] = of_all[: len(postures)]
-            still = of_pair.max() < of_pair.min() + _STILL
-            neighbours = still or np.mean(of_pair < CLEARANCE) >= _NEIGHBOURS
+            constant = of_pair.max() < of_pair.min() + _MIN_VARIATION_M
+            neighbours = constant or np.mean(of_pair < CLEARANCE) >= _NEIGHBOUR_SHARE
             touch = start is not None and of_all[-1] < CLEARANCE
             if touch and not neighbours:
                 touching.append(" and ".join(self._body_names(a, b)))
@@ -170,56 +170,62 @@ class Scene:
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
         context = self.diagram.CreateDefaultContext()
-        of_plant = self.plant.GetMyContextFromRoot(context)
-        q = self.plant.GetPositions(of_plant)[self.arm.position_index][np.newaxis]
+        plant_context = self.plant.GetMyContextFromRoot(context)
+        q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
         motions_of(self.arm.table, q, 0 * q, 0 * q, motions)
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
         for shape in sorted({shape for pair in candidates for shape in pair}, key=_number):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
             row = rows[body.index()]
-            X_WB = self.plant.EvalBodyPoseInWorld(of_plant, body)
+            X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
             X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
             capsules[shape] = row, capsule.moved(X_LB @ inspector.GetPoseInFrame(shape))
             if inspector.GetName(shape).endswith(_TABLE):
                 capsules[shape] = row, _TABLE_CAPSULE
         outer = {shape: _outermost(shape, capsules) for shape in capsules}
-        kept = sorted({outer[shape] for shape in outer}, key=_number)
-        true: dict[tuple[int, int], Array] = {}
+        outer_shapes = sorted({outer[shape] for shape in outer}, key=_number)
+        shape_distances: dict[tuple[int, int], Array] = {}
         for (a, b), of_pair in candidates.items():
-            first, second = sorted((kept.index(outer[a]), kept.index(outer[b])))
-            true[first, second] = np.minimum(of_pair, true.get((first, second), np.inf))
-        pairs = np.array(sorted(true), dtype=np.int64).reshape(-1, 2)
-        of_rows = np.array([capsules[shape][0] for shape in kept], dtype=np.int64)
-        shapes = [capsules[shape][1] for shape in kept]
+            first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
+            shape_distances[first, second] = np.minimum(
+                of_pair, shape_distances.get((first, second), np.inf)
+            )
+        pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
+        capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
+        shapes = [capsules[shape][1] for shape in outer_shapes]
         motions = empty_motions(len(postures), self.arm.num_joints)
         motions_of(self.arm.table, postures, 0 * postures, 0 * postures, motions)
         ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
         radii = np.array([capsule.radius for capsule in shapes])
-        of_capsules = capsule_distances(motions, of_rows, ends, radii, pairs)
+        capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
         used, distances = [], []
         for k, (a, b) in enumerate(pairs):
-            distance = _kept_distance(true[a, b], of_capsules[:, k])
-            near, seem_near = true[a, b] < CLEARANCE, of_capsules[:, k] < distance
-            if near.sum() >= _FEW:
-                useful = np.mean(seem_near[near]) > np.mean(seem_near[~near])
+            distance = _minimum_distance(shape_distances[a, b], capsules_apart[:, k])
+            near, capsules_near = shape_distances[a, b] < CLEARANCE, capsules_apart[:, k] < distance
+            if near.sum() >= _MIN_POSTURES:
+                useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
             else:
-                useful = near.any() or 0 < np.mean(of_capsules[:, k] < CLEARANCE) < _SELDOM
+                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE) < _RARE_SHARE
             if useful:
                 used.append(k)
                 distances.append(distance)
-        return of_rows, shapes, pairs[used], np.array(distances)
+        return capsule_rows, shapes, pairs[used], np.array(distances)
 
 
-def _kept_distance(of_shapes: Array, of_capsules: Array) -> float:
+def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
     """Return the minimum distance of two capsules from (T,) distances [m].
 
     It subtracts the lower quartile of their excess near contact, and leaves 90 % of free postures.
     """
-    touching = (of_shapes > _BAND[0]) & (of_shapes < _BAND[1])
-    excess = (of_shapes - of_capsules)[touching] if touching.sum() >= _FEW else np.zeros(1)
-    free = of_capsules[of_shapes > CLEARANCE]
-    return float(min(CLEARANCE - np.quantile(excess, _LEAST), np.quantile(free, _BLOCKED)))
+    touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
+    excess = (
+        (of_shapes - capsules_apart)[touching] if touching.sum() >= _MIN_POSTURES else np.zeros(1)
+    )
+    free = capsules_apart[of_shapes > CLEARANCE]
+    return float(
+        min(CLEARANCE - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
+    )
 
 
 def _number(shape: GeometryId) -> int:
@@ -266,8 +272,8 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: b
                 _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
         if plant.GetCollisionGeometriesForBody(body) and not visuals_count:
             continue
-        for k, seen in enumerate(plant.GetVisualGeometriesForBody(body)):
-            X_BG, shape = inspector.GetPoseInFrame(seen), inspector.GetShape(seen)
+        for k, visual in enumerate(plant.GetVisualGeometriesForBody(body)):
+            X_BG, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)
             _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
 
 
@@ -281,9 +287,9 @@ def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> 
                 continue
             capsule = bounding_capsule(shape)
             size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
-            if not size <= _LARGEST:
+            if not size <= _MAX_SIZE_M:
                 raise DrakeTeleopError(
-                    f"a shape of {body.name()} is {size:.3g} m large, more than {_LARGEST:g} m",
+                    f"a shape of {body.name()} is {size:.3g} m large, more than {_MAX_SIZE_M:g} m",
                     where=where,
                     remedy="give all lengths in metres",
                 )

@@ -46,24 +46,24 @@ from drake_teleop.load.trajectory import FourierTrajectory
 RELIABLE = 0.95
 """Share of the records in which all numbers are within their tolerances together."""
 # Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
-_LONGEST, _FASTEST = 20.0, 15.0
+_MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
 # Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
-_STEP = 0.15
+_MAX_LOG_STEP = 0.15
 # Largest number of rounds; number of successful rounds without progress; required progress factor;
 # additional margin after a round that missed the tolerance.
-_ROUNDS, _IN_VAIN, _SHORTER, _MORE = 20, 1, 0.99, 1.005
+_MAX_ROUNDS, _MAX_VAIN_ROUNDS, _PROGRESS_RATIO, _FACTOR_MARGIN = 20, 1, 0.99, 1.005
 # Number of rounds without any motion before the search fails.
-_LOST = 3
+_MAX_EMPTY_ROUNDS = 3
 # Largest misfit of a motion that later rounds vary, and number of such starts.
-_NEAR, _STARTS_AROUND = 1.5, 4
+_MAX_START_MISFIT, _NUM_LATER_STARTS = 1.5, 4
 # Difference between the seeds of rounds.
-_OTHER = 2**33
+_SEED_STEP = 2**33
 # Variation in later rounds: share of the coefficients, factor of the period.
-_AROUND, _PERIODS = 0.2, 1.3
+_COEFFICIENT_SPREAD, _PERIOD_SPREAD = 0.2, 1.3
 # Sharpness of the maximum over tolerances, relative to that over eigenvalues.
-_SHARPER = 4.0
+_SHARPNESS_RATIO = 4.0
 # Regularisation of the balanced information; it is singular without motion.
-_REGULAR = 1e-11
+_REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def shortest(
         starts: random starts of the first round.
 
     Raises:
-        DrakeTeleopError: if no motion up to `_LONGEST` reaches it.
+        DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches it.
     """
     errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
@@ -105,14 +105,14 @@ def shortest(
     )
     worst, around = np.inf, None
     best: Shortest | None = None
-    in_vain, lost = 0, 0
-    for k in range(_ROUNDS):
+    vain_rounds, empty_rounds = 0, 0
+    for k in range(_MAX_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        many = starts if around is None else min(starts, _STARTS_AROUND)
-        found = design(problem, seed=seed + _OTHER * k, starts=many, progress=progress)
-        found = [each for each in found if each.value <= _LONGEST]
+        num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
+        found = design(problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress)
+        found = [each for each in found if each.value <= _MAX_PERIOD_S]
         if not found:
-            if (lost := lost + 1) == _LOST:
+            if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
                 break
             around = None
             continue
@@ -121,18 +121,22 @@ def shortest(
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
         reached = deviations_of(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _NEAR else None
+        around = problem.best if worst < _MAX_START_MISFIT else None
         if worst <= 1.0:
-            least = np.inf if best is None else best.excitation.trajectory.period
-            in_vain = 0 if trajectory.period < _SHORTER * least else in_vain + 1
-            if trajectory.period < least:
+            shortest_period = np.inf if best is None else best.excitation.trajectory.period
+            vain_rounds = (
+                0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
+            )
+            if trajectory.period < shortest_period:
                 best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
-            if in_vain == _IN_VAIN:
+            if vain_rounds == _MAX_VAIN_ROUNDS:
                 break
-        seen = problem.deviations(motion, trajectory.period)
-        now = factor * (reached / seen)
+        modelled = problem.deviations(motion, trajectory.period)
+        new_factor = factor * (reached / modelled)
         # No decrease after a round that missed the tolerance, to avoid oscillation.
-        factor = _MORE * np.maximum(now, factor) if worst > 1.0 and k > 0 else now
+        factor = (
+            _FACTOR_MARGIN * np.maximum(new_factor, factor) if worst > 1.0 and k > 0 else new_factor
+        )
     if best is not None:
         return best
     raise DrakeTeleopError(
@@ -190,7 +194,7 @@ class ShortestProblem(Problem):
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
-        self._period, self._shortest = 1.0, task.harmonics / _FASTEST
+        self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
         """Return the trajectory with the unknowns x."""
@@ -199,11 +203,11 @@ class ShortestProblem(Problem):
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
         """Return a random motion and period, or a variation of `around`."""
         if self._around is not None and near_home:
-            other = _AROUND * rng.uniform() * np.abs(self._around[:-1]).mean()
+            other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
-            x[-1] += np.log(_PERIODS) * rng.uniform(-1.0, 1.0)
+            x[-1] += np.log(_PERIOD_SPREAD) * rng.uniform(-1.0, 1.0)
             return x
-        period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _LONGEST))))
+        period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
         self.task = replace(task, period=period)  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
@@ -212,15 +216,18 @@ class ShortestProblem(Problem):
 
     def bounds(self, x: Array) -> Bounds:
         """Return bounds of log T near x."""
-        least, largest = np.log(self._shortest), np.log(2.0 * _LONGEST)
-        around = (np.clip(x[-1] + step, least, largest) for step in (-_STEP, _STEP))
+        shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
+        around = (
+            np.clip(x[-1] + step, shortest_period, largest)
+            for step in (-_MAX_LOG_STEP, _MAX_LOG_STEP)
+        )
         low, high = (float(each) for each in around)
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
         """Evaluate log T and eight limits: tolerance, then arm."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
-        log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _LONGEST)))
+        log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
@@ -229,19 +236,19 @@ class ShortestProblem(Problem):
         sensor_vectors(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._asked(_SHARPER * of_criterion)
+        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * of_criterion)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMITS)))
         limit_uses(
             task.table, q, qd, qdd, self._motions, task.limits, of_maxima, smooth, largest, g[2:]
         )
-        of_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
+        by_log_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
-        of_period[1] -= 0.25
-        of_period[0] = 1.0
+        by_log_period[1] -= 0.25
+        by_log_period[0] = 1.0
         g[:, 1] /= T
         g[:, 2] /= T**2
-        gradients = np.hstack([self._of_unknowns(), of_period[:, np.newaxis]])
+        gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
         return Evaluation(
             float(x[-1]), np.append(use, smooth), gradients, max(worst, float(largest.max()))
         )
@@ -272,13 +279,13 @@ class ShortestProblem(Problem):
         G = share * (flat.T @ flat)
         B = share * (flat.T @ (self._noise @ rows).reshape(flat.shape))
         size = 1.0 / np.sqrt(np.diag(G))
-        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULAR * np.eye(16))
+        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULARISATION * np.eye(16))
         inverse *= np.outer(size, size)
         v = self._errors @ inverse
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _asked(self, sharpness: float) -> tuple[float, float, Array]:
+    def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
         """Return smooth and exact use of the tolerance, and the gradient of the smooth one by V.
 
         With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
