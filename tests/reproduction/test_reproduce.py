@@ -79,7 +79,7 @@ def test_the_contact_is_as_in_figure_8(run):
 
 
 @pytest.mark.slow
-def test_the_load_is_found_from_the_sensors_samples(run):
+def test_load_is_identified_from_sensor_samples(run):
     figures = run[0]["identification"]
     assert figures["mass_error_percent"] <= 0.2
     assert figures["com_error_mm"] <= 0.5
@@ -96,7 +96,7 @@ def test_the_speed_was_measured(run):
 
 
 @pytest.mark.slow
-def test_everything_is_as_accepted(run):
+def test_all_rows_are_accepted(run):
     assert unaccepted(run[0]) == []
 
 
@@ -130,7 +130,7 @@ def test_everything_is_written(run):
 
 
 @pytest.mark.slow
-def test_the_bottom_plots_are_what_the_hand_gets(run):
+def test_bottom_plots_equal_the_output_of_the_loop(run):
     _, out = run
     load = Identification.load(out / "identification.json")
     for name in ("free_motion_force", "free_motion_torque", "contact_transition"):
@@ -151,7 +151,7 @@ def test_the_bottom_plots_are_what_the_hand_gets(run):
 
 
 @pytest.mark.slow
-def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
+def test_sensor_log_alone_gives_the_same_load(run):
     """The log without states of the plant gives the same load."""
     _, out = run
     result = log(out, "identification")
@@ -196,7 +196,7 @@ def motion() -> ContactMotion:
     )
 
 
-def test_a_clean_contact_is_detected_at_once_and_hidden_in_the_raw_force(motion):
+def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
     figures = contact_figures(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
@@ -206,14 +206,14 @@ def test_a_clean_contact_is_detected_at_once_and_hidden_in_the_raw_force(motion)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_any_axis_of_the_raw_force_that_tells_the_contact_counts(motion, axis):
+def test_raw_force_detects_contact_by_any_axis(motion, axis):
     told = motion.raw.copy()
     told[motion.contact, axis] += 180.0
     figures = contact_figures(dataclasses.replace(motion, raw=told))
     assert figures["raw_detectable"] is True
 
 
-def test_the_length_of_the_raw_force_counts_too(motion):
+def test_raw_force_detects_contact_by_its_norm(motion):
     """Each component is inside its range, but not the norm."""
     free, told = motion.raw_free.copy(), motion.raw.copy()
     free[:100, 0] = told[:100, 0] = 80.0
@@ -223,21 +223,21 @@ def test_the_length_of_the_raw_force_counts_too(motion):
     assert excess[3] > 0
 
 
-def test_a_crossing_at_the_second_turn_is_a_false_alarm(motion):
+def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
     calculated = motion.calculated.copy()
     calculated[np.argmin(np.abs(motion.touched.t - 0.6)), 2] = 2.0
     figures = contact_figures(dataclasses.replace(motion, calculated=calculated))
     assert figures["false_alarm_0_6_s"] is True
 
 
-def test_without_elimination_nothing_is_detected(motion):
+def test_contact_is_not_detected_without_elimination(motion):
     largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
     figures = contact_figures(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
     assert figures["detected_s"] is None
     assert np.isnan(flat({"contact": figures})["contact.detected_s"])
 
 
-def test_without_contact_there_is_no_time_of_it(motion):
+def test_contact_time_is_null_without_contact(motion):
     nothing = np.zeros(len(motion.touched.t), dtype=bool)
     figures = contact_figures(
         dataclasses.replace(motion, contact=nothing, calculated=motion.calculated_free)
@@ -246,7 +246,7 @@ def test_without_contact_there_is_no_time_of_it(motion):
     assert figures["raw_detectable"] is False
 
 
-def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn():
+def test_elimination_removes_the_reaction_force_of_the_plant():
     """Rotations about all axes excite each term of V."""
     sine = Sine(
         duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
@@ -262,7 +262,7 @@ def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn(
     assert 0 < left[3:].max() < 1e-12
 
 
-def test_a_wrong_mass_is_seen_in_what_is_left():
+def test_wrong_mass_increases_the_residual():
     """A mass error of 10 % leaves 10 % of the force."""
     scenario = replace(
         LoadScenario("free_motion_force"), simulation__settle=0.7, simulation__duration=0.4

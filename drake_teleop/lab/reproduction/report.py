@@ -100,37 +100,37 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
     return [
-        _between("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
+        _range_row("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
                  s["free_force.peak_raw_N"], "N", 90, 115),
-        _between("set", "Fig. 6: the same at the master", "about 5.7 N",
+        _range_row("set", "Fig. 6: the same at the master", "about 5.7 N",
                  s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
-        _between("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
+        _range_row("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
                  s["free_force.half_ratio"], "", 0.48, 0.52),
-        _between("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
+        _range_row("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
                  s["free_force.residual_max_N"], "N", 0, 5),
-        _between("found", "Fig. 6: the same, ideal sensor and true φ", _NOT_REPORTED,
+        _range_row("found", "Fig. 6: the same, ideal sensor and true φ", _NOT_REPORTED,
                  s["free_force.residual_ideal_max_N"], "N", 0, 1e-9),
-        _record("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
+        _unrated_row("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
                 s["free_torque.peak_raw_Nm"], "N m"),
-        _between("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
+        _range_row("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
                  s["free_torque.half_ratio"], "", 0.48, 0.52),
-        _record("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
+        _unrated_row("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
                 s["free_torque.residual_max_Nm"], "N m"),
-        _between("found", "Fig. 7: the same, ideal sensor and true φ", _NOT_REPORTED,
+        _range_row("found", "Fig. 7: the same, ideal sensor and true φ", _NOT_REPORTED,
                  s["free_torque.residual_ideal_max_Nm"], "N m", 0, 1e-9),
-        _between("set", "Fig. 8: contact is made at", "about 220 ms",
+        _range_row("set", "Fig. 8: contact is made at", "about 220 ms",
                  1e3 * s["contact.true_s"], "ms", 205, 235),
-        _between("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
+        _range_row("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
                  delay_ms, "ms", 0, 10),
-        _answer("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+        _answer_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
                 s["contact.raw_detectable"], False),
-        _answer("Fig. 8: false alarm at about 600 ms", "no contact there",
+        _answer_row("Fig. 8: false alarm at about 600 ms", "no contact there",
                 s["contact.false_alarm_0_6_s"], False),
-        _between("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
+        _range_row("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
                  share, "", 0, 0.7),
-        _between("found", "Mass, error of the estimate", _NOT_REPORTED,
+        _range_row("found", "Mass, error of the estimate", _NOT_REPORTED,
                  s["identification.mass_error_percent"], "%", 0, 0.2),
-        _between("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
+        _range_row("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
                  s["identification.com_error_mm"], "mm", 0, 0.5),
     ]  # fmt: skip
 
@@ -256,23 +256,23 @@ def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _between(
+def _range_row(
     origin: str, what: str, paper: str, value: float, unit: str, low: float, high: float
 ) -> Comparison:
     bounds = f"at most {high:.3g} {unit}" if low == 0 else f"{low:.3g} to {high:.3g} {unit}"
     holds = bool(low <= value <= high)
-    return Comparison(what, paper, _text(value, unit), origin, bounds.strip(), holds)
+    return Comparison(what, paper, _format_value(value, unit), origin, bounds.strip(), holds)
 
 
-def _answer(what: str, paper: str, value: bool, expected: bool) -> Comparison:
+def _answer_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
     words, holds = {True: "yes", False: "no"}, bool(value) == expected
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 
 
-def _record(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
-    return Comparison(what, paper, _text(value, unit), origin, "", None)
+def _unrated_row(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
+    return Comparison(what, paper, _format_value(value, unit), origin, "", None)
 
 
-def _text(value: float, unit: str) -> str:
+def _format_value(value: float, unit: str) -> str:
     number = f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:#.3g}".rstrip(".")
     return f"{number} {unit}".strip()

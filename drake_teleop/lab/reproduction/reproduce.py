@@ -48,7 +48,7 @@ from drake_teleop.lab.reproduction.report import (
     write_report,
 )
 from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
-from drake_teleop.lab.run_summary import FILTER_TAIL, in_contact
+from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
 from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.station.replay import write_replay
 from drake_teleop.station.result import SimulationResult
@@ -65,7 +65,7 @@ _THRESHOLD_OVER_FREE = 1.5
 # Slow motion of the replay; the contact lasts 40 ms.
 _SLOW_MOTION = 8.0
 _FORCE_Z, _TORQUE_X = 2, 3
-_AXES = ("f_x", "f_y", "f_z", "|f|")
+_RAW_SIGNALS = ("f_x", "f_y", "f_z", "|f|")
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def reproduce_command(
     with show_progress(progress and not quiet) as stage:
         # Each run has another seed.
         force, torque, contact = (
-            _at_the_hands_rate(LoadScenario(name), seed + k)
+            _log_at_hand_rate(LoadScenario(name), seed + k)
             for k, name in enumerate(
                 ("free_motion_force", "free_motion_torque", "contact_transition"), 1
             )
@@ -166,7 +166,7 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
         raw_free=_scaled(free, estimate, 1.0),
         calculated_free=calculated_free,
         contact=in_contact(touched),
-        threshold=_THRESHOLD_OVER_FREE * float(_force(calculated_free).max()),
+        threshold=_THRESHOLD_OVER_FREE * float(_force_norm(calculated_free).max()),
     )
 
 
@@ -187,40 +187,41 @@ def free_figures(run: FreeMotion, ideal: Array, component: int, unit: str) -> Fi
         "half_ratio": _rms(half) / _rms(raw),
         f"residual_max_{unit}": float(np.abs(rest).max()),
         f"residual_rms_{unit}": _rms(rest),
-        f"residual_norm_max_{unit}": _largest(run.scaled[0.0][:, vector]),
-        f"residual_ideal_max_{unit}": _largest(ideal[:, vector]),
+        f"residual_norm_max_{unit}": _largest_norm(run.scaled[0.0][:, vector]),
+        f"residual_ideal_max_{unit}": _largest_norm(ideal[:, vector]),
     }
 
 
 def contact_figures(run: ContactMotion) -> Figures:
     """Return the values of Fig. 8."""
-    t, size = run.touched.t, _force(run.calculated)
-    over = size > run.threshold
-    touch = _touch(run)
-    after = t > t[touch][-1] if touch.any() else np.zeros(len(t), dtype=bool)
+    t, force_norm = run.touched.t, _force_norm(run.calculated)
+    detected = force_norm > run.threshold
+    window = _contact_window(run)
+    after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
     return {
-        "true_s": _first(t, run.contact),
-        "detected_s": _first(t, over),
+        "true_s": _first_time(t, run.contact),
+        "detected_s": _first_time(t, detected),
         "threshold_N": run.threshold,
         "raw_detectable": bool(raw_excess(run).max() > 0),
-        "false_alarm_0_6_s": bool(over[after].any()),
-        "peak_contact_N": float(size.max()),
-        "peak_true_contact_N": _largest(run.touched["true_contact_wrench_W"][:, :3]),
-        "peak_inertial_N": _largest((run.raw - run.calculated)[:, :3]),
+        "false_alarm_0_6_s": bool(detected[after].any()),
+        "peak_contact_N": float(force_norm.max()),
+        "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
+        "peak_inertial_N": _largest_norm((run.raw - run.calculated)[:, :3]),
         "duration_s": float(np.count_nonzero(run.contact) * (t[1] - t[0])),
         "largest_deflection_mm": 1e3 * float(np.abs(run.touched["sheet_state"][:, 0]).max()),
-        "free_residual_norm_max_N": float(_force(run.calculated_free).max()),
-        "free_residual_norm_max_Nm": _largest(run.calculated_free[:, 3:]),
+        "free_residual_norm_max_N": float(_force_norm(run.calculated_free).max()),
+        "free_residual_norm_max_Nm": _largest_norm(run.calculated_free[:, 3:]),
     }
 
 
 def raw_excess(run: ContactMotion) -> Array:
     """Return (4,) excess of f_x, f_y, f_z, |f| over the free range [N]."""
     touched, free = (
-        np.column_stack([raw[:, :3], _force(raw)]) for raw in (run.raw[_touch(run)], run.raw_free)
+        np.column_stack([raw[:, :3], _force_norm(raw)])
+        for raw in (run.raw[_contact_window(run)], run.raw_free)
     )
     if not len(touched):
-        return np.full(len(_AXES), -np.inf)
+        return np.full(len(_RAW_SIGNALS), -np.inf)
     return np.maximum(
         touched.max(axis=0) - free.max(axis=0), free.min(axis=0) - touched.min(axis=0)
     )
@@ -228,9 +229,9 @@ def raw_excess(run: ContactMotion) -> Array:
 
 def identification_figures(load: LoadIdentification, scenario: Scenario) -> Figures:
     """Return errors and expected accuracy of the estimate."""
-    error = load.estimate - _truth(scenario)
+    error = load.estimate - _true_parameters(scenario)
     mass, moment = load.estimate[6], load.estimate[7:10]
-    true_mass, true_moment = _truth(scenario)[6], _truth(scenario)[7:10]
+    true_mass, true_moment = _true_parameters(scenario)[6], _true_parameters(scenario)[7:10]
     deviations = load.batch.standard_deviations
     return {
         "mass_kg": float(mass),
@@ -274,12 +275,12 @@ def draw(
         contact=contact.contact,
         detected_s=math.nan if detected is None else detected,
         threshold=contact.threshold,
-        turning_s=_turn_without_contact(contact),
+        turning_s=_reversal_without_contact(contact),
     )
     return pictures
 
 
-def _at_the_hands_rate(scenario: Scenario, seed: int) -> Scenario:
+def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
@@ -292,7 +293,7 @@ def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> Simula
     return simulate(station, scenario.simulation, progress=progress)
 
 
-def _truth(scenario: Scenario) -> Array:
+def _true_parameters(scenario: Scenario) -> Array:
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 
@@ -323,29 +324,29 @@ def _speed(progress: Progress) -> Figures:
     }
 
 
-def _touch(run: ContactMotion) -> NDArray[np.bool_]:
-    """Return (N,) from first contact to FILTER_TAIL after the last."""
+def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
+    """Return (N,) from first contact to FILTER_TAIL_S after the last."""
     t = run.touched.t
     if not run.contact.any():
         return run.contact
     times = t[run.contact]
-    return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL)
+    return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
 
 
-def _turn_without_contact(run: ContactMotion) -> float | None:
-    t, size = run.touched.t, _force(run.raw)
-    touch = _touch(run)
-    if not touch.any():
+def _reversal_without_contact(run: ContactMotion) -> float | None:
+    t, force_norm = run.touched.t, _force_norm(run.raw)
+    window = _contact_window(run)
+    if not window.any():
         return None
-    size[t <= t[touch][-1]] = 0.0
-    return float(t[np.argmax(size)])
+    force_norm[t <= t[window][-1]] = 0.0
+    return float(t[np.argmax(force_norm)])
 
 
-def _force(wrench: Array) -> Array:
+def _force_norm(wrench: Array) -> Array:
     return np.linalg.norm(wrench[:, :3], axis=1)
 
 
-def _largest(vectors: Array) -> float:
+def _largest_norm(vectors: Array) -> float:
     return float(np.linalg.norm(vectors, axis=1).max())
 
 
@@ -353,7 +354,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _first(t: Array, happened: NDArray[np.bool_]) -> float | None:
+def _first_time(t: Array, happened: NDArray[np.bool_]) -> float | None:
     return float(t[np.argmax(happened)]) if happened.any() else None
 
 
@@ -385,17 +386,17 @@ def _write(
     write_text(out / "table.md", _markdown(compare_with_paper(figures)))
     write_report(
         out / "report.html",
-        setup=_setup(seed, force.scenario, load),
+        setup=_describe_setup(seed, force.scenario, load),
         summary=figures,
-        figures=_captioned(out, figures),
+        figures=_captioned_figures(out, figures),
         parameters=parameter_rows(
-            _truth(force.scenario), load.estimate, load.batch.standard_deviations
+            _true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
         ),
         replay="replay.html",
     )
 
 
-def _captioned(out: Path, figures: Figures) -> list[ReportFigure]:
+def _captioned_figures(out: Path, figures: Figures) -> list[ReportFigure]:
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
@@ -405,7 +406,7 @@ def _captioned(out: Path, figures: Figures) -> list[ReportFigure]:
     return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
 
 
-def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
+def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
     rates, scale = scenario.rates, scenario.force_scaling.force_scale
     return {
         "Seed": str(seed),

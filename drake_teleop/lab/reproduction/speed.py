@@ -15,7 +15,7 @@ from drake_teleop.station.simulation import MakeSimulator, advance
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_SPAN = 0.1  # simulated time of one measurement [s]
+_RUN_S = 0.1  # simulated time of one measurement [s]
 
 
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
@@ -52,11 +52,11 @@ def cpu_seconds(
 
     Other load of the machine can only add time, so the minimum counts (as in `timeit`).
     """
-    spent: dict[str, list[float]] = {name: [] for name in simulators}
+    times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for turn in range(turns):
         for name, simulator in simulators.items():
             start = time.thread_time()
-            advance(simulator, simulator.get_context().get_time() + _SPAN)
-            spent[name].append((time.thread_time() - start) / _SPAN)
+            advance(simulator, simulator.get_context().get_time() + _RUN_S)
+            times_s[name].append((time.thread_time() - start) / _RUN_S)
         progress((turn + 1) / turns)
-    return {name: min(times) for name, times in spent.items()}
+    return {name: min(times) for name, times in times_s.items()}
