@@ -49,7 +49,7 @@ def rows_of(study: Study, noise: float = 0.0) -> pl.DataFrame:
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
-def test_a_cell_without_a_successful_run_stays_empty():
+def test_cell_without_successful_run_has_no_value():
     rows = rows_of(TOUCH)
     (pair,) = pair_means(TOUCH, rows, EFFORT)
     expected = [
@@ -60,7 +60,7 @@ def test_a_cell_without_a_successful_run_stays_empty():
     assert set(pair.why[np.isfinite(pair.mean)]) == {""}
 
 
-def test_no_effect_is_averaged_over_what_is_not_there():
+def test_effects_compare_equal_combinations_only():
     found = main_effects(TOUCH, rows_of(TOUCH, noise=0.1), EFFORT)
     sigma, gamma = found["force_scaling.sigma"], found["force_scaling.gamma"]
     # All sigmas have gamma 0.25 and 1; sigma 1 has all successful gammas.
@@ -78,7 +78,7 @@ def test_no_effect_is_averaged_over_what_is_not_there():
     assert not gamma.fitted
 
 
-def test_the_table_says_what_is_left_out():
+def test_effects_table_lists_excluded_combinations():
     table = effects(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
     assert table["level"].to_list() == ["0.25", "1", "4", "8", "16"]
     assert table["runs"].to_list() == [16, 16, 8, 4, 0]
@@ -87,7 +87,7 @@ def test_the_table_says_what_is_left_out():
     assert table["why"].to_list() == [None] * 4 + [NO_SUCCESS]
 
 
-def test_pictures_hatch_what_is_empty_and_say_why():
+def test_pictures_hatch_empty_cells_with_a_legend():
     rows = rows_of(TOUCH)
     main, pairs = (
         pictures.main_effects(TOUCH, rows, [EFFORT]),
@@ -104,7 +104,7 @@ def test_pictures_hatch_what_is_empty_and_say_why():
     assert pairs.axes[0].images[0].get_clim() == pytest.approx((1.9, effort(1.0, 0.25) + 0.9))
 
 
-def test_the_levels_are_as_many_as_any_combination_has():
+def test_largest_comparable_set_of_levels_is_used():
     there = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 0, 1, 0]], dtype=bool)
     rows, columns = comparable(there)
     assert rows.tolist() == [True, True, False] and columns.tolist() == [True, True, False, False]
@@ -142,7 +142,7 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
     assert np.mean(narrow) < 0.8
 
 
-def test_their_widths_are_those_of_least_squares():
+def test_half_widths_equal_least_squares():
     """Reference: regression with a column for each point and each seed."""
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
@@ -164,7 +164,7 @@ def test_their_widths_are_those_of_least_squares():
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_a_regression_does_not_go_on_beyond_the_edge_of_failures():
+def test_regression_does_not_extrapolate_into_failed_cells():
     factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
     points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(6)
     known = points[:, 0] - points[:, 1] < 0.4
@@ -193,7 +193,7 @@ def looked(design: str) -> tuple[Study, pl.DataFrame]:
     return study, pl.DataFrame(rows).with_columns((pl.col("a.x") + pl.col("a.y")).alias(EFFORT))
 
 
-def test_a_cell_where_no_point_lies_is_empty_but_says_no_more():
+def test_cell_without_point_is_empty_but_does_not_exclude_levels():
     study, rows = looked("sobol")
     (pair,) = pair_means(study, rows, EFFORT)
     points = rows.select("a.x", "a.y").to_numpy()
@@ -204,7 +204,7 @@ def test_a_cell_where_no_point_lies_is_empty_but_says_no_more():
     assert all(found.left_out == 0 for found in main_effects(study, rows, EFFORT).values())
 
 
-def test_an_adaptive_design_says_nothing_of_where_it_did_not_look():
+def test_adaptive_design_has_no_value_in_unsearched_cells():
     study, rows = looked("adaptive")
     for found in main_effects(study, rows, EFFORT).values():
         assert found.left_out > 0

@@ -81,7 +81,7 @@ def force(x, y, word, seed):
     return 6 * x * (1 + y) + np.sin(5 * y) + 0.02 * (word == "real") + 0.1 * seed
 
 
-def test_a_factor_that_does_nothing_shows_nothing():
+def test_irrelevant_factor_has_no_significant_effect():
     """Plain means of its three levels differ by 2.2 N, because x and y differ."""
     study = sobol(32, repeats=2, seed=104)
     rows = made_up(study, force)
@@ -96,7 +96,7 @@ def test_a_factor_that_does_nothing_shows_nothing():
     assert np.all(np.abs(found["a.x"].effect) > found["a.x"].effect_half)
 
 
-def test_intervals_are_wide_if_seeds_differ_in_what_a_factor_does():
+def test_intervals_contain_seed_dependent_effects():
     study = sobol(64, repeats=3)
     alike = main_effects(study, made_up(study, force), "hand_work_J")
     rows = made_up(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
@@ -105,7 +105,7 @@ def test_intervals_are_wide_if_seeds_differ_in_what_a_factor_does():
     assert apart["a.y"].effect_half[0] < 1.5 * alike["a.y"].effect_half[0]
 
 
-def test_what_is_exact_has_a_width_of_rounding():
+def test_exact_fit_has_a_width_of_rounding():
     study = sobol(64)
     found = main_effects(study, made_up(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
     for name, truth in (("a.x", 3 * np.array([-0.4, -0.2, 0, 0.2, 0.4])), ("a.y", np.zeros(5))):
@@ -113,7 +113,7 @@ def test_what_is_exact_has_a_width_of_rounding():
         assert np.all(found[name].effect_half < 1e-8)
 
 
-def test_a_point_that_failed_does_not_move_the_others():
+def test_failed_point_does_not_change_other_effects():
     factors = [Factor("a.x", values=[0.0, 1.0, 4.0]), Factor("a.y", values=[1.0, 2.0, 3.0, 5.0])]
     study = Study(factors=factors, repeats=2, measures=["hand_work_J"])
     rows = made_up(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
@@ -130,7 +130,7 @@ def test_a_point_that_failed_does_not_move_the_others():
     np.testing.assert_allclose(effects(study, broken)["mean"], whole["mean"], atol=1e-9)
 
 
-def test_means_over_pairs_are_those_of_the_function():
+def test_pair_means_equal_the_function():
     study = sobol(64)
     rows = made_up(study, lambda x, y, w, seed: 8 * x * y + (3 * y if w == "real" else 0))
     pairs = {found.fields: found for found in pair_means(study, rows, "hand_work_J")}
@@ -143,7 +143,7 @@ def test_means_over_pairs_are_those_of_the_function():
     assert pair_means(few, made_up(few, force), "hand_work_J") == []
 
 
-def test_too_few_points_say_nothing():
+def test_too_few_points_give_no_effects():
     study = sobol(2)
     found = main_effects(study, made_up(study, force), "hand_work_J")
     assert all(np.isnan(one.effect).all() for one in found.values())
@@ -151,6 +151,6 @@ def test_too_few_points_say_nothing():
     assert main_effects(study, nothing, "hand_work_J") == {}
 
 
-def test_words_that_no_run_has_are_no_levels():
+def test_words_without_run_are_not_levels():
     factor = Factor("a.w", words=["a", "b", "c"])
     assert levels_of(factor, ["c", "a", "c"]).names == ["a", "c"]

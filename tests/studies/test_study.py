@@ -25,7 +25,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.measures import default_measures, measured
-from drake_teleop.lab.studies.runs import ONCE, Told, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST, StudyProgress, run_study
 from drake_teleop.lab.studies.store import Store, open_store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.station.result import SimulationResult
@@ -56,7 +56,7 @@ import joblib, polars
 from drake_teleop.lab.studies import runs
 from drake_teleop.lab.studies.design import Factor, Study
 
-runs._CHUNKS = 150  # as many runs in a part as a larger study has
+runs._NUM_CHUNKS = 150  # as many runs in a part as a larger study has
 
 def work(values, seed):
     time.sleep(pause)
@@ -141,7 +141,7 @@ def two_runs(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
+def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
     """With two runs each."""
     monkeypatch.chdir(tmp_path)
     page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
@@ -163,7 +163,7 @@ def parts(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_row_for_each_run(serial):
+def test_table_has_a_row_for_each_run(serial):
     summary, out = serial
     rows = pl.read_parquet(out / "runs.parquet").sort("run")
     assert rows["run"].to_list() == list(range(12))
@@ -194,9 +194,7 @@ def test_processes_give_the_same_bytes(serial, files):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
-    serial, files, monkeypatch
-):
+def test_local_dask_cluster_gives_the_same_bytes(serial, files, monkeypatch):
     out, write, seen = files / "dask", Store.write, set()
 
     def look_and_write(store, rows):
@@ -210,14 +208,14 @@ def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
     assert seen and seen <= THIS_MACHINE
 
 
-def test_without_dask_the_extra_is_named(files, monkeypatch):
+def test_error_without_dask_names_the_extra(files, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(DrakeTeleopError, match=r"pip install '\.\[cluster\]' in"):
         study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
 
 
 @pytest.mark.slow
-def test_a_study_of_stations_that_was_stopped_goes_on(serial, files, monkeypatch):
+def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
     out, work, calls = files / "stopped", studies.StationWork.__call__, []
 
     def stopping(self, values, seed):
@@ -234,7 +232,7 @@ def test_a_study_of_stations_that_was_stopped_goes_on(serial, files, monkeypatch
 
 
 @pytest.mark.slow
-def test_kills_lose_and_double_no_row(tmp_path):
+def test_kills_neither_lose_nor_duplicate_rows(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
     script, killed, whole, report = (tmp_path / name for name in names)
     script.write_text(FAKE)
@@ -258,7 +256,7 @@ def test_kills_lose_and_double_no_row(tmp_path):
     assert rows["hand_work_J"].null_count() == failed["hand_work_J"].null_count() == failed.height
 
 
-def test_a_run_that_fails_is_a_row(files):
+def test_failed_run_is_a_row_with_an_error(files):
     (files / "failing.yaml").write_text(
         STUDY.replace(
             "values: [1e-3]", "values: [1e-3]}\n  - {field: force_scaling.eta, values: [1]"
@@ -273,7 +271,7 @@ def test_a_run_that_fails_is_a_row(files):
 
 
 @pytest.mark.slow
-def test_another_study_does_not_mix_with_the_rows(serial, files):
+def test_folder_of_another_study_is_refused(serial, files):
     before = parts(serial[1])
     (files / "other.yaml").write_text(STUDY + "seed: 1\n")
     with pytest.raises(DrakeTeleopError, match="another study"):
@@ -282,7 +280,7 @@ def test_another_study_does_not_mix_with_the_rows(serial, files):
 
 
 @pytest.mark.parametrize("damage", ["empty", "no rows", "damaged"])
-def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, damage):
+def test_empty_part_is_repeated_and_other_files_are_ignored(tmp_path, damage):
     study = Study(factors=[Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0])], measures=[])
     calls: list[int] = []
 
@@ -309,7 +307,7 @@ def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, 
     assert run().equals(rows) and not calls
 
 
-def test_two_processes_do_not_write_at_once(tmp_path):
+def test_second_process_in_a_folder_is_refused(tmp_path):
     with (
         open_store(tmp_path, {}),
         pytest.raises(DrakeTeleopError, match="another process"),
@@ -320,7 +318,7 @@ def test_two_processes_do_not_write_at_once(tmp_path):
         pass
 
 
-def test_an_interrupt_says_what_is_kept(tmp_path):
+def test_interrupt_reports_stored_runs(tmp_path):
     calls = []
 
     def work(values, seed):
@@ -350,7 +348,7 @@ def dying(own: int, at: float):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
-def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
+def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
     factor = Factor("a.b", low=0.0, high=9.0, levels=10)
     study = Study(factors=[factor], measures=["hand_work_J"])
     rows = run_study(study, tmp_path, dying(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
@@ -484,7 +482,7 @@ def test_an_adaptive_design_finds_the_best_point(searched):
 
 
 @pytest.mark.slow
-def test_an_adaptive_design_goes_on_after_any_stop(tmp_path, searched):
+def test_adaptive_design_continues_after_any_stop(tmp_path, searched):
     calls = []
 
     def stopping(values, seed):
@@ -557,7 +555,7 @@ def test_measures_of_a_known_motion():
     )
 
 
-def test_a_preset_brings_its_values():
+def test_preset_as_factor_sets_its_values():
     work = studies.StationWork({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
@@ -601,7 +599,7 @@ def test_a_preset_brings_its_values():
         ((STUDY, "- 1"), "expected a mapping"),
     ],
 )
-def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message):
+def test_wrong_study_file_is_one_line_with_its_field(files, tmp_path, change, message):
     path = files / "bad.yaml"
     path.write_text(STUDY.replace(*change))
     with pytest.raises(DrakeTeleopError) as error:
@@ -622,9 +620,7 @@ repeats: 200
     ("factors", "runs"),
     [(2, "1,000,000,000,000 runs"), (5, "10^21.0 runs"), (110, "10^336.0 runs")],
 )
-def test_a_study_that_is_too_large_is_refused_before_there_is_any_of_it(
-    files, tmp_path, monkeypatch, factors, runs
-):
+def test_too_large_study_is_refused_before_its_design(files, tmp_path, monkeypatch, factors, runs):
     monkeypatch.setattr(Study, "points", lambda self: pytest.fail("as large as that"))
     fields = [f"{{field: a.b{k}, low: 0, high: 1, levels: 1000}}" for k in range(factors)]
     path = files / "huge.yaml"
@@ -634,7 +630,7 @@ def test_a_study_that_is_too_large_is_refused_before_there_is_any_of_it(
     assert not (tmp_path / "out").exists()
 
 
-def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
+def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     class Begun(Exception):
         pass
 
@@ -657,7 +653,7 @@ def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
         study_command(path, out, yes=lambda question: pytest.fail("nobody need ask"))
 
 
-def test_no_file(tmp_path):
+def test_missing_study_file_is_an_error(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"none\.yaml'; give a YAML file or one of scaling_"):
         LoadStudy(tmp_path / "none.yaml")
 
@@ -666,7 +662,7 @@ def threads(values, seed):
     return {"hand_work_J": float(max(library["num_threads"] for library in threadpool_info()))}
 
 
-def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_process(tmp_path):
+def test_runs_use_one_blas_thread(tmp_path):
     study = Study(factors=[Factor("a.b", values=[0.0, 1.0])], measures=["hand_work_J"])
     with threadpool_limits(2):
         rows = run_study(study, tmp_path, threads, {}, jobs=1)
@@ -674,34 +670,34 @@ def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_proc
     assert rows["hand_work_J"].to_list() == [1.0, 1.0]
 
 
-def test_the_time_that_is_left_follows_from_the_last_runs():
+def test_remaining_time_follows_from_the_latest_runs():
     """Runs take 2 s, four in parallel; the first two also identify a load."""
     shown = []
-    told = Told(100)
-    told.start(lambda fraction, words="": shown.append((fraction, words)), 4)
-    told.found(20)
+    counter = StudyProgress(100)
+    counter.start(lambda fraction, words="": shown.append((fraction, words)), 4)
+    counter.add_earlier_runs(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
-    told.more([{"seconds": 9.0, ONCE: 7.0}] * 2)
+    counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}] * 2)
     assert shown[-1] == (0.22, "22/100, about 0:00:39 left")
     for _ in range(18):
-        told.more([{"seconds": 2.0}])
-    told.more([{"error": "the run has ended its process"}])
+        counter.add_finished_runs([{"seconds": 2.0}])
+    counter.add_finished_runs([{"error": "the run has ended its process"}])
     assert shown[-1] == (0.41, "41/100, about 0:00:30 left")
-    told.more([{"seconds": 2.0}] * 59)
+    counter.add_finished_runs([{"seconds": 2.0}] * 59)
     assert shown[-1] == (1.0, "100/100, about 0:00:00 left")
 
 
-def test_loads_that_every_run_identifies_are_counted_in_the_end():
+def test_repeated_identifications_count_in_the_remaining_time():
     shown = []
-    told = Told(100)
-    told.start(lambda fraction, words="": shown.append(words), 1)
+    counter = StudyProgress(100)
+    counter.start(lambda fraction, words="": shown.append(words), 1)
     for _ in range(40):
-        told.more([{"seconds": 9.0, ONCE: 7.0}])
+        counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}])
     assert shown[0] == "1/100, about 0:03:18 left"
     assert shown[-1] == "40/100, about 0:09:00 left"
 
 
-def test_rows_of_a_large_study_come_one_by_one_at_first(tmp_path):
+def test_first_rows_of_a_large_study_are_stored_one_by_one(tmp_path):
     factor = Factor("a.b", low=0.0, high=1.0, levels=1000)
     study = Study(factors=[factor], repeats=5, measures=["hand_work_J"])
     sizes = []

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 # Bounds of log length scale, in units of the design's span, and of log noise variance, in units of
 # the objective's variance.
-_LENGTH, _NOISE = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
+_LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
 
 
 def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
@@ -58,19 +58,19 @@ def _fit(places: Array, y: Array) -> tuple[Array, float]:
         logarithm = np.log(np.diag(factor[0])).sum()
         return float(0.5 * y @ cho_solve(factor, y) + logarithm)
 
-    bounds = [_LENGTH] * places.shape[1] + [_NOISE]
+    bounds = [_LOG_LENGTH_BOUNDS] * places.shape[1] + [_LOG_NOISE_BOUNDS]
     starts = (np.log([length] * places.shape[1] + [0.1]) for length in (0.3, 1.5))
     found = [minimize(misfit, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     x = min(found, key=lambda result: result.fun).x
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 
 
-def _predict(places: Array, y: Array, wanted: Array, noise: float) -> tuple[Array, Array]:
-    """Return mean and standard deviation at `wanted`."""
+def _predict(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
+    """Return mean and standard deviation at `queries`."""
     K = _kernel(places, places)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)
-    cross = _kernel(places, wanted)
+    cross = _kernel(places, queries)
     mean = cross.T @ cho_solve((lower, True), y)
     explained = np.sum(solve_triangular(lower, cross, lower=True) ** 2, axis=0)
     return mean, np.sqrt(np.maximum(1.0 - explained, 1e-12))

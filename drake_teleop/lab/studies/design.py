@@ -22,11 +22,11 @@ Values: TypeAlias = dict[str, Value]
 
 MANY_RUNS = 10**5
 """More runs take days or weeks and require consent."""
-MOST_RUNS = 10**6
+MAX_RUNS = 10**6
 """Maximum number of runs; their design needs 1 GB."""
 
 # Number of candidates of an adaptive design (a power of two).
-_CANDIDATES = 1024
+_NUM_CANDIDATES = 1024
 
 
 @settings
@@ -173,12 +173,12 @@ class Study:
         """Refuse a study that is too large, before its design is created.
 
         Raises:
-            DrakeTeleopError: above `MOST_RUNS`, or above `MANY_RUNS` without consent (`yes`).
+            DrakeTeleopError: above `MAX_RUNS`, or above `MANY_RUNS` without consent (`yes`).
         """
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
-        if runs > MOST_RUNS:
-            remedy = f"give fewer values or repeats: a study has {MOST_RUNS:,} runs at most"
+        if runs > MAX_RUNS:
+            remedy = f"give fewer values or repeats: a study has {MAX_RUNS:,} runs at most"
             raise DrakeTeleopError(f"{what} are too many", where=where, remedy=remedy)
         if runs <= MANY_RUNS or yes is True:
             return
@@ -211,13 +211,13 @@ class Study:
 
         # New candidates for each batch, so that the points are not on one grid.
         tried = {str(point) for point in points}
-        drawn = self._sobol(_CANDIDATES, self.seed + len(points))
+        drawn = self._sobol(_NUM_CANDIDATES, self.seed + len(points))
         candidates = list(
             {str(point): point for point in drawn if str(point) not in tried}.values()
         )
         if len(candidates) <= count:
             return candidates
-        chosen = propose(self._places(points), objective, self._places(candidates), count)
+        chosen = propose(self._coordinates(points), objective, self._coordinates(candidates), count)
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
@@ -242,7 +242,7 @@ class Study:
             for point in shares.tolist()
         ]
 
-    def _places(self, points: Sequence[Values]) -> Array:
+    def _coordinates(self, points: Sequence[Values]) -> Array:
         rows = [
             list(itertools.chain(*(f.coordinates(point[f.field]) for f in self.factors)))
             for point in points

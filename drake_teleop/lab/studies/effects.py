@@ -131,28 +131,28 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
     """Return the effect of each factor on a measure."""
-    data = _Data(study, rows, measure)
+    data = _MeasureData(study, rows, measure)
     return (
-        {} if data.nothing else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
+        {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
     )
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
     """Return the means of a measure over each pair of factors."""
-    data = _Data(study, rows, measure)
+    data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
-    return [] if data.nothing else [found for pair in pairs if (found := data.pair(*pair))]
+    return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
 
 
-class _Data:
+class _MeasureData:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied(study)
-        points, values = _points_and_seeds(rows, measure)
+        points, values = _values_by_point_and_seed(rows, measure)
         seen = np.isfinite(values)
         self.runs = seen.sum(axis=1)
         known = self.runs > 0
-        self.nothing = not known.any()
-        if self.nothing:
+        self.is_empty = not known.any()
+        if self.is_empty:
             return
         kept = np.ix_(known, seen.any(axis=0))
         self.table = filled(values[kept])
@@ -220,7 +220,7 @@ class _Data:
         return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
-def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
+def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
     """Return points, and (n, seeds) values; nan where missing."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)

@@ -41,7 +41,10 @@ class Factorial:
             values to means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
-        (row, rows), (column, columns) = self._places(shown), self._places(others)
+        (row, rows), (column, columns) = (
+            self._combination_indices(shown),
+            self._combination_indices(others),
+        )
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
         kept, over = comparable(point >= 0)
@@ -58,16 +61,16 @@ class Factorial:
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
         """Return (k,) sums with (k, n) weights, and half widths."""
         mean, half = interval(weights @ table)
-        return mean, np.hypot(half, self._lacking(table, weights))
+        return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
-    def _places(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+    def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
         place, count = np.zeros(len(self.seen), dtype=np.int64), 1
         for factor in factors:
             place = place * self.counts[factor] + self.levels[factor]
             count *= self.counts[factor]
         return place, count
 
-    def _lacking(self, table: Array, weights: Array) -> Array:
+    def _missing_seed_widths(self, table: Array, weights: Array) -> Array:
         """Return (k,) half widths due to missing seeds."""
         points, seeds = table.shape
         runs = self.seen.sum(axis=1)

@@ -25,9 +25,9 @@ Array = NDArray[np.float64]
 CONFIDENCE = 0.95
 # Models by number of parts of a range and products of pairs. The first one that leaves half of the
 # points for the residuals is used, or else the last feasible one.
-_LADDER = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
+_MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
-_COMBINATIONS = 50_000
+_MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels
     # The last indicator column depends on the others.
     middles = middles[:, : max(middles.shape[1] - 1, 1)]
     middles = (middles - middles.mean(axis=0))[present]
-    names = [_name(listed[k]) for k in present]
+    names = [_format_value(listed[k]) for k in present]
     return Levels(index, names, None, middles[index], middles)
 
 
@@ -115,8 +115,8 @@ class LevelModel:
         """
         means = [self.compared(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
-        all_of_them = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
-        coefficients, design = self.solve @ table.mean(axis=1), self._design(table, all_of_them)
+        num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
+        coefficients, design = self.solve @ table.mean(axis=1), self._design(table, num_effects)
         effects, halves = [], []
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
@@ -194,7 +194,7 @@ def level_model(
         by_chance: True if empty cells are random.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _LADDER:
+    for parts, products in _MODELS:
         levels = [levels_of(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _model(levels, products, known, by_chance)
         if model is not None:
@@ -208,7 +208,7 @@ def _model(
     factors: list[Levels], products: bool, known: Flags, by_chance: bool
 ) -> LevelModel | None:
     points = int(known.sum())
-    failed = _failed(factors, known, by_chance)
+    failed = _failed_cells(factors, known, by_chance)
     codes = [_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
@@ -221,7 +221,7 @@ def _model(
     X = np.hstack(columns)
     counts = sorted(len(levels.names) for levels in factors)
     involved = [len(factors[k].names) for k in set(itertools.chain(*failed))] + counts[-2:]
-    if X.shape[1] >= points or math.prod(involved) > _COMBINATIONS:
+    if X.shape[1] >= points or math.prod(involved) > _MAX_COMBINATIONS:
         return None
     u, size, v = np.linalg.svd(X, full_matrices=False)
     if size[-1] < 1e-6 * size[0]:
@@ -229,7 +229,9 @@ def _model(
     return LevelModel(factors, codes, places, failed, X, v.T / size @ u.T)
 
 
-def _failed(factors: list[Levels], known: Flags, by_chance: bool) -> dict[tuple[int, int], Flags]:
+def _failed_cells(
+    factors: list[Levels], known: Flags, by_chance: bool
+) -> dict[tuple[int, int], Flags]:
     """Return excluded cells of pairs of factors."""
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
@@ -263,5 +265,5 @@ def _quantile(together: int, freedom: int) -> float:
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
 
 
-def _name(value: Value) -> str:
+def _format_value(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

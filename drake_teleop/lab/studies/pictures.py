@@ -23,8 +23,8 @@ from drake_teleop.lab.studies.level_model import CONFIDENCE
 if TYPE_CHECKING:
     import polars as pl
 
-_LABELLED = 24  # largest number of labelled points
-_WIDTH = 24  # letters that fit below a picture
+_MAX_LABELS = 24  # largest number of labelled points
+_MAX_LETTERS = 24  # letters that fit below a picture
 # Hatches of cells without value.
 _HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
 
@@ -58,7 +58,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
         for line, measure in zip(grid, measures, strict=True):
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
-                _levels(axes, found[factor.field])
+                _draw_levels(axes, found[factor.field])
                 fitted |= found[factor.field].fitted
                 reasons |= set(found[factor.field].why)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
@@ -70,11 +70,11 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
     return figure
 
 
-def _levels(axes: Axes, found: effects.MainEffect) -> None:
+def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     place = np.arange(len(found.names))
     bars = np.nan_to_num(found.effect_half)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    _name(axes, found.names)
+    _label_levels(axes, found.names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
         bar = _hatched(found.why[level], (level - 0.5, 0.0))
@@ -85,17 +85,17 @@ def _levels(axes: Axes, found: effects.MainEffect) -> None:
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
-    axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+    axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
 
 
-def _name(axes: Axes, levels: list[str]) -> None:
+def _label_levels(axes: Axes, levels: list[str]) -> None:
     axes.set_xticks(range(len(levels)), levels)
-    if len("".join(levels)) > _WIDTH:
+    if len("".join(levels)) > _MAX_LETTERS:
         for label in axes.get_xticklabels():
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
 
-def _combinations(found: effects.MainEffect | effects.PairMeans) -> str:
+def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
     if not found.left_out:
         return ""
     return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
@@ -128,11 +128,11 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
             for row, column in np.argwhere(np.isnan(found.mean)):
                 axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
             axes.grid(False)
-            _name(axes, found.names[1])
+            _label_levels(axes, found.names[1])
             axes.set_yticks(range(len(found.names[0])), found.names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
-            axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+            axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
@@ -154,10 +154,10 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):
             axes.plot(points[name], points[PARETO[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _bars(axes, on_front, name)
+            _draw_bars(axes, on_front, name)
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO[0])
-        if on_front.height <= _LABELLED:
+        if on_front.height <= _MAX_LABELS:
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
                 for axes, name in zip(figure.axes, PARETO[1:], strict=True):
                     axes.annotate(str(place), (point[name], point[PARETO[0]]), (4, 4),
@@ -175,7 +175,7 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     return figure
 
 
-def _bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+def _draw_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
     half = [np.nan_to_num(points[f"{which}_half"].to_numpy()) for which in (name, PARETO[0])]
     axes.errorbar(
         points[name], points[PARETO[0]], half[1], half[0],

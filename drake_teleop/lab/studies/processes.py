@@ -32,8 +32,8 @@ class Processes:
     rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
 
 
-DIED = "the run has ended its process"
-_LOOK = 0.5  # period of the check for the parent process [s]
+PROCESS_ENDED = "the run has ended its process"
+_PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
@@ -52,15 +52,15 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
 
         yield Processes(
             effective_n_jobs(jobs),
-            lambda run, chunks: _on_this_machine(run, chunks, store, jobs),
+            lambda run, chunks: _run_locally(run, chunks, store, jobs),
         )
         return
     with _client(cluster, jobs) as client:
         workers = sum(client.nthreads().values())
-        yield Processes(workers, lambda run, chunks: _on_a_cluster(run, chunks, client))
+        yield Processes(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
     left = list(chunks)
     # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
@@ -68,7 +68,7 @@ def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int)
         marked = store.marked(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
-                yield _alone(run, chunk, store)
+                yield _run_alone(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
@@ -93,7 +93,7 @@ def _parallel(jobs: int) -> Any:
         return_as="generator_unordered",
         # Batches of chunks would leave processes idle at the end.
         batch_size=1,
-        initializer=_watch,
+        initializer=_end_with_parent,
         initargs=(os.getpid(),),
     )
 
@@ -101,10 +101,10 @@ def _parallel(jobs: int) -> Any:
 def _task(run: Run, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
-    return delayed(_marked)(run, chunk, store)
+    return delayed(_run_marked)(run, chunk, store)
 
 
-def _alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
+def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
     """Run rows one by one, with no other row."""
     found = []
     for row in chunk:
@@ -112,12 +112,12 @@ def _alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
             # With one job joblib would run it in this process.
             found += next(_parallel(2)([_task(run, [row], store)]))
         except BrokenExecutor:
-            found.append(row | {"error": DIED})
+            found.append(row | {"error": PROCESS_ENDED})
     store.unmark(chunk[0]["run"])
     return found
 
 
-def _marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
+def _run_marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
     store.mark(chunk[0]["run"])
     try:
         return run(chunk)
@@ -125,12 +125,12 @@ def _marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
         store.unmark(chunk[0]["run"])
 
 
-def _watch(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
     """End this process after a SIGKILL of its parent."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK)
+            time.sleep(_PARENT_CHECK_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -170,7 +170,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _on_a_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
+def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
     futures = client.map(run, chunks, pure=False)
@@ -187,7 +187,7 @@ def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
         found: Chunk = future.result()
     except KilledWorker:
         if len(chunk) == 1:
-            return [chunk[0] | {"error": DIED}]
+            return [chunk[0] | {"error": PROCESS_ENDED}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
         found = [row for part, rows in alone for row in _rows_of(part, rows, run, client)]
     return found

@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Work: TypeAlias = Callable[[Values, int], dict[str, float]]
-"""Function from factor values and seed to the measures of one run, and optionally `ONCE`."""
+"""Function from factor values and seed to measures, and optionally `ONE_TIME_COST`."""
 
-ONCE = "seconds_once"
+ONE_TIME_COST = "seconds_once"
 """Time of a run for work that most others do not repeat, such as an identification [s]."""
 _SECONDS = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
 # waits at the end. The first chunks have one run, for early results and time estimates.
 _LARGEST_CHUNK = 8
-_CHUNKS = 512
-_SINGLE = 64
+_NUM_CHUNKS = 512
+_NUM_SINGLE_RUNS = 64
 # Number of latest runs for the estimate of the remaining time.
-_RECENT = 16
+_NUM_RECENT_RUNS = 16
 
 
 def run_study(
@@ -68,37 +68,37 @@ def run_study(
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _SINGLE}  # chunks are identified by their first run
+    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
     schema = _schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     with open_store(out, identity) as store:
-        told = Told(study.size() * study.repeats)
+        counter = StudyProgress(study.size() * study.repeats)
         try:
             with show_progress(progress) as stage, processes(store, jobs, cluster) as workers:
-                told.start(stage("Study"), workers.count)
+                counter.start(stage("Study"), workers.count)
                 new = points
                 while new:
-                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, told)
+                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, counter)
                     for found in workers.rows_of(run, chunks):
-                        _keep(store, found, schema)
-                        told.more(found)
+                        _store_rows(store, found, schema)
+                        counter.add_finished_runs(found)
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            kept = f"{out} keeps {told.done} of {told.total} runs; the same command goes on"
+            kept = f"{out} keeps {counter.done} of {counter.total} runs; the same command goes on"
             if isinstance(error, CannotWrite):
                 raise DrakeTeleopError(str(error), remedy=kept) from error
             raise KeyboardInterrupt(kept) from error
         return store.read()
 
 
-def _chunks(rows: Chunk, store: Store, told: Told) -> list[Chunk]:
-    size = min(max(len(rows) // _CHUNKS, 1), _LARGEST_CHUNK)
-    chunks = [[row] for row in rows[:_SINGLE]]
-    chunks += [rows[first : first + size] for first in range(_SINGLE, len(rows), size)]
+def _chunks(rows: Chunk, store: Store, counter: StudyProgress) -> list[Chunk]:
+    size = min(max(len(rows) // _NUM_CHUNKS, 1), _LARGEST_CHUNK)
+    chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
+    chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     finished = store.finished()
     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
-    told.found(len(rows) - sum(map(len, left)))
+    counter.add_earlier_runs(len(rows) - sum(map(len, left)))
     return left
 
 
@@ -114,33 +114,33 @@ def _objective(study: Study, store: Store, points: int) -> Array:
     return means[study.objective].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-class Told:
+class StudyProgress:
     """Progress of a study."""
 
     def __init__(self, total: int) -> None:
-        self.total, self.done, self._told = total, 0, 0
-        self._recent: deque[float] = deque(maxlen=_RECENT)
+        self.total, self.done, self._num_timed = total, 0, 0
+        self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
     def start(self, progress: Progress, processes: int) -> None:
         """Set bar and number of processes."""
         self._progress, self._processes = progress, processes
 
-    def found(self, runs: int) -> None:
+    def add_earlier_runs(self, runs: int) -> None:
         """Count runs of an earlier session."""
         self.done += runs
-        self._tell()
+        self._report()
 
-    def more(self, rows: Chunk) -> None:
+    def add_finished_runs(self, rows: Chunk) -> None:
         """Count finished runs; without one-time costs for the first ones."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process
-                first = self._told < _RECENT
-                self._recent.append(row[_SECONDS] - (row.get(ONCE, 0.0) if first else 0.0))
-                self._told += 1
-        self._tell()
+                first = self._num_timed < _NUM_RECENT_RUNS
+                self._recent.append(row[_SECONDS] - (row.get(ONE_TIME_COST, 0.0) if first else 0.0))
+                self._num_timed += 1
+        self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
@@ -172,7 +172,7 @@ def _run_chunk(
     return found
 
 
-def _keep(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
+def _store_rows(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
     import polars as pl
 
     columns = {name: [row.get(name) for row in rows] for name in schema}

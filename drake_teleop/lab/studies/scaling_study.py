@@ -40,13 +40,13 @@ CRITERIA = {
     "force": "contact_force_overshoot_N",
 }
 #: Selections of equally weighted criteria.
-WAYS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+SELECTIONS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
 """Criteria of each task; free reaching has no contact."""
-_OBJECT = "scaling_object"
+_OBJECT_STUDY = "scaling_object"
 _SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
-_DRAWS, _SEED = 2000, 0
-_FAILURES, _SELDOM = 0.05, 0.05
+_NUM_DRAWS, _SEED = 2000, 0
+_MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ def scaling_study_command(
     """Run the remaining runs of all studies; write and return the answer."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
+    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
@@ -88,14 +88,14 @@ def scaling_study_command(
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _axes()
-    answers = {way: answer(tables, criteria) for way, criteria in WAYS.items()}
+    answers = {way: answer(tables, criteria) for way, criteria in SELECTIONS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {way: _chosen(found, sigmas, gammas) for way, found in answers.items()},
-        "eta": _eta(rows[_OBJECT]),
+        "choice": {way: _choice(found, sigmas, gammas) for way, found in answers.items()},
+        "eta": _eta_effects(rows[_OBJECT_STUDY]),
     }
     with output_folder(out, "answer.json"):
-        write_table(out / "answer.csv", _merits(answers, sigmas, gammas))
+        write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
         write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
         write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
         write_json(out / "answer.json", summary)
@@ -113,16 +113,16 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _DRAWS)
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_relative(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_relative_means(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
     merits = np.mean(parts, axis=0)
     failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
-    usable = failures <= _FAILURES
+    usable = failures <= _MAX_FAILURE_SHARE
     # Draws in which the reference has no successful run are undefined.
     known = np.isfinite(merits[:, usable]).all(axis=1)
     merits[:, ~usable] = np.nan
@@ -136,7 +136,7 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
     return Answer(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _relative(table: Array, weights: Array) -> Array:
+def _relative_means(table: Array, weights: Array) -> Array:
     """Return (draws, s, g) weighted means relative to the reference."""
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -169,11 +169,11 @@ def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _chosen(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
+def _choice(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best >= _SELDOM)
+    near = np.argwhere(found.best >= _MIN_BEST_SHARE)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
@@ -188,7 +188,9 @@ def _chosen(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str
     }
 
 
-def _merits(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> pl.DataFrame:
+def _merit_table(
+    answers: dict[str, Answer], sigmas: list[float], gammas: list[float]
+) -> pl.DataFrame:
     import polars as pl
 
     return pl.DataFrame(
@@ -209,7 +211,7 @@ def _merits(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]
     )
 
 
-def _eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
+def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA].unique().to_list())
     levels = np.array([etas.index(value) for value in rows[_ETA]])
     seeds = rows["seed"].to_numpy()
@@ -273,7 +275,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
             axes.set_title(f"counts: {way}")
             for i, j in np.ndindex(found.merit.shape):
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
-                axes.text(j, i, _cell(found, i, j), color="white" if dark else "black",
+                axes.text(j, i, _cell_text(found, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
         bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
@@ -284,7 +286,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
     return figure
 
 
-def _cell(found: Answer, i: int, j: int) -> str:
+def _cell_text(found: Answer, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
         return f"{found.failures[i, j]:.0%} fail"
     best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""

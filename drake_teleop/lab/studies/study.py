@@ -36,7 +36,7 @@ from drake_teleop.lab.studies.design import Factor, Study, Values
 from drake_teleop.lab.studies.effects import effects
 from drake_teleop.lab.studies.measures import measured
 from drake_teleop.lab.studies.pictures import write_pictures
-from drake_teleop.lab.studies.runs import ONCE, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
 
 if TYPE_CHECKING:
@@ -63,16 +63,16 @@ class StationWork:
     def scenario(self, values: Values, seed: int) -> Scenario:
         """Return the scenario of one run."""
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_changed(self.data, changes), self.where)
+        return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return the measures of one run, and its one-time cost (`ONCE`) [s]."""
+        """Return the measures of one run, and its one-time cost (`ONE_TIME_COST`) [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
-        once = time.monotonic() - start - simulated / run.real_time_factor
+        one_time_s = time.monotonic() - start - simulated / run.real_time_factor
         found = measured(run.result, scenario, self.measures, self.threshold)
-        return found | {ONCE: max(once, 0.0)}
+        return found | {ONE_TIME_COST: max(one_time_s, 0.0)}
 
 
 def study_command(
@@ -102,7 +102,7 @@ def study_command(
     study, path = LoadStudy(path), study_file(path)
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)
-    data, where = ReadScenario(_scenario_of(study, path))
+    data, where = ReadScenario(_scenario_path(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_values(factor, f"{path}:factors[{index}]")
@@ -151,7 +151,7 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _scenario_of(study: Study, path: Path) -> str | Path:
+def _scenario_path(study: Study, path: Path) -> str | Path:
     known = study.scenario in ScenarioNames()
     return study.scenario if known else path.parent / study.scenario
 
@@ -160,12 +160,12 @@ def _check_values(factor: Factor, where: str) -> None:
     """Check each value alone."""
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
-        data = _changed({}, {factor.field: value})
+        data = _with_changes({}, {factor.field: value})
         check_structure(Scenario, data, where)
         check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
 
 
-def _changed(data: Any, changes: dict[str, Any]) -> Any:
+def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
     """Return a copy with changed fields (`block.field`)."""
     data = copy.deepcopy(data)
     for name, value in changes.items():
