@@ -10,10 +10,9 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.arrays import learnt
+from drake_teleop.common.arrays import Array, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Progress, Stage, show_progress
@@ -41,8 +40,6 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import ArmModel, accelerations
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
-
-Array = NDArray[np.float64]
 
 # The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.progress import Stage
 from drake_teleop.common.resources import models_dir
 from drake_teleop.common.version import __version__
@@ -48,7 +48,7 @@ class IdentifiedLoad:
         return repr(self.identification)
 
     @property
-    def estimate(self) -> NDArray[np.float64]:
+    def estimate(self) -> Array:
         """(16,) [offsets; phi], Eq. (7)."""
         return np.concatenate([self.identification.offsets, self.identification.phi])
 

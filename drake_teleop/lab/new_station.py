@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.common.writing import make_folder, whole_file
@@ -79,14 +80,14 @@ class Place(NamedTuple):
         room: smallest distance of a joint to its limit, over half its range.
     """
 
-    pose: NDArray[np.float64]
+    pose: Array
     by_position: bool
-    q: NDArray[np.float64]
+    q: Array
     half: float
     room: float
 
     @property
-    def position(self) -> NDArray[np.float64]:
+    def position(self) -> Array:
         """(3,) p_WS [m]."""
         return self.pose[4:]
 
@@ -115,7 +116,7 @@ class Plan:
     translation_scale: float
     force_scale: float
     swing: float
-    lowest: NDArray[np.float64]
+    lowest: Array
     assumptions: tuple[str, ...]
     axis_note: str
 
@@ -287,14 +288,14 @@ def _axis_advice(arm: ArmModel) -> str:
     )
 
 
-def _is_in_front(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+def _is_in_front(places: Array, reach: float) -> NDArray[np.bool_]:
     x, y, z = places.T / reach
     r = np.hypot(x, y)
     result: NDArray[np.bool_] = (r > 0.35) & (r < 0.85) & (x > 0.9 * r) & (z > 0.15) & (z < 0.8)
     return result
 
 
-def _place_with_cube(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
+def _place_with_cube(arm: ArmModel, position: Array, turn: float) -> Place:
     """Return a place with the largest reachable cube of `_CUBE_HALVES_M`."""
     R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
@@ -311,11 +312,11 @@ def _place_with_cube(arm: ArmModel, position: NDArray[np.float64], turn: float) 
     return place._replace(room=0.0)
 
 
-def _place_of_short_arm(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
+def _place_of_short_arm(arm: ArmModel, q: Array, pose: Array) -> Place:
     """Return a place of an arm with at most five joints."""
     reached = np.empty(7)
 
-    def is_reachable(displacement: NDArray[np.float64]) -> bool:
+    def is_reachable(displacement: Array) -> bool:
         target = pose + np.append(np.zeros(4), displacement)
         pose_into(arm.table, find_posture(arm, target, q)[0], reached)
         return bool(
@@ -332,7 +333,7 @@ def _place_of_short_arm(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.
     return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_joint_margin(arm, q))
 
 
-def _joint_margin(arm: ArmModel, q: NDArray[np.float64]) -> float:
+def _joint_margin(arm: ArmModel, q: Array) -> float:
     return float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
 
 

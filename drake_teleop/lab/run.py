@@ -10,9 +10,6 @@ import time
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.writing import (
@@ -35,8 +32,6 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
-
-Array = NDArray[np.float64]
 
 _DURING_RUN = "learnt while it ran"
 _FINAL_FILES = (

@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import learnt
+from drake_teleop.common.arrays import Array, learnt
 from drake_teleop.common.quaternions import conjugate, logarithm, multiply
 from drake_teleop.common.style import contact_spans
 from drake_teleop.lab.identification import sensor_samples, slave_arm
@@ -41,8 +41,6 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.signals import POSE_OF
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.task_measures import task_failure, task_measures
-
-Array = NDArray[np.float64]
 
 # Settling time of the sensor's filter after a contact [s].
 FILTER_TAIL_S = 0.01

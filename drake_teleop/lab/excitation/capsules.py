@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import (
     Box,
     Cylinder,
@@ -18,7 +17,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
-Array = NDArray[np.float64]
+from drake_teleop.common.arrays import Array
 
 # Vertices of the circumscribed polygon of a cylinder.
 _RIM = 24

@@ -9,16 +9,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import QueryObject
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialInertia
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.excitation.limits import LIMITS
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
-
-Array = NDArray[np.float64]
 
 #: Sample rate [Hz].
 RATE = 1000.0

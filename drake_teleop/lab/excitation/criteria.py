@@ -16,13 +16,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import regressor
-
-Array = NDArray[np.float64]
 
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 

@@ -11,13 +11,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.lab.excitation.problem import Evaluation, Problem
 from drake_teleop.load.trajectory import FourierTrajectory
-
-Array = NDArray[np.float64]
 
 #: Share of each limit; the grid misses up to 0.9 % of a fifth harmonic's peak.
 MARGIN = 0.985

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.lab.excitation.check import RATE, Use, check
@@ -25,8 +25,6 @@ from drake_teleop.lab.excitation.prediction import predicted_deviations
 from drake_teleop.lab.excitation.problem import Problem, Task
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
-
-Array = NDArray[np.float64]
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.excitation.criteria import regressor_gradient
 from drake_teleop.lab.excitation.recursion import (
@@ -21,8 +22,6 @@ from drake_teleop.lab.excitation.recursion import (
 )
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.slave.arm import MOTION_SIZE, inverse_dynamics, link_motions
-
-Array = NDArray[np.float64]
 
 LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
@@ -20,8 +20,6 @@ from drake_teleop.station.sensor.motion_estimation import (
     motion_gains,
 )
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-
-Array = NDArray[np.float64]
 
 
 class SensorNoise(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
@@ -19,7 +19,6 @@ from drake_teleop.lab.excitation.limits import (
 )
 from drake_teleop.load.trajectory import FourierTrajectory
 
-Array = NDArray[np.float64]
 Bounds = list[tuple[float | None, float | None]]
 """Lower and upper bound of each unknown; None: unbounded."""
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.style import (
     BLUE,
     GREEN,
@@ -113,12 +114,12 @@ def contact_figure(
     return figure
 
 
-def _time(t: ArrayLike) -> tuple[NDArray[np.float64], str]:
+def _time(t: ArrayLike) -> tuple[Array, str]:
     seconds = np.asarray(t, float)
     return (seconds * 1e3, "ms") if seconds[-1] - seconds[0] <= 2 else (seconds, "s")
 
 
-def _common_range(traces: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+def _common_range(traces: Sequence[Array]) -> tuple[float, float]:
     low = min(0.0, *(float(trace.min()) for trace in traces))
     high = max(0.0, *(float(trace.max()) for trace in traces))
     margin = 0.1 * (high - low) or 1.0

@@ -7,16 +7,14 @@ reaction force of the tool's weld does not use V.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.progress import Progress
 from drake_teleop.lab.identification import sensor_samples, slave_arm
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance, read_log
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
-
-Array = NDArray[np.float64]
 
 
 def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.style import PAGE_DPI
 from drake_teleop.common.writing import (
@@ -57,7 +58,6 @@ from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 
-Array = NDArray[np.float64]
 Figures = dict[str, Any]
 
 SIGMAS = (1.0, 0.5, 0.0)

@@ -6,13 +6,13 @@ A batch uses predicted values ("kriging believer", Ginsbourger 2010).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import ndtr
 from scipy.stats import norm
 
-Array = NDArray[np.float64]
+from drake_teleop.common.arrays import Array
 
 # Bounds of log length scale, in units of the design's span, and of log noise variance, in units of
 # the objective's variance.

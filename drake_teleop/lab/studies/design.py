@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, meant
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.lab.studies.measures import MEASURES, default_measures
 
-Array = NDArray[np.float64]
 Value: TypeAlias = float | str | bool | list[float]
 Values: TypeAlias = dict[str, Value]
 """Values of the factors at one point, by field."""

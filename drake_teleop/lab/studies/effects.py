@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.studies.cells import TOO_FEW, Flags, reasons
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.factorial import Factorial, filled, interval
@@ -22,7 +23,6 @@ from drake_teleop.lab.studies.level_model import LevelModel, level_model, levels
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 
 #: Measures of the Pareto front.
 PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")

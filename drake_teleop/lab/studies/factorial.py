@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.studies.cells import Flags, comparable
 from drake_teleop.lab.studies.level_model import CONFIDENCE
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

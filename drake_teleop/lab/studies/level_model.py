@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.studies.cells import Flags, comparable
 from drake_teleop.lab.studies.design import Factor, Value
-
-Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 # Models by number of parts of a range and products of pairs. The first one that leaves half of the

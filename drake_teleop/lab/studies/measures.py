@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.result import SimulationResult
 
 if TYPE_CHECKING:
     from drake_teleop.station.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 def _peak(forces: Array) -> float:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Progress, show_progress
@@ -27,7 +27,6 @@ from drake_teleop.lab.studies.store import Store, open_store
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 Work: TypeAlias = Callable[[Values, int], dict[str, float]]
 """Function from factor values and seed to measures, and optionally `ONE_TIME_COST`."""
 

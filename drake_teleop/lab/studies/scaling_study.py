@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.style import COLOURS, Picture, house_style
 from drake_teleop.common.writing import (
     make_folder,
@@ -32,7 +32,6 @@ from drake_teleop.lab.studies.study import LoadStudy, study_command
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 
 CRITERIA = {
     "effort": "effort_Ns",

@@ -22,8 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.errors import DrakeTeleopError, expect, meant
@@ -41,8 +39,6 @@ from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromDa
 
 if TYPE_CHECKING:
     import polars as pl
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
