@@ -9,8 +9,12 @@ import pytest
 from pydrake.geometry import Box, Cylinder
 from pydrake.geometry import Capsule as CapsuleShape
 
-from drake_teleop.lab.excitation.capsules import Capsule, bounding_capsule
-from drake_teleop.lab.excitation.scene import CLEARANCE, _minimum_distance
+from drake_teleop.lab.excitation.collision import (
+    CLEARANCE,
+    Capsule,
+    _minimum_distance,
+    bounding_capsule,
+)
 
 
 @pytest.mark.parametrize("long", [0, 1, 2])

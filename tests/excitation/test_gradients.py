@@ -16,7 +16,6 @@ from drake_teleop.lab.excitation.criteria import (
     Scales,
     characteristic_length,
 )
-from drake_teleop.lab.excitation.design import _Search
 from drake_teleop.lab.excitation.limits import (
     CLEARANCE_SCALE,
     LIMITS,
@@ -26,8 +25,8 @@ from drake_teleop.lab.excitation.limits import (
     limit_uses,
     motions_of,
 )
+from drake_teleop.lab.excitation.optimizer import Problem, Task, _Search
 from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
-from drake_teleop.lab.excitation.problem import Problem, Task
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, motion_gains

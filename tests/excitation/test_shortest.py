@@ -9,8 +9,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation import shortest as module
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import sensor_motion
+from drake_teleop.lab.excitation.optimizer import Task
 from drake_teleop.lab.excitation.prediction import predicted_covariance
-from drake_teleop.lab.excitation.problem import Task
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import ShortestProblem, reliable_factor, shortest
 from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance

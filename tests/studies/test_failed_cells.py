@@ -12,11 +12,23 @@ from scipy.special import stdtrit
 from scipy.stats import qmc
 
 from drake_teleop.lab.studies import pictures
-from drake_teleop.lab.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, comparable, reasons
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.effects import effects, main_effects, pair_means
-from drake_teleop.lab.studies.factorial import Factorial, filled, interval
-from drake_teleop.lab.studies.level_model import level_model
+from drake_teleop.lab.studies.effects import (
+    Factorial,
+    effects,
+    filled,
+    interval,
+    main_effects,
+    pair_means,
+)
+from drake_teleop.lab.studies.level_model import (
+    NO_RUN,
+    NO_SUCCESS,
+    NOT_COMPARABLE,
+    comparable,
+    level_model,
+    reasons,
+)
 
 EFFORT = "effort_Ns"
 SIGMAS, GAMMAS = [0.0, 0.1, 0.5, 1.0], [0.25, 1.0, 4.0, 8.0, 16.0]

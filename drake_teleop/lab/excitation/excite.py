@@ -13,7 +13,6 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.lab.excitation.check import RATE, Use, check
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.lab.excitation.design import Iterate, design
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     empty_motions,
@@ -21,8 +20,8 @@ from drake_teleop.lab.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
+from drake_teleop.lab.excitation.optimizer import Iterate, Problem, Task, design
 from drake_teleop.lab.excitation.prediction import predicted_deviations
-from drake_teleop.lab.excitation.problem import Problem, Task
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 

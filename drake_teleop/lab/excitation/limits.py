@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.excitation.criteria import regressor_gradient
-from drake_teleop.lab.excitation.recursion import (
+from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,
     pull_back,
     seed_joint_torque,

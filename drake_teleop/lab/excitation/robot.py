@@ -15,10 +15,10 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
 from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
-from drake_teleop.lab.excitation.scene import CLEARANCE, Parse, Scene
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig

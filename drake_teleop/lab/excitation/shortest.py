@@ -23,7 +23,6 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.lab.excitation.check import RATE, Use
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.design import Iterate, design
 from drake_teleop.lab.excitation.excite import Excitation, best_checked, criteria_of, sensor_motion
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
@@ -32,12 +31,12 @@ from drake_teleop.lab.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
+from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Iterate, Problem, Task, design
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
     spatial_inertia,
 )
-from drake_teleop.lab.excitation.problem import Bounds, Evaluation, Problem, Task
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of

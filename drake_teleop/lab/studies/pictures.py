@@ -15,10 +15,15 @@ from matplotlib.patches import Rectangle
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, house_style
 from drake_teleop.common.writing import write_picture
 from drake_teleop.lab.studies import effects
-from drake_teleop.lab.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, TOO_FEW
 from drake_teleop.lab.studies.design import Study
 from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied
-from drake_teleop.lab.studies.level_model import CONFIDENCE
+from drake_teleop.lab.studies.level_model import (
+    CONFIDENCE,
+    NO_RUN,
+    NO_SUCCESS,
+    NOT_COMPARABLE,
+    TOO_FEW,
+)
 
 if TYPE_CHECKING:
     import polars as pl
