@@ -10,16 +10,16 @@ import pytest
 from shown import type_in
 
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.reproduction.reaction import eliminated_reaction
-from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
-from drake_teleop.lab.reproduction.reproduce import (
+from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
-    contact_figures,
-    free_figures,
+    contact_values,
+    eliminated_reaction,
     free_motion,
+    free_values,
     raw_excess,
 )
+from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
 from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -197,7 +197,7 @@ def motion() -> ContactMotion:
 
 
 def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
-    figures = contact_figures(motion)
+    figures = contact_values(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
     assert np.all(raw_excess(motion) <= 0)
@@ -209,7 +209,7 @@ def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
 def test_raw_force_detects_contact_by_any_axis(motion, axis):
     told = motion.raw.copy()
     told[motion.contact, axis] += 180.0
-    figures = contact_figures(dataclasses.replace(motion, raw=told))
+    figures = contact_values(dataclasses.replace(motion, raw=told))
     assert figures["raw_detectable"] is True
 
 
@@ -226,20 +226,20 @@ def test_raw_force_detects_contact_by_its_norm(motion):
 def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
     calculated = motion.calculated.copy()
     calculated[np.argmin(np.abs(motion.touched.t - 0.6)), 2] = 2.0
-    figures = contact_figures(dataclasses.replace(motion, calculated=calculated))
+    figures = contact_values(dataclasses.replace(motion, calculated=calculated))
     assert figures["false_alarm_0_6_s"] is True
 
 
 def test_contact_is_not_detected_without_elimination(motion):
     largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
-    figures = contact_figures(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
+    figures = contact_values(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
     assert figures["detected_s"] is None
     assert np.isnan(flat({"contact": figures})["contact.detected_s"])
 
 
 def test_contact_time_is_null_without_contact(motion):
     nothing = np.zeros(len(motion.touched.t), dtype=bool)
-    figures = contact_figures(
+    figures = contact_values(
         dataclasses.replace(motion, contact=nothing, calculated=motion.calculated_free)
     )
     assert figures["true_s"] is figures["detected_s"] is None
@@ -271,6 +271,6 @@ def test_wrong_mass_increases_the_residual():
     estimate[6:] *= 1.1
     motion = free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled) == SIGMAS
-    figures = free_figures(motion, motion.scaled[0.0], 2, "N")
+    figures = free_values(motion, motion.scaled[0.0], 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)
