@@ -21,10 +21,7 @@ from drake_teleop.common.writing import (
     write_picture,
     write_table,
 )
-from drake_teleop.lab.identification import (
-    identify_load,
-    simulate_with_timing,
-)
+from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
 from drake_teleop.station.replay import write_replay

@@ -21,9 +21,7 @@ from pydrake.geometry import (
     Shape,
     Sphere,
 )
-from pydrake.geometry import (
-    Capsule as CapsuleShape,
-)
+from pydrake.geometry import Capsule as CapsuleShape
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.multibody.tree import (
@@ -156,13 +154,7 @@ class Scene:
         _add_load(self.plant, instance, self.sensor_frame, reserve)
         _make_solid(self.plant, self.scene_graph, visuals_count)
         _check_sizes(self.plant, self.scene_graph, where)
-        _add_shape(
-            self.plant,
-            self.plant.world_body(),
-            RigidTransform(),
-            HalfSpace(),
-            _TABLE,
-        )
+        _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE)
         finalize(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
@@ -232,10 +224,7 @@ class Scene:
         return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
     def capsules(
-        self,
-        rows: dict[BodyIndex, int],
-        candidates: dict[_Pair, Array],
-        postures: Array,
+        self, rows: dict[BodyIndex, int], candidates: dict[_Pair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
         """Return rows, capsules, pairs, and the minimum distance of each pair.
 

@@ -95,12 +95,7 @@ def shortest(
     errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
     task = Task(
-        robot.arm.table,
-        robot.limits,
-        Criterion("A16", robot.scales),
-        robot.home,
-        1.0,
-        harmonics,
+        robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
     best: Shortest | None = None

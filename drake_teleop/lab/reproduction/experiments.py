@@ -10,11 +10,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.progress import Progress, Stage
-from drake_teleop.lab.identification import (
-    LoadIdentification,
-    sensor_samples,
-    slave_arm,
-)
+from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
 from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench
 from drake_teleop.station.result import SimulationResult

@@ -51,8 +51,7 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
         from joblib import effective_n_jobs
 
         yield Processes(
-            effective_n_jobs(jobs),
-            lambda run, chunks: _run_locally(run, chunks, store, jobs),
+            effective_n_jobs(jobs), lambda run, chunks: _run_locally(run, chunks, store, jobs)
         )
         return
     with _client(cluster, jobs) as client:
@@ -144,9 +143,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise DrakeTeleopError(
-            "Dask is not installed",
-            where="--cluster",
-            remedy=install_extra("cluster"),
+            "Dask is not installed", where="--cluster", remedy=install_extra("cluster")
         ) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,

@@ -33,11 +33,7 @@ if TYPE_CHECKING:
     import polars as pl
 
 
-CRITERIA = {
-    "effort": "effort_Ns",
-    "time": "task_time_s",
-    "force": "contact_force_overshoot_N",
-}
+CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
 #: Selections of equally weighted criteria.
 SELECTIONS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
