@@ -197,7 +197,7 @@ def test_run_reports_its_load_source_and_does_not_depend_on_it(identifications, 
     assert first.load_source == "identified before the run"
     summary = run_command(path, tmp_path / "out")
     assert summary["load_source"] == "cache"
-    assert "load: cache; --fresh identifies it anew" in capsys.readouterr().out
+    assert "load: cache; --fresh repeats the identification" in capsys.readouterr().out
     for name, write in (
         ("log.parquet/row_0000000000.parquet", first.result.write_parquet),
         ("identification.json", first.identification.save),

@@ -62,7 +62,7 @@ def test_station_is_written_and_run(tmp_path, runs, capsys):
     assert wall == pytest.approx(tip[2] - 1.5 * plan.swing, abs=1e-3)
     into = -scenario.operator.intent[1].translation[2] * scale - (tip[2] - wall)
     assert 0.0 < into <= 0.0101
-    with pytest.raises(DrakeTeleopError, match="is there already"):
+    with pytest.raises(DrakeTeleopError, match="already exists"):
         new_command(tmp_path / "mine", ARM, "sensor")
 
 
@@ -84,7 +84,9 @@ def test_place_is_in_front_with_a_reachable_cube():
         pose = np.array([*w, *(place + half * np.array(signs))])
         assert find_posture(arm, pose, q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
-    with pytest.raises(DrakeTeleopError, match="nowhere can the arm hold its sensor"):
+    with pytest.raises(
+        DrakeTeleopError, match="no place found where the arm can hold z_S downwards"
+    ):
         find_place(stiff)
 
 
@@ -123,9 +125,7 @@ def test_note_about_another_axis_along_the_last_joint(tmp_path, runs, capsys):
         plan = plan_station(turned(rpy, tmp_path), "turned")
         assert f"{axis}_S is along" in plan.axis_note and f'rpy="{back}"' in plan.axis_note
     new_command(tmp_path / "mine", turned("3.1416 0 0", tmp_path), "turned")
-    assert "note: z_S points to the tool, and here -z_S" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert "note: z_S must point to the tool, but -z_S" in " ".join(capsys.readouterr().out.split())
     assert plan_station(ARM, "sensor").axis_note == ""
     behind = tmp_path / "behind.sdf"  # origin of the last joint
     behind.write_text(
@@ -226,7 +226,7 @@ def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
 
 def test_misread_station_leaves_no_files(tmp_path, runs, monkeypatch):
     monkeypatch.setattr(new_station, "_relative_path", lambda folder, path: "tool.sdf")
-    with pytest.raises(DrakeTeleopError, match="is read as another station"):
+    with pytest.raises(DrakeTeleopError, match="does not describe the given models"):
         new_command(tmp_path / "a" / "mine", ARM, "sensor")
     assert list(tmp_path.iterdir()) == [] and runs == []
 
@@ -234,9 +234,12 @@ def test_misread_station_leaves_no_files(tmp_path, runs, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"device": "omega_5"}, r"--device: 'omega_5' is none.*omega_6"),
-        ({"device": "leader"}, r"--device: .leader. is none.*; one of phantom.*master.leader"),
-        ({"sensor": "ati"}, r"--sensor: 'ati' is none.*ati_gamma"),
+        ({"device": "omega_5"}, r"--device: there is no device 'omega_5'.*omega_6"),
+        (
+            {"device": "leader"},
+            r"--device: there is no device .leader.*; choose one of phantom.*master.leader",
+        ),
+        ({"sensor": "ati"}, r"--sensor: there is no sensor 'ati'.*ati_gamma"),
         ({"frame": "wrist"}, "wrist"),
     ],
 )

@@ -144,7 +144,7 @@ def identify_load(
     check_scenario(scenario)
     if not scenario.load_estimator.enabled:
         raise DrakeTeleopError(
-            "the load estimator is off, so the load would not be learnt",
+            "the load estimator is off, so it cannot identify the load",
             where="scenario:load_estimator.enabled",
             remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass "
             'LoadScenario("identification")',

@@ -39,9 +39,8 @@ from drake_teleop.station.slave.tool import Ball, Tool
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
 _PHANTOM_HALF_M = 0.08
 #: Placeholder of a tool [kg, m].
-_PLACEHOLDER_TOOL = Tool(
-    mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])]
-)
+_TIP = Ball(radius=0.012, position=[0, 0, 0.1])
+_PLACEHOLDER_TOOL = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[_TIP])
 _CUBE_HALVES_M = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
 _NUM_POSTURES, _NUM_PLACES = 20_000, 24  # random postures; examined places
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
@@ -57,10 +56,7 @@ _MAX_RELATIVE_ERROR = 0.1  # position error of an arm of few joints, over the di
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
 _PREFERRED_POSITION = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
-_MAX_SWING_M, _MAX_DEPTH_M = (
-    0.04,
-    0.01,
-)  # of the slave: largest amplitude, largest depth in the wall [m]
+_MAX_SWING_M, _MAX_DEPTH_M = 0.04, 0.01  # of the slave: amplitude, depth in the wall
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
@@ -145,35 +141,37 @@ def new_command(
     scenario = folder / "station.yaml"
     if scenario.exists():
         raise DrakeTeleopError(
-            "is there already", where=str(scenario), remedy="edit it, or name another folder"
+            "already exists", where=str(scenario), remedy="edit it, or give another folder"
         )
     for kind, name, known in (
         ("device", device, (PHANTOM, *FIGURES)),
         ("sensor", sensor, (None, *PRESETS)),
     ):
         if name not in known:
-            later = "; a leader arm is written into the station afterwards, as master.leader"
-            raise DrakeTeleopError(
-                f"{name!r} is none that is known",
-                where=f"--{kind}",
-                remedy=f"one of {', '.join(filter(None, known))}{later if name == LEADER else ''}",
-            )
+            remedy = f"choose one of {', '.join(filter(None, known))}"
+            if name == LEADER:
+                remedy += "; add a leader arm to station.yaml afterwards, as master.leader"
+            raise DrakeTeleopError(f"there is no {kind} {name!r}", where=f"--{kind}", remedy=remedy)
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
-    paths = [_relative_path(folder, path) for path in package_paths]
-    tools = None if tool is None else _relative_path(folder, tool)
+    slave_data: dict[str, Any] = {"model": _relative_path(folder, arm)}
+    if package_paths:
+        slave_data["package_paths"] = [_relative_path(folder, path) for path in package_paths]
+    slave_data["sensor_frame"] = sensor_frame
+    tool_path = None if tool is None else _relative_path(folder, tool)
     try:
-        text = _scenario_text(
-            plan, _relative_path(folder, arm), sensor_frame, paths, tools, device, sensor
-        )
+        text = _scenario_text(plan, slave_data, tool_path, device, sensor)
         with whole_file(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
             read = [slave.path, *slave.packages, *(slave.files()[1:] if tool else ())]
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
-                raise DrakeTeleopError("is read as another station", where=str(scenario))
+                raise DrakeTeleopError(
+                    "does not describe the given models (their names cannot be written)",
+                    where=str(scenario),
+                )
     except BaseException:
         for each in made:
             with suppress(OSError):
@@ -260,10 +258,9 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     best = max(found, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
-            "nowhere can the arm hold its sensor with z downwards and move to all sides",
+            "no place found where the arm can hold z_S downwards and move in all directions",
             where="new",
-            remedy=_axis_advice(arm)
-            or "check the joints' limits, and which way sensor_frame points",
+            remedy=_axis_advice(arm) or "check joint limits and the orientation of sensor_frame",
         )
     return best
 
@@ -283,8 +280,8 @@ def _axis_advice(arm: ArmModel) -> str:
     if axis not in _RPY_ONTO_Z:
         return ""
     return (
-        f"z_S points to the tool, and here {axis}_S is along the last joint: if the tool is, fix a"
-        f' link to sensor_frame by <origin rpy="{_RPY_ONTO_Z[axis]}"/>, and name that'
+        f"z_S must point to the tool, but {axis}_S is along the last joint; if the tool is too, add"
+        f' a link fixed to sensor_frame by <origin rpy="{_RPY_ONTO_Z[axis]}"/> and name that link'
     )
 
 
@@ -325,11 +322,7 @@ def _place_of_short_arm(arm: ArmModel, q: Array, pose: Array) -> Place:
         )
 
     displacements = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
-    halves = (
-        half
-        for half in _CUBE_HALVES_M
-        if all(is_reachable(half * displacement) for displacement in displacements)
-    )
+    halves = (h for h in _CUBE_HALVES_M if all(is_reachable(h * d) for d in displacements))
     return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_joint_margin(arm, q))
 
 
@@ -363,47 +356,39 @@ def _relative_path(folder: Path, path: Path) -> str:
 
 
 def _scenario_text(
-    plan: Plan,
-    arm: str,
-    sensor_frame: str,
-    package_paths: list[str],
-    tool: str | None,
-    device: str,
-    sensor: str | None,
+    plan: Plan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
     s, swing = plan.translation_scale, plan.swing
     x, y, z = plan.lowest
     down = 1.5 * swing + min(_MAX_DEPTH_M, swing / 4.0)
-    home, packages = plan.place.home, {"package_paths": package_paths} if package_paths else {}
-    start = {"home": home} if home else {"position": _round_row(plan.place.position)}
-    slave: dict[str, Any] = {"model": arm, **packages, "sensor_frame": sensor_frame, **start}
+    if plan.place.by_position:
+        slave["position"] = _round_row(plan.place.position)
+    else:
+        slave["home"] = plan.place.home
     comments = {
         "slave.position": "of the sensor at the start, tool down [m]",
         "slave.home": "joints at the start, tool down [rad, m]",
-        "kinematic_scaling": f"the arm can go {1e3 * plan.place.half:g} mm to all sides",
-        "force_scaling": "sigma 1: the hand feels the whole tool; force_scale: see analyze",
-        "operator.intent": "of the hand: a swing up and down, and then down onto the wall",
+        "kinematic_scaling": f"the arm can move {1e3 * plan.place.half:g} mm in all directions",
+        "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
+        "operator.intent": "of the hand: up and down, then down onto the wall",
         "rates": "of the device",
     }
     if tool is not None:
         slave["tool"] = {"model": tool}
     elif plan.own_tool:
-        slave["tool"], comments["slave.tool"] = None, "what the model has beyond the sensor"
+        slave["tool"], comments["slave.tool"] = None, "the bodies of the model beyond the sensor"
     else:
         slave["tool"] = {"mass": _PLACEHOLDER_TOOL.mass, "com": _PLACEHOLDER_TOOL.com}
         slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_PLACEHOLDER_TOOL.shapes[0])]}
-        comments["slave.tool"] = "a stand-in: put your tool's file (model: ...) or its numbers here"
+        comments["slave.tool"] = "a placeholder: put model file or numbers of your tool here"
     swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
     swing_motion |= {"frequency": _SWING_HZ, "translation": _round_row([0.0, 0.0, swing / s])}
     press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
     press_motion |= {"translation": _round_row([0.0, 0.0, -down / s])}
-    wall = {
-        "_tag": "!Wall",
-        "position": _round_row([x, y, z - 1.5 * swing]),
-        "stiffness": _WALL_STIFFNESS,
-    }
+    wall = {"_tag": "!Wall", "position": _round_row([x, y, z - 1.5 * swing])}
+    wall["stiffness"] = _WALL_STIFFNESS
     data = {
-        "description": f"{Path(arm).stem} led by {device}",
+        "description": f"{Path(slave['model']).stem} commanded by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
         **_device_rates(device),
         "slave": slave,
@@ -438,7 +423,7 @@ def _print(plan: Plan, scenario: Path) -> None:
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
         ("Start", f"sensor at {_round_row(plan.place.position)} m, tool down"),
-        ("Room around it", f"{1e3 * plan.place.half:g} mm to all sides"),
+        ("Reachable around it", f"{1e3 * plan.place.half:g} mm in all directions"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)

@@ -87,7 +87,9 @@ def run_command(
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
     if drive is not None and out.resolve() == drive.folder.resolve():
-        raise DrakeTeleopError("is the drive itself", where=str(out), remedy="give another --out")
+        raise DrakeTeleopError(
+            "is the folder of the drive", where=str(out), remedy="give another --out"
+        )
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
@@ -181,7 +183,7 @@ def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioR
 def _describe_log(log: Path) -> str:
     if not log.exists():
         return ""
-    return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
+    return f"{log} contains the {len(SimulationResult.scan_parquet(log).t)} samples until then"
 
 
 def _print(summary: dict[str, Any], out: Path) -> None:
@@ -197,7 +199,7 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     console = Console()
     console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
     console.print(table)
-    hint = "; --fresh identifies it anew" if summary["load_source"] == "cache" else ""
+    hint = "; --fresh repeats the identification" if summary["load_source"] == "cache" else ""
     console.print(f"load: {summary['load_source']}{hint}", highlight=False)
     for k, (start, stop) in enumerate(summary["true_contact_s"]):
         noticed = ""
@@ -208,7 +210,7 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     if "contact_by" in summary:
         console.print(f"contact by {summary['contact_by']}", highlight=False)
     for name, way in summary.get("moved_mm", {}).items():
-        turn = f"{way:.1f} mm and turned by {summary['turned_deg'][name]:.1f} degrees"
+        turn = f"{way:.1f} mm and rotated by {summary['turned_deg'][name]:.1f} degrees"
         console.print(f"{name} was moved by {turn}", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
@@ -217,7 +219,7 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(
-        f"written to {out}; its film: {out / 'replay.html'}", highlight=False, markup=False
+        f"written to {out}; 3D replay: {out / 'replay.html'}", highlight=False, markup=False
     )
 
 

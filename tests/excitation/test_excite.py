@@ -268,10 +268,10 @@ def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
         home=[0.0, 0.3, 1.4, 0.0, 1.4, 0.0],
     )
     free = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
-    assert not any("not kept apart" in text for text in free.assumptions)
+    assert not any("no clearance required" in text for text in free.assumptions)
     urdf.write_text(text.replace('size="0.2 0.2 0.1"', 'size="0.6 0.6 1.6"'))
     found = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
-    named = next(text for text in found.assumptions if "not kept apart" in text)
+    named = next(text for text in found.assumptions if "no clearance required" in text)
     assert "l0 and l3" in named and "l0 and l6" not in named
     assert "l0 and l2" not in named  # they touch in all postures
     still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
@@ -541,7 +541,7 @@ def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
         (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits for 6 joints"),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
-        (["--sensor-frame", "l6", "--payload", "0.1"], "holds 0.9 kg beyond the sensor"),
+        (["--sensor-frame", "l6", "--payload", "0.1"], "already contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
         (["--sensor-frame", "l0"], "no moving joint"),
         ([], "--sensor-frame"),

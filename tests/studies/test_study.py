@@ -363,7 +363,7 @@ def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
 @pytest.mark.slow
 def test_processes_that_never_begin_are_an_error(tmp_path):
     study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0])])
-    with pytest.raises(DrakeTeleopError, match="processes end before they begin"):
+    with pytest.raises(DrakeTeleopError, match="processes ended before their first run"):
         run_study(study, tmp_path, Unreadable(), {}, jobs=2)
 
 
@@ -573,18 +573,21 @@ def test_preset_as_factor_sets_its_values():
         (("[0, 0.5, 1]", "[0, -0.5]"), "factors[0].force_scaling.sigma: -0.5"),
         (("[light, firm]", "[light, iron]"), "factors[1].operator.grip: 'iron' is not known"),
         (("words", "values"), "factors[1].values[0]: expected a number"),
-        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: what it varies over"),
-        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: what it varies over"),
-        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: the range ends at 0"),
+        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: its values are ambiguous"),
+        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: its values are ambiguous"),
+        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: 0 is not above low"),
         (("[0, 0.5, 1]", "[0, .inf]"), "factors[0]: its numbers, or their range, are not finite"),
         (("[0, 0.5, 1]", "[.nan]"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "vectors: [[0, .inf]]"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: 0, high: .inf"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: -.inf, high: .inf"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"), "factors[0]: its numbers"),
-        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value stands there twice"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value is repeated"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
-        (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),
+        (
+            ("force_scaling.sigma", "simulation.seed"),
+            "factors[0].field: the seed cannot be a factor",
+        ),
         (("tiny.yaml", "none.yaml"), "there is no scenario"),
         (("repeats: 2", "repeats: 0"), "repeats: 0 is outside 1 to"),
         (("repeats: 2", "repeat: 2"), "did you mean 'repeats'"),
@@ -593,9 +596,9 @@ def test_preset_as_factor_sets_its_values():
         (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
         (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
         (("repeats: 2", "measures: [hand_work]"), "did you mean 'hand_work_J'"),
-        (("repeats: 2", "design: adaptive"), "objective: '' is no objective"),
-        (("repeats: 2", "objective: hand_work_J"), "no objective for a design that is factorial"),
-        ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
+        (("repeats: 2", "design: adaptive"), "objective: '' cannot be the objective"),
+        (("repeats: 2", "objective: hand_work_J"), "cannot be the objective of design 'factorial'"),
+        ((STUDY, "scenario: tiny.yaml"), "factors: there are no factors"),
         ((STUDY, "- 1"), "expected a mapping"),
     ],
 )
@@ -640,7 +643,10 @@ def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     monkeypatch.setattr(studies, "run_study", begin)
     path, out, asked = files / "many.yaml", tmp_path / "out", []
     path.write_text(MANY.replace("LEVELS", "501"))
-    with pytest.raises(DrakeTeleopError, match=r"many\.yaml: 100,200 runs are many; --yes"):
+    with pytest.raises(
+        DrakeTeleopError,
+        match=r"many\.yaml: 100,200 runs need a confirmation; confirm them by --yes",
+    ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):
         study_command(path, out, yes=lambda question: asked.append(question))

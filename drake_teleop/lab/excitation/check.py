@@ -181,7 +181,7 @@ def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str
     """Return the smallest distance [m], at most `reach`, and body names."""
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
-        return reach, "all farther"
+        return reach, "all shapes are farther"
     pair = min(found, key=lambda pair: pair.distance)
     inspector = robot.scene_graph.model_inspector()
     frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))

@@ -30,8 +30,8 @@ _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
 # Factor of the criterion between candidates of one descent; largest number of checks.
 _CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
 _HULL_ADVICE = (
-    "; or, if it is the hulls of meshes that touch, excite a station (drake-teleop new): what"
-    " touches where its arm starts is let off"
+    "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
+    " touch in its start posture are ignored"
 )
 
 

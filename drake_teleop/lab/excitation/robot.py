@@ -160,9 +160,9 @@ def RobotFromModel(
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
             raise DrakeTeleopError(
-                f"the model holds {load[0]:.3g} kg beyond the sensor already",
+                f"the model already contains {load[0]:.3g} kg beyond the sensor",
                 where="--payload",
-                remedy="give the mass of all that may hang there",
+                remedy="give the total mass beyond the sensor",
             )
         reserve = _compact_load(mass - load[0])
     with drakes_errors_said(path):
@@ -212,7 +212,7 @@ def _make_robot(
     candidates, touching = scene.without_neighbours(bodies, postures, start)
     if touching:
         assumptions.append(
-            f"as they touch where the arm starts, not kept apart: {', '.join(touching)}"
+            f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
         )
     rows, capsules, pairs, distances = scene.capsules(bodies, candidates, postures)
     phi = arm.phi_load

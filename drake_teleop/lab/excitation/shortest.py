@@ -134,10 +134,10 @@ def shortest(
     if best is not None:
         return best
     raise DrakeTeleopError(
-        "no motion within the limits was found that reaches it"
-        + (f": the best misses it by {worst:.3g} times" if np.isfinite(worst) else ""),
+        "no motion within the limits reaches the tolerance"
+        + (f": the best one exceeds it by a factor of {worst:.3g}" if np.isfinite(worst) else ""),
         where=f"{robot.name}: {tolerance}",
-        remedy="ask for less, or repeat the motion of `excite`",
+        remedy="give larger tolerances, or repeat the motion of `excite`",
     )
 
 

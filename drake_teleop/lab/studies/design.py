@@ -33,13 +33,13 @@ _NUM_CANDIDATES = 1024
 class Factor:
     """Scenario field that the study varies."""
 
-    field: str = plain("", "`block.field`, as it stands in a scenario file")
-    values: list[float] = plain([], "the numbers that it takes")
-    words: list[str] = plain([], "the words that it takes, in place of numbers")
-    flags: list[bool] = plain([], "likewise")
-    vectors: list[list[float]] = plain([], "likewise")
-    low: float | None = plain(None, "where its range begins, in place of a list")
-    high: float | None = plain(None, "where its range ends")
+    field: str = plain("", "`block.field` of a scenario file")
+    values: list[float] = plain([], "numbers")
+    words: list[str] = plain([], "words, instead of numbers")
+    flags: list[bool] = plain([], "true or false, instead of numbers")
+    vectors: list[list[float]] = plain([], "vectors, instead of numbers")
+    low: float | None = plain(None, "start of a range, instead of a list")
+    high: float | None = plain(None, "end of the range")
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed(self) -> Sequence[Value]:
@@ -79,21 +79,19 @@ class Factor:
         lists = (self.values, self.words, self.flags, self.vectors)
         if [*map(bool, lists), any(ranged)].count(True) != 1 or any(ranged) != all(ranged):
             raise DrakeTeleopError(
-                "what it varies over is not clear",
+                "its values are ambiguous or missing",
                 where=where,
-                remedy="give either values, or words, or flags, or vectors, or both low and high",
+                remedy="give one of values, words, flags, vectors, or both low and high",
             )
         numbers = [*self.values, *itertools.chain(*self.vectors)]
         numbers += [self.high - self.low] if self.low is not None and self.high is not None else []
         if not all(map(math.isfinite, numbers)):
             raise DrakeTeleopError("its numbers, or their range, are not finite", where=where)
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise DrakeTeleopError(
-                f"the range ends at {self.high:g}, before it begins", where=f"{where}.high"
-            )
+            raise DrakeTeleopError(f"{self.high:g} is not above low", where=f"{where}.high")
         listed = self.listed()
         if any(value in listed[:index] for index, value in enumerate(listed)):
-            raise DrakeTeleopError("a value stands there twice", where=where)
+            raise DrakeTeleopError("a value is repeated", where=where)
 
 
 @settings
@@ -101,26 +99,26 @@ class Factor:
 class Study:
     """Factors, design and measures of a study."""
 
-    description: str = plain("", "what the study is about")
+    description: str = plain("", "purpose of the study")
     scenario: str = plain(
         "contact_transition",
-        "name of a shipped one, or a YAML file; its path is relative to the study's file",
+        "name of a shipped scenario, or a YAML file, relative to the study file",
     )
-    factors: list[Factor] = plain([], "the fields that it varies")
+    factors: list[Factor] = plain([], "varied fields")
     design: str = choice(
         "factorial",
         ("factorial", "sobol", "adaptive"),
-        "every combination of the values, scrambled Sobol points, or a search for the best point",
+        "all combinations of the values, scrambled Sobol points, or a search for the best point",
     )
-    samples: int = quantity(64, "1", 1, 2**20, "points of a Sobol (a power of two) or adaptive one")
-    objective: str = plain(
-        "", "the measure whose mean over the repeats an adaptive design makes small"
+    samples: int = quantity(
+        64, "1", 1, 2**20, "points of a Sobol design (a power of two) or of an adaptive design"
     )
-    batch: int = quantity(8, "1", 1, 2**10, "points that an adaptive design chooses at once")
-    repeats: int = quantity(1, "1", 1, 1e6, "runs of each point, each with a seed of its own")
-    seed: int = quantity(0, "1", 0, 1e9, "of the Sobol points, and of the first repeat")
-    measures: list[str] = plain(default_measures(), "what it measures of each run")
-    force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "of time_above_force_s")
+    objective: str = plain("", "measure whose mean over the repeats an adaptive design minimises")
+    batch: int = quantity(8, "1", 1, 2**10, "points of one batch of an adaptive design")
+    repeats: int = quantity(1, "1", 1, 1e6, "runs of each point, with different seeds")
+    seed: int = quantity(0, "1", 0, 1e9, "seed of the Sobol points and of the first repeat")
+    measures: list[str] = plain(default_measures(), "measures of each run")
+    force_threshold: float = quantity(1.0, "N", 0.0, 1e3, "threshold of time_above_force_s")
 
     def check(self, where: str) -> None:
         """Check the study without the scenario.
@@ -145,10 +143,10 @@ class Study:
                 raise DrakeTeleopError(f"{name} is varied twice", where=place)
             if name == "simulation.seed":
                 raise DrakeTeleopError(
-                    "the seed is no factor", where=place, remedy="set repeats and seed"
+                    "the seed cannot be a factor", where=place, remedy="set repeats and seed"
                 )
         if not self.factors:
-            raise DrakeTeleopError("nothing is varied", where=f"{where}:factors")
+            raise DrakeTeleopError("there are no factors", where=f"{where}:factors")
         if self.design == "sobol" and self.samples & (self.samples - 1):
             raise DrakeTeleopError(
                 f"{self.samples} Sobol points are not balanced",
@@ -157,9 +155,9 @@ class Study:
             )
         if (self.design == "adaptive") != (self.objective in self.measures):
             raise DrakeTeleopError(
-                f"'{self.objective}' is no objective for a design that is {self.design}",
+                f"'{self.objective}' cannot be the objective of design '{self.design}'",
                 where=f"{where}:objective",
-                remedy="an adaptive design takes one of the study's measures, the others none",
+                remedy="give one of the measures if the design is adaptive, else remove the objective",
             )
 
     def size(self) -> int:
@@ -182,8 +180,8 @@ class Study:
         if runs <= MANY_RUNS or yes is True:
             return
         if yes is False or not yes(f"{where}: {what}. Begin?"):
-            remedy = "--yes (in Python: yes=True) says that they are meant"
-            raise DrakeTeleopError(f"{what} are many", where=where, remedy=remedy)
+            remedy = "confirm them by --yes (in Python: yes=True)"
+            raise DrakeTeleopError(f"{what} need a confirmation", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
         """Return all points; for an adaptive design, the first ones."""

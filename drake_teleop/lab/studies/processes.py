@@ -77,7 +77,9 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
         except BrokenExecutor as error:
             suspicious = 1
             if not store.marked(suspicious):
-                raise DrakeTeleopError(f"processes end before they begin ({error})") from error
+                raise DrakeTeleopError(
+                    f"processes ended before their first run ({error})"
+                ) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
 

@@ -84,7 +84,7 @@ def run_study(
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            kept = f"{out} keeps {counter.done} of {counter.total} runs; the same command goes on"
+            kept = f"{out} keeps {counter.done} of {counter.total} runs; the same command continues"
             if isinstance(error, CannotWrite):
                 raise DrakeTeleopError(str(error), remedy=kept) from error
             raise KeyboardInterrupt(kept) from error

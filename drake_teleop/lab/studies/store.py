@@ -73,7 +73,7 @@ class Store:
         """Return all rows, sorted by run."""
         import polars as pl
 
-        remedy = "remove the part that is damaged; the same command makes it anew"
+        remedy = "remove the damaged part and repeat the command"
         with reading(self.folder, remedy):
             return pl.read_parquet(self._parts()).sort("run")
 
@@ -132,7 +132,7 @@ def _lock(handle: int, out: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise DrakeTeleopError(
-            "another process runs a study there", where=str(out), remedy="wait for it, or stop it"
+            "is in use by another process", where=str(out), remedy="wait for it, or stop it"
         ) from None
 
 
@@ -143,7 +143,7 @@ def _check_identity(out: Path, identity: dict[str, Any]) -> None:
         write_text(path, text)
     elif path.read_bytes() != text.encode():
         raise DrakeTeleopError(
-            "holds the runs of another study, or of another version of this one",
+            "contains runs of another study, or of another version of this one",
             where=str(out),
             remedy="give another folder, or remove this one",
         )
