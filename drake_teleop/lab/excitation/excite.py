@@ -97,13 +97,26 @@ def excite(
         )
         report_best(1.0, min((iterate.value for iterate in found), default=np.inf))
         trajectory, uses = best_checked(robot, found, stage("Check it at 1 kHz"))
+    return checked_excitation(robot, criterion, found, trajectory, uses)
+
+
+def checked_excitation(
+    robot: Robot,
+    criterion: str,
+    found: list[Iterate],
+    trajectory: FourierTrajectory,
+    uses: list[Use],
+) -> Excitation:
+    """Return a checked trajectory with its criteria, predicted deviations and history."""
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
         trajectory,
         criterion,
         criteria_of(robot, trajectory),
-        _predicted_deviations(robot, trajectory),
+        predicted_deviations(
+            *sensor_motion(robot, trajectory), 1 / RATE, robot.noise, robot.limits.phi
+        ),
         uses,
         np.array([(it.evaluations, value) for it, value in zip(found, best, strict=True)]),
         found[-1].seconds,
@@ -151,11 +164,6 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
     sensor_vectors(motions, out)
     s, omega, alpha = out
     return s, omega, alpha
-
-
-def _predicted_deviations(robot: Robot, trajectory: FourierTrajectory) -> Array:
-    motion = sensor_motion(robot, trajectory)
-    return predicted_deviations(*motion, 1 / RATE, robot.noise, robot.limits.phi)
 
 
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import accumulate
 
 import numpy as np
 from scipy.special import ndtri
@@ -21,9 +20,14 @@ from scipy.special import ndtri
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.lab.excitation.check import RATE, Use
+from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.excite import Excitation, best_checked, criteria_of, sensor_motion
+from drake_teleop.lab.excitation.excite import (
+    Excitation,
+    best_checked,
+    checked_excitation,
+    sensor_motion,
+)
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     criterion_gradient,
@@ -31,7 +35,7 @@ from drake_teleop.lab.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
-from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Iterate, Problem, Task, design
+from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Problem, Task, design
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
@@ -122,7 +126,8 @@ def shortest(
                 0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
             )
             if trajectory.period < shortest_period:
-                best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
+                excitation = checked_excitation(robot, "period", found, trajectory, uses)
+                best = Shortest(excitation, reached)
             if vain_rounds == _MAX_VAIN_ROUNDS:
                 break
         modelled = problem.deviations(motion, trajectory.period)
@@ -138,27 +143,6 @@ def shortest(
         + (f": the best one exceeds it by a factor of {worst:.3g}" if np.isfinite(worst) else ""),
         where=f"{robot.name}: {tolerance}",
         remedy="give larger tolerances, or repeat the motion of `excite`",
-    )
-
-
-def _excitation(
-    robot: Robot,
-    trajectory: FourierTrajectory,
-    covariance: Array,
-    uses: list[Use],
-    found: list[Iterate],
-) -> Excitation:
-    periods = accumulate((each.value for each in found), min)
-    history = [(each.evaluations, value) for each, value in zip(found, periods, strict=True)]
-    return Excitation(
-        robot,
-        trajectory,
-        "period",
-        criteria_of(robot, trajectory),
-        np.sqrt(np.diag(covariance)),
-        uses,
-        np.array(history),
-        found[-1].seconds,
     )
 
 

@@ -157,7 +157,7 @@ class Study:
             raise DrakeTeleopError(
                 f"'{self.objective}' cannot be the objective of design '{self.design}'",
                 where=f"{where}:objective",
-                remedy="give one of the measures if the design is adaptive, else remove the objective",
+                remedy="give one of the measures for an adaptive design, none for others",
             )
 
     def size(self) -> int:
