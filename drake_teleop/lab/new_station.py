@@ -385,8 +385,8 @@ def _scenario_text(
     swing_motion |= {"frequency": _SWING_HZ, "translation": _round_row([0.0, 0.0, swing / s])}
     press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
     press_motion |= {"translation": _round_row([0.0, 0.0, -down / s])}
-    wall = {"_tag": "!Wall", "position": _round_row([x, y, z - 1.5 * swing])}
-    wall["stiffness"] = _WALL_STIFFNESS
+    wall_position = _round_row([x, y, z - 1.5 * swing])
+    wall = {"_tag": "!Wall", "position": wall_position, "stiffness": _WALL_STIFFNESS}
     data = {
         "description": f"{Path(slave['model']).stem} commanded by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
