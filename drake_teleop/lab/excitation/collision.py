@@ -226,9 +226,10 @@ class Scene:
     def capsules(
         self, rows: dict[BodyIndex, int], candidates: dict[_Pair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
-        """Return rows, capsules, pairs, and the minimum distance of each pair.
+        """Return rows, capsules, pairs of capsules, and the minimum distance of each pair.
 
-        Excluded are pairs inside larger capsules, and distances unrelated to the shapes.
+        Excluded are pairs inside larger capsules, and pairs whose capsules are near regardless of
+        their shapes.
         """
         inspector = self.scene_graph.model_inspector()
         motions = empty_motions(1, self.arm.num_joints)
@@ -277,9 +278,10 @@ class Scene:
 
 
 def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
-    """Return the minimum distance of two capsules from (T,) distances [m].
+    """Return the minimum distance of two capsules from (T,) distances in random postures [m].
 
-    It subtracts the lower quartile of their excess near contact, and leaves 90 % of free postures.
+    Capsules are larger than their shapes, so the lower quartile of their excess near contact is
+    subtracted. At least 90 % of the free postures remain feasible.
     """
     touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
     excess = (

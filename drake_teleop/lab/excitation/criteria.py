@@ -120,7 +120,7 @@ class Criterion:
     def _log_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the log, and its gradient by eigenvalues (A16: by Gram)."""
+        """Return the logarithm and its gradient by eigenvalues (A16: by the Gram matrix)."""
         if self.name == "D16":
             n = len(eigenvalues)
             return float(-0.5 * np.log(eigenvalues).mean()), -0.5 / (n * eigenvalues)

@@ -169,8 +169,8 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     """Yield trajectories within the limits at 1 kHz, best first.
 
-    A descent may end too close to a true shape, so the next candidate is
-    worse by `_CANDIDATE_RATIO`.
+    A descent may end too close to a true shape, so its next candidate is worse by
+    `_CANDIDATE_RATIO`.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)
     last = dict.fromkeys((iterate.start for iterate in ranked), 0.0)

@@ -43,7 +43,7 @@ def to_link(motion, a):
 
 @njit(cache=True)
 def seed_vector(motion, place, gradient, seed):
-    """Add the seed of s, omega or alpha (`place` 0, 3, 6) in the link."""
+    """Add the seed of s, omega or alpha (`place` 0, 3, 6) in the link's frame."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, three(motion, place)))
@@ -51,7 +51,7 @@ def seed_vector(motion, place, gradient, seed):
 
 @njit(cache=True)
 def seed_point(motion, point, gradient, seed):
-    """Add the seed of a point (3,) on the link; `gradient` is in W."""
+    """Add the seed of a point (3,) fixed to the link; `gradient` is in W."""
     add_into(seed, _P, gradient)
     add_into(seed, _THETA, cross(to_world(motion, point), gradient))
 

@@ -81,7 +81,7 @@ def _poses(
 
 
 def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    """Add visual shapes; without them collision shapes and bones."""
+    """Add visual shapes; for bodies without them collision shapes and bones."""
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))

@@ -113,7 +113,7 @@ class Problem:
         return None
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """Evaluate at x with sharpness of criterion and smooth maxima."""
+        """Evaluate criterion and limits at x, with the sharpness of their smooth maxima."""
         task, n = self.task, len(self.task.home)
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         joints = self._basis @ coefficients
@@ -296,7 +296,7 @@ class _Search:
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
     def _evaluate_once(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """Evaluate a point once; SLSQP requests its parts separately."""
+        """Evaluate a point; SLSQP requests its value, limits and gradients separately."""
         key = np.array([*x, of_criterion, of_maxima]).tobytes()
         if key != self._key:
             self._count_evaluation()

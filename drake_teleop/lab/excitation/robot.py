@@ -122,12 +122,12 @@ def RobotFromModel(
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
 ) -> Robot:
-    """Return a serial arm from a model; bases are welded, joints beyond the sensor locked.
+    """Return a serial arm from a model; free bases are welded, joints beyond the sensor locked.
 
     Args:
         sensor_frame: frame or link at which the sensor measures.
         package_paths: folders for `package://` addresses.
-        acceleration: limits [rad/s^2], one or one for each joint, if the model has none.
+        acceleration: limits [rad/s^2] if the model has none, one value or one for each joint.
         payload: mass of the heaviest load [kg], if the model lacks it.
 
     Raises:

@@ -203,7 +203,7 @@ class ShortestProblem(Problem):
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
     def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """Evaluate log T and eight limits: tolerance, then arm."""
+        """Evaluate log T and eight limits: the tolerance, then those of the arm."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
@@ -242,7 +242,7 @@ class ShortestProblem(Problem):
         return np.sqrt(self._variances(self._rows(*motion), period)[0])
 
     def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
-        """Return (T, 6, 16) rows over root densities of the wrench noise."""
+        """Return (T, 6, 16) regression rows over root densities of the wrench noise."""
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
@@ -250,8 +250,9 @@ class ShortestProblem(Problem):
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
         """Return (k,) variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        G = sum of R^T R T / samples is the information of weighted least squares; B = sum of
-        R^T S R T / samples has the noise densities S (sandwich, White, Econometrica 1980).
+        G = sum of R^T R period / samples is the information of weighted least squares;
+        B = sum of R^T S R period / samples contains the noise densities S (sandwich, White,
+        Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)

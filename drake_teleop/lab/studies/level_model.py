@@ -30,13 +30,17 @@ TOO_FEW = "too few points"
 
 
 def comparable(there: Flags) -> tuple[Flags, Flags]:
-    """Return the rows and columns of a complete block.
+    """Return the largest complete block of a table with missing values.
+
+    Levels (or cells) are comparable only over combinations of the other factors at which all of
+    them have a successful run.
 
     Args:
-        there: (rows, columns) True where level (or cell) and combination have a value.
+        there: (rows, columns) True where level and combination have a value.
 
     Returns:
-        (rows,) the most frequent largest pattern; (columns,) all columns with these rows.
+        (rows,) the largest pattern of rows, the most frequent if several; (columns,) all columns
+        with these rows.
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -192,12 +196,12 @@ class LevelModel:
         return np.linalg.norm(terms @ self.solve, axis=1)
 
     def _design(self, table: Array, together: int) -> float:
-        """Return the half width of the design for unit spread."""
+        """Return the half width due to the design, for unit spread."""
         variance = self._variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
     def _seeds(self, table: Array, terms: Array) -> float:
-        """Return the half width of seeds beyond residual noise."""
+        """Return the half width due to seeds, beyond the residual noise."""
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0
@@ -283,7 +287,7 @@ def _products(a: Array, b: Array) -> Array:
 
 
 def _codes(count: int, present: NDArray[np.int64]) -> Array:
-    """Return (count, k - 1) sum-to-zero codes."""
+    """Return (count, k - 1) sum-to-zero codes of the k present levels."""
     codes = np.zeros((count, len(present) - 1))
     codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
     return codes

@@ -45,7 +45,7 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
         cluster: address of a Dask scheduler, or "local".
 
     Raises:
-        DrakeTeleopError: without Dask or scheduler, or if processes end before they begin.
+        DrakeTeleopError: without Dask or scheduler, or if processes end before their first run.
     """
     if cluster is None:
         from joblib import effective_n_jobs
@@ -106,7 +106,7 @@ def _task(run: Run, chunk: Chunk, store: Store) -> Any:
 
 
 def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    """Run rows one by one, with no other row."""
+    """Run the rows one by one while no other row runs."""
     found = []
     for row in chunk:
         try:

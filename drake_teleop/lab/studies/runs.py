@@ -1,4 +1,4 @@
-"""Runs of a study."""
+"""Runs of a study, from the design through the processes into the store."""
 
 from __future__ import annotations
 
@@ -114,14 +114,14 @@ def _objective(study: Study, store: Store, points: int) -> Array:
 
 
 class StudyProgress:
-    """Progress of a study."""
+    """Number of finished runs and remaining time of a study."""
 
     def __init__(self, total: int) -> None:
         self.total, self.done, self._num_timed = total, 0, 0
         self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
     def start(self, progress: Progress, processes: int) -> None:
-        """Set bar and number of processes."""
+        """Set the progress bar and the number of processes."""
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:
@@ -130,7 +130,7 @@ class StudyProgress:
         self._report()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs; without one-time costs for the first ones."""
+        """Count finished runs; the first ones without their one-time work."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process

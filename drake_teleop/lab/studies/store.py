@@ -61,7 +61,7 @@ class Store:
         (self._marks / str(run)).unlink(missing_ok=True)
 
     def marked(self, times: int) -> set[int]:
-        """Return unfinished chunks with at least so many starts."""
+        """Return the unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 

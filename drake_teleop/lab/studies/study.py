@@ -62,7 +62,7 @@ class StationWork:
         return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return the measures of one run, and its one-time cost (`ONE_TIME_COST`) [s]."""
+        """Return the measures of one run, and the time of one-time work [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
@@ -153,7 +153,7 @@ def _scenario_path(study: Study, path: Path) -> str | Path:
 
 
 def _check_values(factor: Factor, where: str) -> None:
-    """Check each value alone."""
+    """Check each value alone; combinations are checked in the runs."""
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
         data = _with_changes({}, {factor.field: value})
@@ -162,7 +162,7 @@ def _check_values(factor: Factor, where: str) -> None:
 
 
 def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
-    """Return a copy with changed fields (`block.field`)."""
+    """Return a copy of a scenario's data with changed fields (`block.field`)."""
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")
