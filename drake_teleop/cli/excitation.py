@@ -93,7 +93,7 @@ def excite_command(
     setup = LoadScenario(scenario)
     make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
-        opened = stage("Read the robot")
+        read = stage("Read the robot")
         if model is None:
             _refuse(sensor_frame, package_paths, acceleration, payload)
             robot = RobotFromScenario(setup)
@@ -114,7 +114,7 @@ def excite_command(
                 acceleration=acceleration,
                 payload=payload,
             )
-        opened(1.0)
+        read(1.0)
         reached = {}
         if tolerance is None:
             found = excite(
@@ -127,15 +127,15 @@ def excite_command(
                 progress=stage,
             )
         else:
-            told = stage("Shorten the motion")
+            report = stage("Shorten the motion")
             result = shortest(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
                 seed=seed,
-                progress=lambda done, best: told(done, f"{best:.3g} s" if best < np.inf else ""),
+                progress=lambda done, best: report(done, f"{best:.3g} s" if best < np.inf else ""),
             )
-            told(1.0)
+            report(1.0)
             found = result.excitation
             shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
@@ -209,7 +209,7 @@ def draw(found: Excitation) -> Figure:
         _draw_wrench(forces, torques, found)
         progress.step(*found.history.T, where="post", color=BLUE)
         progress.set(
-            title=f"{found.criterion} on the way to {found.values[found.criterion]:.4g}",
+            title=f"{found.criterion} down to {found.values[found.criterion]:.4g}",
             xlabel="evaluations",
             yscale="log",
         )

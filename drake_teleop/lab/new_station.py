@@ -251,8 +251,8 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     else:
         looked_at = fit[np.argsort(distances)][:: max(len(fit) // _NUM_PLACES, 1)]
         found = [
-            _place_with_cube(arm, np.round(poses[k, 4:], 2), turn)
-            for turn in _TOOL_YAWS_DEG
+            _place_with_cube(arm, np.round(poses[k, 4:], 2), yaw_deg)
+            for yaw_deg in _TOOL_YAWS_DEG
             for k in looked_at
         ]
     best = max(found, key=_merit, default=None)
@@ -292,12 +292,12 @@ def _is_in_front(places: Array, reach: float) -> NDArray[np.bool_]:
     return result
 
 
-def _place_with_cube(arm: ArmModel, position: Array, turn: float) -> Place:
+def _place_with_cube(arm: ArmModel, position: Array, yaw_deg: float) -> Place:
     """Return a place with the largest reachable cube of `_CUBE_HALVES_M`."""
-    R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
+    R_WS = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
     q, status = tool_down(arm, position, R_WS)
-    place = Place(np.array([*w, *position]), turn == 0.0, q, 0.0, _joint_margin(arm, q))
+    place = Place(np.array([*w, *position]), yaw_deg == 0.0, q, 0.0, _joint_margin(arm, q))
     if status != IkStatus.OK:
         return place._replace(room=0.0)
     for half in (half for half in _CUBE_HALVES_M if 2.0 * half <= np.hypot(*position[:2])):

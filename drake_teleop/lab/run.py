@@ -96,7 +96,7 @@ def run_command(
     with output_folder(out):
         with show_progress(progress and not quiet) as stage:
             run = _run_with_log(setup, out, stage, fresh, drive)
-            written = stage("Write pictures and film")
+            written = stage("Write pictures and 3D replay")
             write_picture(out / "overview.png", overview(run.result))
             written(0.3)
             write_replay(out / "replay.html", run.result, run.scenario)
@@ -153,15 +153,15 @@ def run_scenario(
         DrakeTeleopError: for an unusable scenario or a joint outside its range.
     """
     check_scenario(scenario)
-    learns = scenario.load_estimator.enabled
-    if learns and not scenario.operator.intent and scenario.operator.task is None:
+    estimates_load = scenario.load_estimator.enabled
+    if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
             scenario, found.result, found.identification, _DURING_RUN, found.real_time_factor
         )
     identification, estimate, floor, source = None, None, None, _DURING_RUN
     with show_progress(progress) as stage:
-        if not learns:
+        if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
@@ -209,13 +209,13 @@ def _print(summary: dict[str, Any], out: Path) -> None:
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     if "contact_by" in summary:
         console.print(f"contact by {summary['contact_by']}", highlight=False)
-    for name, way in summary.get("moved_mm", {}).items():
-        turn = f"{way:.1f} mm and rotated by {summary['turned_deg'][name]:.1f} degrees"
-        console.print(f"{name} was moved by {turn}", highlight=False)
+    for name, displacement in summary.get("moved_mm", {}).items():
+        motion = f"{displacement:.1f} mm and rotated by {summary['turned_deg'][name]:.1f} degrees"
+        console.print(f"{name} was moved by {motion}", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
-    for words in summary.get("assumed", ()):
-        console.print(f"assumed: {words}", highlight=False, markup=False)
+    for assumption in summary.get("assumed", ()):
+        console.print(f"assumed: {assumption}", highlight=False, markup=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(

@@ -167,13 +167,13 @@ def _unmodelled_contact(scenario: Scenario) -> str:
 
 
 def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
-    moved, turned = {}, {}
+    displacements, rotations = {}, {}
     for signal in (name for name in result.signals if name.startswith(POSE_OF)):
         name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
-        moved[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
-        turn = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
-        turned[name] = float(np.degrees(np.linalg.norm(turn)))
-    return {"moved_mm": moved, "turned_deg": turned} if moved else {}
+        displacements[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
+        rotation = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
+        rotations[name] = float(np.degrees(np.linalg.norm(rotation)))
+    return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 
 def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:

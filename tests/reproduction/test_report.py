@@ -117,9 +117,9 @@ def test_captions_contain_values_of_the_run():
     assert "99.4 N" in text["fig6"] and "1.21 N remain" in text["fig6"]
     assert "5.10 N m" in text["fig7"]
     assert "at 220 ms" in text["fig8"] and "2.5 ms after" in text["fig8"]
-    assert "no threshold on it tells" in text["fig8"]
+    assert "no threshold on it separates" in text["fig8"]
     other = captions(SUMMARY | {"contact.raw_detectable": True, "contact.false_alarm_0_6_s": True})
-    assert "a threshold on it tells" in other["fig8"]
+    assert "a threshold on it separates" in other["fig8"]
     assert "it also crosses it" in other["fig8"]
 
 

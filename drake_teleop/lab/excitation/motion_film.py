@@ -48,7 +48,7 @@ def write_motion_film(path: Path, found: Excitation) -> None:
             Reading("Force of the heaviest load", "N", force[samples], BLUE),
             Reading("Speed of the sensor", "m/s", speed),
         ],
-        notes=("Line: the sensor's way, from rest to rest.",),
+        notes=("Line: path of the sensor, from rest to rest.",),
         clock="of the motion",
         curves="force at the sensor, 0 to {top} N",
     )

@@ -157,16 +157,16 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
     """Return the captions of fig6, fig7 and fig8 with the values of this run."""
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
-    tells = "a threshold on it tells" if s["contact.raw_detectable"] else "no threshold on it tells"
+    threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
     alarm = "also crosses it" if s["contact.false_alarm_0_6_s"] else "stays below it"
     return {
         "fig6": (
-            f"A fast vertical movement of the stylus in free space. Top: the load alone puts up to "
+            f"A fast vertical movement of the stylus in free space. Top: the load causes up to "
             f"{s['free_force.peak_raw_N']:.1f} N on the wrist sensor, "
             f"{s['free_force.peak_raw_master_N']:.2f} N after scaling to the master. Middle: half "
-            f"of the non-contact force is taken away and {s['free_force.half_ratio']:.1%} is left "
-            f"(rms). Bottom: all of it is taken away; never more than "
-            f"{s['free_force.residual_max_N']:.2f} N remain, noise of the sensor included."
+            f"of the non-contact force is eliminated and {s['free_force.half_ratio']:.1%} remains "
+            f"(rms). Bottom: all of it is eliminated; at most "
+            f"{s['free_force.residual_max_N']:.2f} N remain, including sensor noise."
         ),
         "fig7": (
             f"The same for the torque, in a horizontal movement: "
@@ -177,10 +177,10 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
         "fig8": (
             f"A repetitive vertical movement that touches the sheet spring once, at "
             f"{1e3 * s['contact.true_s']:.0f} ms (shaded). The measured force is dominated by "
-            f"inertia, {s['contact.peak_inertial_N']:.0f} N at its peak, and {tells} "
-            f"contact from free motion. The calculated contact force rises to "
+            f"inertia, {s['contact.peak_inertial_N']:.0f} N at its peak, and {threshold} on it "
+            f"separates contact from free motion. The calculated contact force rises to "
             f"{s['contact.peak_contact_N']:.0f} N and crosses the threshold {lag:.1f} ms after "
-            f"the touch; at the turn without contact, at about 600 ms, it {alarm}."
+            f"the touch; at the reversal without contact, at about 600 ms, it {alarm}."
         ),
     }
 

@@ -46,17 +46,20 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
 
 
 def cpu_seconds(
-    simulators: Mapping[str, Simulator], *, turns: int = 11, progress: Progress = lambda done: None
+    simulators: Mapping[str, Simulator],
+    *,
+    repetitions: int = 11,
+    progress: Progress = lambda done: None,
 ) -> dict[str, float]:
     """Return thread CPU seconds for each simulated second, by interleaved runs.
 
     Other load of the machine can only add time, so the minimum counts (as in `timeit`).
     """
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
-    for turn in range(turns):
+    for k in range(repetitions):
         for name, simulator in simulators.items():
             start = time.thread_time()
             advance(simulator, simulator.get_context().get_time() + _RUN_S)
             times_s[name].append((time.thread_time() - start) / _RUN_S)
-        progress((turn + 1) / turns)
+        progress((k + 1) / repetitions)
     return {name: min(times) for name, times in times_s.items()}

@@ -61,10 +61,11 @@ class Factorial:
         )
         point = np.full((rows, columns), -1)
         point[row, column] = np.arange(len(row))
-        kept, over = comparable(point >= 0)
-        weights = np.zeros((int(kept.sum()), len(row)))
-        np.put_along_axis(weights, point[kept][:, over], 1.0 / over.sum(), axis=1)
-        return kept, over, weights
+        is_compared, combinations = comparable(point >= 0)
+        weights = np.zeros((int(is_compared.sum()), len(row)))
+        points = point[is_compared][:, combinations]
+        np.put_along_axis(weights, points, 1.0 / combinations.sum(), axis=1)
+        return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
         """Return (kept levels,) effects and half widths of each factor."""
@@ -260,15 +261,15 @@ class _MeasureData:
         self.is_empty = not known.any()
         if self.is_empty:
             return
-        kept = np.ix_(known, seen.any(axis=0))
-        self.table = filled(values[kept])
+        used = np.ix_(known, seen.any(axis=0))
+        self.table = filled(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
             counts = [len(levels.names) for levels in self.levels]
-            self.model = Factorial(index, counts, seen[kept])
+            self.model = Factorial(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
             self.model = level_model(self.factors, columns, known, by_chance=by_chance)
@@ -280,13 +281,13 @@ class _MeasureData:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW] * count, 0
         if self.model is not None:
-            kept, over, weights = self.model.compared(factor)
-            if kept.sum() > 1:
+            is_compared, combinations, weights = self.model.compared(factor)
+            if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
-                figures[:, kept] = found
-                compared = self._combinations(over, factor)
-            why = self._reasons(kept & (kept.sum() > 1), levels.index)
+                figures[:, is_compared] = found
+                compared = self._combinations(combinations, factor)
+            why = self._reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
         left_out = self._combinations(np.ones(1), factor) - compared
         return MainEffect(
@@ -299,15 +300,15 @@ class _MeasureData:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        kept, over, weights = self.model.compared(first, second)
-        mean = np.full(len(kept), np.nan)
-        mean[kept] = self.model.means(self.table, weights)[0]
+        is_compared, combinations, weights = self.model.compared(first, second)
+        mean = np.full(len(is_compared), np.nan)
+        mean[is_compared] = self.model.means(self.table, weights)[0]
         # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
-        kept &= np.bincount(cell, self.runs, len(kept)) > 0
-        mean[~kept] = np.nan
-        why = np.array(self._reasons(kept, cell)).reshape(shape)
-        compared = self._combinations(over, first, second)
+        is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
+        mean[~is_compared] = np.nan
+        why = np.array(self._reasons(is_compared, cell)).reshape(shape)
+        compared = self._combinations(combinations, first, second)
         left_out = self._combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
         names = a.names, b.names
@@ -317,9 +318,9 @@ class _MeasureData:
     def fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
-    def _combinations(self, over: NDArray[Any], *shown: int) -> int:
+    def _combinations(self, combinations: NDArray[Any], *shown: int) -> int:
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
-        return round(np.mean(over) * math.prod(others))
+        return round(np.mean(combinations) * math.prod(others))
 
     def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
         runs = np.bincount(cell, minlength=len(compared))

@@ -84,10 +84,12 @@ def run_study(
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            kept = f"{out} keeps {counter.done} of {counter.total} runs; the same command continues"
+            remedy = (
+                f"{out} keeps {counter.done} of {counter.total} runs; the same command continues"
+            )
             if isinstance(error, CannotWrite):
-                raise DrakeTeleopError(str(error), remedy=kept) from error
-            raise KeyboardInterrupt(kept) from error
+                raise DrakeTeleopError(str(error), remedy=remedy) from error
+            raise KeyboardInterrupt(remedy) from error
         return store.read()
 
 

@@ -83,10 +83,12 @@ def scaling_study_command(
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _axes()
-    answers = {way: answer(tables, criteria) for way, criteria in SELECTIONS.items()}
+    answers = {selection: answer(tables, criteria) for selection, criteria in SELECTIONS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {way: _choice(found, sigmas, gammas) for way, found in answers.items()},
+        "choice": {
+            selection: _choice(found, sigmas, gammas) for selection, found in answers.items()
+        },
         "eta": _eta_effects(rows[_OBJECT_STUDY]),
     }
     with output_folder(out, "answer.json"):
@@ -191,7 +193,7 @@ def _merit_table(
     return pl.DataFrame(
         [
             {
-                "way": way,
+                "way": selection,
                 "sigma": sigma,
                 "gamma": gamma,
                 "merit": found.merit[i, j],
@@ -199,7 +201,7 @@ def _merit_table(
                 "high": found.high[i, j],
                 "best_in": found.best[i, j],
             }
-            for way, found in answers.items()
+            for selection, found in answers.items()
             for i, sigma in enumerate(sigmas)
             for j, gamma in enumerate(gammas)
         ]
@@ -258,7 +260,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
     with house_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
-        for axes, (way, found) in zip(grid.ravel(), answers.items(), strict=True):
+        for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):
             drawn = axes.imshow(
                 found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
             )
@@ -267,7 +269,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
-            axes.set_title(f"counts: {way}")
+            axes.set_title(f"counts: {selection}")
             for i, j in np.ndindex(found.merit.shape):
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
                 axes.text(j, i, _cell_text(found, i, j), color="white" if dark else "black",
@@ -293,11 +295,11 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     from rich.table import Table
 
     table = Table("what counts", "sigma", "gamma", "merit", "95 %", "best in")
-    for way, found in summary["choice"].items():
+    for selection, found in summary["choice"].items():
         if found is not None:
             low, high = found["interval"]
             table.add_row(
-                way, f"{found['sigma']:g}", f"{found['gamma']:g}", f"{found['merit']:.3f}",
+                selection, f"{found['sigma']:g}", f"{found['gamma']:g}", f"{found['merit']:.3f}",
                 f"{low:.3f} to {high:.3f}", f"{found['best_in']:.0%}",
             )  # fmt: skip
     console = Console()
