@@ -6,7 +6,7 @@ Derivatives are finite differences; Drake's plant gives torques, accelerations a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.geometry import QueryObject
@@ -20,6 +20,7 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 #: Sample rate [Hz].
 RATE = 1000.0
+_SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
 _STEP_S = 1e-4
 # Search distance beyond the clearance [m].
@@ -83,14 +84,10 @@ def check_motion(
         _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
         _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
-    nearest = motion.nearest[int(np.argmax(motion.clearance))]
-    uses[-1] = Use("clearance", uses[-1].share, uses[-1].time, nearest)
+    uses[-1] = replace(uses[-1], what=motion.nearest[int(np.argmax(motion.clearance))])
     if np.isinf(limits.box_half).all():
         del uses[LIMITS.index("workspace")]
     return sorted(uses, key=lambda use: -use.share)
-
-
-_SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
 
 
 def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
