@@ -158,8 +158,9 @@ class Scene:
         finalize(self.plant)
         self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
         self.diagram = builder.Build()
+        self._rows = self._link_rows()
 
-    def rows(self) -> dict[BodyIndex, int]:
+    def _link_rows(self) -> dict[BodyIndex, int]:
         """Return the link of every body, a row of `link_motions` (-1: world)."""
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
@@ -169,7 +170,7 @@ class Scene:
         return rows
 
     def without_neighbours(
-        self, rows: dict[BodyIndex, int], postures: Array, start: Array | None
+        self, postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
         """Return pairs of shapes that may collide, with distances in each posture (inf: far).
 
@@ -181,10 +182,10 @@ class Scene:
             start: (n,), if known.
         """
         manager = self.scene_graph.collision_filter_manager()
-        for link in set(rows.values()):
+        for link in set(self._rows.values()):
             together = [
                 shape
-                for body, row in rows.items()
+                for body, row in self._rows.items()
                 if row == link
                 for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
             ]
@@ -224,9 +225,9 @@ class Scene:
         return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
 
     def capsules(
-        self, rows: dict[BodyIndex, int], candidates: dict[_Pair, Array], postures: Array
-    ) -> tuple[NDArray[np.int64], list[Capsule], NDArray[np.int64], Array]:
-        """Return rows, capsules, pairs of capsules, and the minimum distance of each pair.
+        self, candidates: dict[_Pair, Array], postures: Array
+    ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
+        """Return rows, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
 
         Excluded are pairs inside larger capsules, and pairs whose capsules are near regardless of
         their shapes.
@@ -240,7 +241,7 @@ class Scene:
         capsules: dict[GeometryId, tuple[int, Capsule]] = {}
         for shape in sorted({shape for pair in candidates for shape in pair}, key=_number):
             body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
-            row = rows[body.index()]
+            row = self._rows[body.index()]
             X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
             X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
             capsule = bounding_capsule(inspector.GetShape(shape))
@@ -274,7 +275,7 @@ class Scene:
             if useful:
                 used.append(k)
                 distances.append(distance)
-        return capsule_rows, shapes, pairs[used], np.array(distances)
+        return capsule_rows, ends, radii, pairs[used], np.array(distances)
 
 
 def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:

@@ -46,6 +46,7 @@ _MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 # The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
 _BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
+_UNLIMITED = np.zeros(3), np.full(3, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,18 +95,15 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
     scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_BOX_W)
-    box = (upper + lower) / 2, (upper - lower) / 2
-    endless = np.zeros(3), np.full(3, np.inf)
     return _make_robot(
         scene,
         "the station's slave",
         scenario.wrist_sensor,
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
-        home=slave.start,
-        starts_at_home=True,
+        start=slave.start,
         points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
-        box=endless if own else box,
+        box=_UNLIMITED if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
         folders=folders,
     )
@@ -177,10 +175,9 @@ def RobotFromModel(
         sensor,
         estimation or MotionEstimationConfig(),
         sensor_hz,
-        home=(scene.arm.lower + scene.arm.upper) / 2,
-        starts_at_home=False,
+        start=None,
         points_S=np.zeros((1, 3)),
-        box=(np.zeros(3), np.full(3, np.inf)),
+        box=_UNLIMITED,
         assumptions=assumptions + completed,
         folders=folders,
     )
@@ -193,29 +190,29 @@ def _make_robot(
     estimation: MotionEstimationConfig,
     sensor_hz: float,
     *,
-    home: Array,
-    starts_at_home: bool,
+    start: Array | None,
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
-    folders: Sequence[TemporaryDirectory[str]] = (),
+    folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
     """Return the robot with its limits; `box` is middle and half size in W [m].
 
-    With `starts_at_home`, shapes that touch at home may touch.
+    Shapes that touch in the `start` posture (n,), if known, may touch.
     """
     arm = scene.arm
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
     postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
-    bodies = scene.rows()
-    start = home if starts_at_home else None
-    candidates, touching = scene.without_neighbours(bodies, postures, start)
+    candidates, touching = scene.without_neighbours(postures, start)
     if touching:
         assumptions.append(
             f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
         )
-    rows, capsules, pairs, distances = scene.capsules(bodies, candidates, postures)
-    phi = arm.phi_load
+    rows, ends, radii, pairs, distances = scene.capsules(candidates, postures)
+    phi, std = arm.phi_load, sensor.wrench_std()
+    force = _FORCE_SHARE * min(sensor.force_range)
+    torque = _TORQUE_SHARE * min(sensor.torque_range)
+    alpha = sensor.angular_acceleration_range
     limits = Limits(
         q_middle=middle,
         q_half=_JOINT_SHARE * half,
@@ -223,25 +220,17 @@ def _make_robot(
         acceleration=arm.acceleration_limit,
         effort=_JOINT_SHARE * arm.effort_limit,
         phi=phi,
-        sensor=np.array(
-            [
-                _FORCE_SHARE * min(sensor.force_range),
-                _TORQUE_SHARE * min(sensor.torque_range),
-                sensor.acceleration_range,
-                sensor.angular_acceleration_range,
-            ]
-        ),
+        sensor=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
         capsule_row=rows,
-        capsule_ends=np.array([capsule.ends for capsule in capsules]).reshape(-1, 2, 3),
-        capsule_radius=np.array([capsule.radius for capsule in capsules]),
+        capsule_ends=ends,
+        capsule_radius=radii,
         pairs=pairs,
         distances=distances,
         clearance=CLEARANCE,
     )
-    std = sensor.wrench_std()
     return Robot(
         name=name,
         diagram=scene.diagram,
@@ -252,7 +241,7 @@ def _make_robot(
         limits=limits,
         scales=Scales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
         noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
-        home=home,
+        home=middle if start is None else start,
         assumptions=tuple(assumptions),
         folders=tuple(folders),
     )
