@@ -112,7 +112,7 @@ class Problem:
         """Return the bounds of a descent from x; None: unbounded."""
         return None
 
-    def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
+    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         """Evaluate criterion and limits at x, with the sharpness of their smooth maxima."""
         task, n = self.task, len(self.task.home)
         coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
@@ -122,11 +122,11 @@ class Problem:
         sensor_vectors(self._motions, self._vectors)
         self._gradients[0] = 0.0
         s, omega, alpha = self._vectors
-        value, g_V = task.criterion.smooth(s, omega, alpha, of_criterion)
+        value, g_V = task.criterion.smooth(s, omega, alpha, criterion_sharpness)
         criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
         smooth, largest = np.empty((2, len(LIMITS)))
         limit_uses(
-            task.table, *joints, self._motions, task.limits, of_maxima,
+            task.table, *joints, self._motions, task.limits, limit_sharpness,
             smooth, largest, self._gradients[1:],
         )  # fmt: skip
         return Evaluation(value, smooth, self._gradients_by_unknowns(), float(largest.max()))
@@ -254,9 +254,9 @@ class _Search:
     def follow(self, x: Array) -> None:
         """Descend from x."""
         self._evaluations, self._best_of_start = 0, float("inf")
-        for of_criterion, of_maxima, weight, iterations in _LBFGS_STAGES:
+        for criterion_sharpness, limit_sharpness, weight, iterations in _LBFGS_STAGES:
             options = {"maxiter": iterations}
-            stage = (of_criterion, of_maxima, weight)
+            stage = (criterion_sharpness, limit_sharpness, weight)
             x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
         is_bounded = self._problem.bounds(x) is not None
         for k, stage in enumerate(_SLSQP_STAGES):
@@ -269,11 +269,13 @@ class _Search:
             before = self._best_of_start
             x = self._run_slsqp(x, *_SLSQP_STAGES[-1])
 
-    def _run_slsqp(self, x: Array, of_criterion: float, of_maxima: float, iterations: int) -> Array:
+    def _run_slsqp(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float, iterations: int
+    ) -> Array:
         found: Array = self._minimize(
             lambda x, *sharpness: self._evaluate_once(x, *sharpness).log_criterion,
             x,
-            (of_criterion, of_maxima),
+            (criterion_sharpness, limit_sharpness),
             "SLSQP",
             jac=lambda x, *sharpness: self._evaluate_once(x, *sharpness).gradients[0],
             bounds=self._problem.bounds(x),
@@ -281,26 +283,28 @@ class _Search:
                 "type": "ineq",
                 "fun": lambda x, *sharpness: MARGIN - self._evaluate_once(x, *sharpness).uses,
                 "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
-                "args": (of_criterion, of_maxima),
+                "args": (criterion_sharpness, limit_sharpness),
             },
             options={"maxiter": iterations, "ftol": _TOLERANCE},
         ).x
         return found
 
     def _penalised(
-        self, x: Array, of_criterion: float, of_maxima: float, weight: float
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
     ) -> tuple[float, Array]:
-        point = self._evaluate_once(x, of_criterion, of_maxima)
+        point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
         excess = np.maximum(point.uses - MARGIN, 0)
         value = point.log_criterion + weight * float(excess @ excess)
         return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
 
-    def _evaluate_once(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
+    def _evaluate_once(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float
+    ) -> Evaluation:
         """Evaluate a point; SLSQP requests its value, limits and gradients separately."""
-        key = np.array([*x, of_criterion, of_maxima]).tobytes()
+        key = np.array([*x, criterion_sharpness, limit_sharpness]).tobytes()
         if key != self._key:
             self._count_evaluation()
-            self._last = self._problem.evaluate(x, of_criterion, of_maxima)
+            self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
             self._key = key
             if self._last.largest_use <= _MAX_FEASIBLE_USE:
                 self._record_iterate(x)

@@ -202,7 +202,7 @@ class ShortestProblem(Problem):
         low, high = (float(each) for each in around)
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
-    def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
+    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
         """Evaluate log T and eight limits: the tolerance, then those of the arm."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
         log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
@@ -214,11 +214,20 @@ class ShortestProblem(Problem):
         sensor_vectors(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * of_criterion)
+        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMITS)))
         limit_uses(
-            task.table, q, qd, qdd, self._motions, task.limits, of_maxima, smooth, largest, g[2:]
+            task.table,
+            q,
+            qd,
+            qdd,
+            self._motions,
+            task.limits,
+            limit_sharpness,
+            smooth,
+            largest,
+            g[2:],
         )
         by_log_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
         # Longer periods have more samples; the objective is log T.
