@@ -256,7 +256,7 @@ def test_improving_iterates_are_recorded_with_start_and_evaluations():
     search = _Search(problem, 9, None, lambda *_: None)
     search.start = 7
     for k in range(4):
-        search._at(np.array([float(k)]), 3.0, 5.0)
+        search._evaluate_once(np.array([float(k)]), 3.0, 5.0)
     noted = [(x.evaluations, x.start, x.value, x.trajectory) for x in search.found]
     assert noted == [(1, 7, 3.0, 0), (2, 7, 2.0, 1), (4, 7, 1.5, 3)]
 
