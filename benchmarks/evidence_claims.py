@@ -192,7 +192,7 @@ CLAIMS: tuple[Claim | InTests | NotShown, ...] = (
     ),
     InTests(
         *(PAPER, "The same seed gives the same bytes", "one machine", "running.md"),
-        "tests/test_run.py::test_the_same_seed_gives_the_same_bytes_and_another_does_not",
+        "tests/test_run.py::test_files_are_reproducible_for_a_seed",
     ),
     # The load
     InTests(

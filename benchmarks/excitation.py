@@ -26,9 +26,8 @@ from scipy.optimize import minimize
 
 from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion
-from drake_teleop.lab.excitation.design import MARGIN, design
 from drake_teleop.lab.excitation.excite import best_checked, criteria_of, excite, sensor_motion
-from drake_teleop.lab.excitation.problem import Problem, Task
+from drake_teleop.lab.excitation.optimizer import MARGIN, Problem, Task, design
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inertia
 from drake_teleop.load.normal_equations import identify

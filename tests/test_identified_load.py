@@ -1,4 +1,4 @@
-"""Identified loads that are kept: the same bits, never stale, and no harm from damaged files."""
+"""Cache of identified loads: same bits, never stale, robust to damaged files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
-# Numbers that no short decimal stands for, of a load that is about the tool.
+# A load near the tool, with numbers without short decimals.
 RNG = np.random.default_rng(1)
 COVARIANCE = np.diag(RNG.uniform(1e-9, 1e-7, 16))
 COVARIANCE[9, 9] = np.inf
@@ -42,7 +42,7 @@ DETECTS = replace(Scenario(), contact_detection=ContactDetectionConfig())
 
 @pytest.fixture
 def identifications(monkeypatch, tmp_path):
-    """The list of the scenarios that were identified; nothing is simulated for it."""
+    """Return the list of identified scenarios; no simulation runs."""
     asked = []
 
     def identify(scenario, stage):
@@ -55,7 +55,7 @@ def identifications(monkeypatch, tmp_path):
 
 
 def same_bits(a, b) -> bool:
-    """Whether two dataclasses have the same types and bytes throughout."""
+    """Return whether two dataclasses have equal types and bytes."""
     return type(a) is type(b) and all(
         type(x) is type(y) and np.asarray(x).dtype == np.asarray(y).dtype
         and np.asarray(x).tobytes() == np.asarray(y).tobytes()
@@ -65,7 +65,7 @@ def same_bits(a, b) -> bool:
     )  # fmt: skip
 
 
-def test_what_was_identified_comes_back_bit_by_bit(identifications):
+def test_cached_load_is_bit_equal(identifications):
     first, again = identified_load(DETECTS), identified_load(DETECTS)
     assert (first.from_cache, again.from_cache, len(identifications)) == (False, True, 1)
     assert same_bits(again.identification, FOUND)
@@ -73,7 +73,7 @@ def test_what_was_identified_comes_back_bit_by_bit(identifications):
     assert again.estimate.tobytes() == np.concatenate([FOUND.offsets, FOUND.phi]).tobytes()
 
 
-def test_fresh_identifies_anew_and_keeps_that(identifications):
+def test_fresh_replaces_the_cached_load(identifications):
     for fresh in (False, True, False):
         identified_load(Scenario(), fresh=fresh)
     assert len(identifications) == 2
@@ -94,33 +94,33 @@ def test_fresh_identifies_anew_and_keeps_that(identifications):
     ],
     ids=lambda change: next(iter(change)),
 )  # fmt: skip
-def test_whatever_it_depends_on_makes_another(identifications, change):
+def test_each_relevant_input_changes_the_cache_key(identifications, change):
     identified_load(Scenario())
     identified_load(replace(Scenario(), **change))
     assert len(identifications) == 2
 
 
-def test_what_it_does_not_depend_on_makes_no_other(identifications):
+def test_irrelevant_inputs_do_not_change_the_cache_key(identifications):
     identified_load(Scenario())
     assert identified_load(
         replace(Scenario(), operator__grip="firm", force_scaling__sigma=0.5, description="x")
     ).from_cache
 
 
-def test_an_edit_of_sources_or_models_makes_another(identifications, tmp_path, monkeypatch):
+def test_edited_sources_or_models_change_the_cache_key(identifications, tmp_path, monkeypatch):
     package, models = tmp_path / "package", tmp_path / "models"
     for folder, name in ((package / "room", "a.py"), (models, "tool.sdf")):
         folder.mkdir(parents=True)
         (folder / name).write_text("x = 1")
-    hashes = [module._sources(package, models)]
+    hashes = [module._hash_sources(package, models)]
     for path in (package / "room/a.py", models / "tool.sdf"):
         path.write_text("x = 2")
-        hashes.append(module._sources(package, models))
+        hashes.append(module._hash_sources(package, models))
     (package / "room/a.py").rename(package / "room/b.py")
-    hashes.append(module._sources(package, models))
+    hashes.append(module._hash_sources(package, models))
     assert len(set(hashes)) == 4
     for each in hashes:
-        monkeypatch.setattr(module, "_SOURCES", each)
+        monkeypatch.setattr(module, "_SOURCES_HASH", each)
         identified_load(Scenario())
     assert len(identifications) == 4
 
@@ -156,7 +156,7 @@ def test_a_pickled_object_is_not_read(identifications, tmp_path):
     assert not identified_load(Scenario()).from_cache
 
 
-def test_a_write_that_fails_leaves_nothing_and_is_no_error(identifications, tmp_path, monkeypatch):
+def test_failed_write_leaves_no_file_and_is_no_error(identifications, tmp_path, monkeypatch):
     identified_load(Scenario())
     (path,) = (tmp_path / "cache").iterdir()
 
@@ -167,13 +167,13 @@ def test_a_write_that_fails_leaves_nothing_and_is_no_error(identifications, tmp_
     monkeypatch.setattr(np, "savez", full)
     assert not identified_load(Scenario(), fresh=True).from_cache
     assert list((tmp_path / "cache").iterdir()) == [path]
-    assert identified_load(Scenario()).from_cache  # who reads meanwhile finds the whole of the old
-    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file, where the folder should be
+    assert identified_load(Scenario()).from_cache  # concurrent readers get the complete old file
+    monkeypatch.setenv(CACHE_VARIABLE, str(path))  # a file instead of a folder
     assert not identified_load(Scenario()).from_cache
 
 
-def test_the_oldest_are_removed(identifications, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "LARGEST_NUMBER", 2)
+def test_oldest_files_are_removed(identifications, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_FILES", 2)
     for seed in range(3):
         identified_load(replace(Scenario(), simulation__seed=seed))
         for path in (tmp_path / "cache").iterdir():
@@ -183,23 +183,21 @@ def test_the_oldest_are_removed(identifications, tmp_path, monkeypatch):
     assert not identified_load(replace(Scenario(), simulation__seed=0)).from_cache
 
 
-def test_the_tests_do_not_touch_the_users_cache():
+def test_tests_do_not_use_the_users_cache():
     from platformdirs import user_cache_path
 
     assert module.cache_folder() != user_cache_path("drake_teleop", appauthor=False)
 
 
 @pytest.mark.slow
-def test_a_run_says_which_load_it_used_and_is_the_same_with_either(
-    identifications, tmp_path, capsys
-):
+def test_run_reports_its_load_source_and_does_not_depend_on_it(identifications, tmp_path, capsys):
     path = tmp_path / "short.yaml"
     path.write_text("simulation: {duration: 0.02, settle: 0.0}")
     first = run_scenario(LoadScenario(path))
     assert first.load_source == "identified before the run"
     summary = run_command(path, tmp_path / "out")
     assert summary["load_source"] == "cache"
-    assert "load: cache; --fresh identifies it anew" in capsys.readouterr().out
+    assert "load: cache; --fresh repeats the identification" in capsys.readouterr().out
     for name, write in (
         ("log.parquet/row_0000000000.parquet", first.result.write_parquet),
         ("identification.json", first.identification.save),

@@ -1,4 +1,4 @@
-"""`drake-teleop new`: what it writes is a station that works, for an arm of one's own."""
+"""`drake-teleop new`: working stations for custom arms."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARM = models_dir() / "rx90.sdf"
 
 @pytest.fixture
 def runs(monkeypatch):
-    """What would have been run."""
+    """Record run commands instead of running them."""
     calls = []
 
     def run(scenario, out, **options):
@@ -42,7 +42,7 @@ def runs(monkeypatch):
     return calls
 
 
-def test_a_station_is_written_and_run(tmp_path, runs, capsys):
+def test_station_is_written_and_run(tmp_path, runs, capsys):
     new_command(tmp_path / "mine", ARM, "sensor", device="omega_6", sensor="ati_gamma_imu")
     path = tmp_path / "mine" / "station.yaml"
     assert runs == [(path, tmp_path / "mine" / "first_run", {"quiet": False})]
@@ -52,21 +52,21 @@ def test_a_station_is_written_and_run(tmp_path, runs, capsys):
     assert "6: joint_1" in capsys.readouterr().out
     plan = plan_station(ARM, "sensor", device="omega_6")
     scale = scenario.kinematic_scaling.translation_scale
-    # The device's workspace is within what the arm reaches, and the hand's way within the device's.
+    # The scaled device workspace is reachable, and the hand stays inside the device workspace.
     assert 0.055 * scale <= plan.place.half
     way = 1.5 * plan.swing + 0.01
     assert way / scale <= 0.113 / 2
-    # From the tool's lowest point down onto the wall, and no further than a centimetre into it.
+    # From the tool's lowest point onto the wall, at most 1 cm deep.
     tip = NominalSlave(scenario.slave).start_tip
     wall = scenario.environment[0].position[2]
     assert wall == pytest.approx(tip[2] - 1.5 * plan.swing, abs=1e-3)
     into = -scenario.operator.intent[1].translation[2] * scale - (tip[2] - wall)
     assert 0.0 < into <= 0.0101
-    with pytest.raises(DrakeTeleopError, match="is there already"):
+    with pytest.raises(DrakeTeleopError, match="already exists"):
         new_command(tmp_path / "mine", ARM, "sensor")
 
 
-def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatch):
+def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch):
     (tmp_path / "models").symlink_to(ARM.parent)
     monkeypatch.chdir(tmp_path)
     type_in("docs/start.md", ".venv/bin/drake-teleop new")
@@ -74,7 +74,7 @@ def test_it_is_written_as_the_page_for_beginners_says(tmp_path, runs, monkeypatc
     assert runs == [(Path("out/mine/station.yaml"), Path("out/mine/first_run"), {"quiet": False})]
 
 
-def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
+def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
     place, half = find_place(arm).position, find_place(arm).half
     assert place[0] > abs(place[1]) and place[2] > 0.1
@@ -84,13 +84,15 @@ def test_the_place_is_in_front_and_the_arm_goes_to_all_sides():
         pose = np.array([*w, *(place + half * np.array(signs))])
         assert find_posture(arm, pose, q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
-    with pytest.raises(DrakeTeleopError, match="nowhere can the arm hold its sensor"):
+    with pytest.raises(
+        DrakeTeleopError, match="no place found where the arm can hold z_S downwards"
+    ):
         find_place(stiff)
 
 
 @pytest.mark.parametrize("device", ["phantom_premium_15", "geomagic_touch", "omega_6", "falcon"])
-def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device):
-    """So that `analyze`, which cuts the loops at their common instants, takes the station."""
+def test_rates_match_the_device(tmp_path, runs, device):
+    """`analyze` requires common sampling instants."""
     new_command(tmp_path / "mine", ARM, "sensor", device=device)
     scenario = LoadScenario(tmp_path / "mine" / "station.yaml")
     assert scenario.master.own_period(scenario.rates.hand_hz) is None
@@ -98,7 +100,7 @@ def test_hand_and_joints_have_a_rate_that_the_device_has(tmp_path, runs, device)
     linearize(scenario.without_environment(), load_estimate=true_load(scenario))
 
 
-def test_a_small_cube_is_better_than_a_joint_at_its_limit():
+def test_joint_margin_counts_more_than_cube_size():
     place = new_station.Place(np.zeros(7), True, np.zeros(6), half=0.05, room=0.2)
     worse = [
         place._replace(half=0.3, room=0.01),
@@ -110,7 +112,7 @@ def test_a_small_cube_is_better_than_a_joint_at_its_limit():
 
 
 def turned(rpy, tmp_path):
-    """The RX90 with a frame on its sensor that is turned."""
+    """Write the RX90 with a rotated frame on its sensor."""
     text = ARM.read_text()
     frame = f'<frame name="turned" attached_to="sensor"><pose>0 0 0 {rpy}</pose></frame>'
     path = tmp_path / "turned.sdf"
@@ -118,24 +120,22 @@ def turned(rpy, tmp_path):
     return path
 
 
-def test_another_axis_than_z_along_the_last_joint_is_said(tmp_path, runs, capsys):
+def test_note_about_another_axis_along_the_last_joint(tmp_path, runs, capsys):
     for rpy, axis, back in (("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")):
         plan = plan_station(turned(rpy, tmp_path), "turned")
-        assert f"{axis}_S is along" in plan.about_z and f'rpy="{back}"' in plan.about_z
+        assert f"{axis}_S is along" in plan.axis_note and f'rpy="{back}"' in plan.axis_note
     new_command(tmp_path / "mine", turned("3.1416 0 0", tmp_path), "turned")
-    assert "note: z_S points to the tool, and here -z_S" in " ".join(
-        capsys.readouterr().out.split()
-    )
-    assert plan_station(ARM, "sensor").about_z == ""
-    behind = tmp_path / "behind.sdf"  # the last joint's origin
+    assert "note: z_S must point to the tool, but -z_S" in " ".join(capsys.readouterr().out.split())
+    assert plan_station(ARM, "sensor").axis_note == ""
+    behind = tmp_path / "behind.sdf"  # origin of the last joint
     behind.write_text(
         turned("0 0 0", tmp_path).read_text().replace("<pose>0 0 0 ", "<pose>0 0 -0.4 ")
     )
-    assert "-z_S is along" in plan_station(behind, "turned").about_z
+    assert "-z_S is along" in plan_station(behind, "turned").axis_note
 
 
-def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, runs):
-    """Its last joint cannot bring x_S forwards, but to a side."""
+def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
+    """Its last joint cannot turn x_S forward."""
     text = ARM.read_text()
     joint = text.index('name="joint_6"')
     lower, upper = (text.index(f"<{tag}>", joint) for tag in ("lower", "upper"))
@@ -154,8 +154,8 @@ def test_an_arm_that_turns_the_tool_elsewhere_gets_its_joints_written(tmp_path, 
     assert R_WS[2, 2] < -0.999 and abs(R_WS[1, 0]) > 0.999
 
 
-def test_an_arm_of_five_joints_starts_with_its_tool_about_down(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(new_station, "_HALVES", (2.0, *new_station._HALVES))
+def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_CUBE_HALVES_M", (2.0, *new_station._CUBE_HALVES_M))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     new_command(tmp_path / "mine", path, "sensor")
@@ -186,8 +186,8 @@ def odd_names(count: int) -> list[str]:
     return [*PIECES, *drawn][:count]
 
 
-def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, runs, monkeypatch):
-    """As the name of the arm's file or folder, of packages, the tool, the sensor's frame."""
+def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
+    """Names of the arm's file and folder, packages, tool, sensor frame."""
     plan = plan_station(ARM, "sensor")
     monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
     equal = 0
@@ -212,19 +212,21 @@ def test_of_400_names_each_is_read_as_it_was_given_or_nothing_is_left(tmp_path, 
 
 
 @pytest.mark.parametrize("name", ["arm.sdf #2", "arm: v2", "*arm", "a\nb", "010", "%41", "\udcff"])
-def test_a_station_of_an_odd_name_is_that_of_this_arm(name, tmp_path, runs):
+def test_station_with_an_odd_name_refers_to_its_arm(name, tmp_path, runs):
     path, text = tmp_path / f"{name}.sdf", ARM.read_text()
     path.write_text(text.replace("</model>", '<frame name="1e-3" attached_to="sensor"/></model>'))
-    (tmp_path / "arm.sdf").write_text(text.replace("<mass>", "<mass>1"))  # another one beside it
+    (tmp_path / "arm.sdf").write_text(
+        text.replace("<mass>", "<mass>1")
+    )  # a different arm beside it
     new_command(tmp_path / "mine", path, "1e-3", quiet=True)
     slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
     assert (slave.path, slave.sensor_frame) == (path, "1e-3")
     assert NominalSlave(slave).arm.num_joints == 6
 
 
-def test_what_is_read_as_another_station_leaves_nothing(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(new_station, "_from", lambda folder, path: "tool.sdf")
-    with pytest.raises(DrakeTeleopError, match="is read as another station"):
+def test_misread_station_leaves_no_files(tmp_path, runs, monkeypatch):
+    monkeypatch.setattr(new_station, "_relative_path", lambda folder, path: "tool.sdf")
+    with pytest.raises(DrakeTeleopError, match="does not describe the given models"):
         new_command(tmp_path / "a" / "mine", ARM, "sensor")
     assert list(tmp_path.iterdir()) == [] and runs == []
 
@@ -232,13 +234,16 @@ def test_what_is_read_as_another_station_leaves_nothing(tmp_path, runs, monkeypa
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"device": "omega_5"}, r"--device: 'omega_5' is none.*omega_6"),
-        ({"device": "leader"}, r"--device: .leader. is none.*; one of phantom.*master.leader"),
-        ({"sensor": "ati"}, r"--sensor: 'ati' is none.*ati_gamma"),
+        ({"device": "omega_5"}, r"--device: there is no device 'omega_5'.*omega_6"),
+        (
+            {"device": "leader"},
+            r"--device: there is no device .leader.*; choose one of phantom.*master.leader",
+        ),
+        ({"sensor": "ati"}, r"--sensor: there is no sensor 'ati'.*ati_gamma"),
         ({"frame": "wrist"}, "wrist"),
     ],
 )
-def test_what_is_not_known_is_one_line_and_nothing_is_written(options, says, tmp_path, runs):
+def test_unknown_name_is_one_line_and_writes_no_files(options, says, tmp_path, runs):
     frame = options.pop("frame", "sensor")
     with pytest.raises(DrakeTeleopError, match=says):
         new_command(tmp_path / "mine", ARM, frame, **options)

@@ -1,4 +1,4 @@
-"""`drake-teleop run`: what it writes, that it warns, and that it is the same every time."""
+"""`drake-teleop run`: files, warnings, reproducibility."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.signals import SIGNALS
 
-# Learns while it moves, so that no identification comes first.
+# The estimator runs in the loop, so no identification is needed.
 QUICK = """
 simulation: {duration: 0.15, settle: 0.05, seed: 4}
 load_estimator: {enabled: true}
@@ -35,7 +35,7 @@ operator:
 
 @pytest.fixture(scope="module")
 def typed(tmp_path_factory):
-    """Where what the README and the page for beginners show of `run` has been typed."""
+    """Run the commands of README and beginners' page; return their output folder."""
     folder = tmp_path_factory.mktemp("typed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
@@ -61,7 +61,7 @@ def identification(tmp_path_factory):
 
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
-    """Runs QUICK, with further lines, into a new folder, without its picture: that takes longer."""
+    """Return a function that runs QUICK with further lines, without its picture."""
     monkeypatch.setattr("drake_teleop.lab.run.overview", lambda result: Figure())
 
     def run(name: str, more: str = "", seed: int | None = None, quiet: bool = True):
@@ -73,7 +73,7 @@ def quick(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_contact_is_run_with_an_identified_load(contact):
+def test_contact_scenario_uses_an_identified_load(contact):
     summary, out = contact
     assert summary["warnings"] == []
     assert summary["mass_error_percent"] < 0.2
@@ -105,7 +105,7 @@ def test_everything_is_written(contact):
 
 
 @pytest.mark.slow
-def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
+def test_written_scenario_is_the_one_that_was_run(typed):
     contact, mine = (
         sorted((typed / name / "log.parquet").iterdir()) for name in ("contact", "mine")
     )
@@ -113,15 +113,15 @@ def test_the_scenario_that_is_printed_is_the_one_that_was_run(typed):
 
 
 @pytest.mark.slow
-def test_the_peg_is_put_into_the_slot(typed):
-    """With everything as it is shipped; `tests/operator/test_task.py` has what goes otherwise."""
+def test_peg_task_succeeds(typed):
+    """The shipped scenario; other outcomes: `tests/operator/test_task.py`."""
     summary = summary_of(typed / "insert")
     assert summary["success"] == 1 and summary["false_notices"] == 0
 
 
 @pytest.mark.slow
-def test_the_shipped_identification_is_the_identification(identification):
-    """Its sensor log gives the same load to the tools for recorded logs."""
+def test_shipped_identification_matches_the_log_tools(identification):
+    """Its sensor log gives the same load with the log tools."""
     summary, out = identification
     assert summary["duration_s"] == 6.0
     assert (out / "replay.html").exists()
@@ -130,12 +130,12 @@ def test_the_shipped_identification_is_the_identification(identification):
     again = identify_log(out / "sensor_log.parquet", cutoff_hz=None, delay=0.0).identification
     found = np.concatenate([load.offsets, load.phi])
     from_log = np.concatenate([again.offsets, again.phi])
-    # One weights the channels by their noise, the other does not know it.
+    # Only one estimator weights the channels by their noise.
     assert np.all(np.abs(found - from_log) < 5 * again.standard_deviations)
 
 
 @pytest.mark.slow
-def test_the_load_is_known_as_well_as_it_says(identification):
+def test_load_errors_match_their_stated_deviations(identification):
     _, out = identification
     load = Identification.load(out / "identification.json")
     scenario = LoadScenario("identification")
@@ -149,12 +149,12 @@ def test_the_load_is_known_as_well_as_it_says(identification):
     assert np.all(error < [0.1, 0.1, 0.1, 0.005, 0.005, 0.005])
     low, high = intervals(load)
     truth = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
-    # Of 16 intervals of 95 % four or more miss once in a hundred times.
+    # With 16 intervals of 95 %, four or more misses have a probability of 1 %.
     assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
+def test_files_are_reproducible_for_a_seed(quick):
     _, first = quick("first")
     _, again = quick("again")
     summary, other = quick("other", seed=5)
@@ -168,7 +168,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(quick):
 
 
 @pytest.mark.slow
-def test_a_scenario_that_learns_needs_no_identification_before(quick):
+def test_enabled_load_estimator_needs_no_identification(quick):
     summary, out = quick("learning")
     assert not (out / "identification.json").exists()
     assert summary["seed"] == 4
@@ -176,7 +176,7 @@ def test_a_scenario_that_learns_needs_no_identification_before(quick):
 
 
 @pytest.mark.slow
-def test_saturation_and_why_a_task_failed_are_said_in_the_table_too(quick, capsys):
+def test_table_contains_saturation_and_reason_of_failure(quick, capsys):
     more = "  task: !Reach {t_start: 0.1}\nwrist_sensor: {force_range: [100, 100, 31]}"
     summary, _ = quick("saturated", more, quiet=False)
     assert summary["success"] == 0.0
@@ -217,7 +217,7 @@ def test_bounces_belong_to_one_contact():
 
 
 @pytest.mark.slow
-def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, capsys):
+def test_detector_notices_contact_before_the_operator(tmp_path, capsys):
     text = (scenarios_dir() / "touch.yaml").read_text()
     path = tmp_path / "touch.yaml"
     path.write_text(text + "contact_detection: {}\n")
@@ -234,7 +234,7 @@ def test_a_touch_is_noticed_by_the_detector_and_then_by_the_operator(tmp_path, c
     assert "task_time_s" in printed
 
 
-def test_where_nothing_was_touched_there_is_no_time_of_notice():
+def test_detection_delay_is_empty_without_contact():
     noticed = np.array([0.0, 1.0, 1.0, 0.0])
     signals = {"contact": noticed, "contact_at_hand": noticed}
     specs = [SIGNALS[name] for name in signals]

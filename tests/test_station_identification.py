@@ -1,4 +1,4 @@
-"""What the identification of a station's load makes of the scenario's sensor."""
+"""Identification of a station's load with the scenario's sensor."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from drake_teleop.station.slave.slave_config import Slave
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])
-def test_how_far_the_offsets_have_wandered_does_not_depend_on_the_rate(rate_hz):
-    """Of a walk K sqrt(t) the mean over a record T is K sqrt(T / 3) off its start (Wiener)."""
+def test_offset_drift_does_not_depend_on_the_rate(rate_hz):
+    """The mean of a walk K sqrt(t) over T is K sqrt(T / 3) from its start (Wiener)."""
     duration = 10.0
     sensor = WristSensorConfig(
         force_noise=0.1, torque_noise=0.005, force_walk=0.5, torque_walk=0.03,
@@ -33,11 +33,11 @@ def test_how_far_the_offsets_have_wandered_does_not_depend_on_the_rate(rate_hz):
     wrench = non_contact_wrench(*motion, slave_arm(scenario).phi_load)
     found = batch_identification(scenario, wrench, *motion, rate_hz)
     expected = np.repeat([0.5, 0.03], 3) * np.sqrt(duration / 3)
-    # The load takes up a little of it.
+    # The load absorbs a small part.
     np.testing.assert_allclose(found.standard_deviations[:6], expected, rtol=0.05)
 
 
-def test_a_motion_is_designed_once_for_all_seeds_and_anew_for_another_sensor(monkeypatch):
+def test_motion_is_designed_once_for_all_seeds_and_again_for_another_sensor(monkeypatch):
     designs = []
 
     def excite(robot, *, period, **_):
@@ -45,15 +45,15 @@ def test_a_motion_is_designed_once_for_all_seeds_and_anew_for_another_sensor(mon
         found = FourierTrajectory(np.zeros(6), *np.full((2, 6, 3), len(designs)), 1 / period)
         return SimpleNamespace(trajectory=found)
 
-    monkeypatch.setattr(identification, "_DESIGNS", {})
+    monkeypatch.setattr(identification, "_DESIGN_CACHE", {})
     monkeypatch.setattr(identification, "excite", excite)
     monkeypatch.setattr(identification, "RobotFromScenario", lambda scenario: None)
     monkeypatch.setattr(identification, "criteria_of", lambda *_: {"kappa_w10": 4.0})
 
     def designed(**changes) -> float:
         scenario = replace(LoadScenario("identification"), **changes)
-        trajectory, _ = identification._designed(scenario, lambda _: None)
-        trajectory.rho[1:] = 99.0  # who has one may change it
+        trajectory, _ = identification._design_trajectory(scenario, lambda _: None)
+        trajectory.rho[1:] = 99.0  # callers may change their copy
         return trajectory.rho[0, 0]
 
     assert designed() == designed(simulation__seed=3) == designed(rates__log_hz=500.0) == 1.0

@@ -1,22 +1,14 @@
-"""`drake-teleop excite`: an excitation trajectory for the station's slave, or for any other arm.
-
-Writes into the folder
+"""`drake-teleop excite`: an excitation trajectory for the station's slave or another arm.
 
 =================== ============================================================================
 trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
-excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
-excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
-excitation.html     the motion as a film in 3D, to be watched before a robot runs it
-session.json        design_s, the optimiser's CPU time [s]
-summary.json        the figures; it and all above but session.json are the same bytes every time
+excitation.yaml     coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
+excitation.png      joint angles, wrench and sensor range, criterion during the search
+excitation.html     3D replay, for inspection before a robot runs the motion
+session.json        design_s, CPU time of the optimiser [s]; the only file that is not reproducible
+summary.json        criteria, checked use of limits, predicted standard deviations, assumptions;
+                    with `until` the tolerance and the share of it `reached`
 =================== ============================================================================
-
-`summary.json` holds the criterion that was minimised and the value of every criterion (what each
-is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
-standard deviation of each parameter of the heaviest load after one period, from the noise of the
-sensor (`excitation/prediction.py`), and what was assumed. With `until` also that, and how much of
-each tolerance is `reached` in the share `reliable` of the records.
-Nothing is written if no trajectory respects all limits.
 """
 
 from __future__ import annotations
@@ -50,7 +42,7 @@ from drake_teleop.station.scenario import LoadScenario
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: What each printed criterion is.
+#: Meaning of each printed criterion.
 WORDS = {
     "kappa_w10": "condition number, ten columns, rows whitened, columns scaled by L = {L:.3g} m",
     "kappa10": "condition number, ten columns, plain V in SI units",
@@ -81,32 +73,27 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Designs, checks and writes an excitation trajectory; see the top of this module.
+    """Design, check and write an excitation trajectory.
 
     Args:
-        scenario: its slave moves, and its wrist sensor measures.
-        out: the folder.
-        model: another arm that moves instead, with the scenario's sensor; and then
-        sensor_frame: the frame or link at which it measures, needed with `model`.
+        scenario: with slave and wrist sensor.
+        model: another arm, with the scenario's sensor.
+        sensor_frame: required with `model`.
+        until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
         package_paths, acceleration, payload: see `RobotFromModel`.
-        until: a tolerance, see `read_tolerance`: then the shortest motion that reaches it, see
-            `shortest`, whatever criterion, period and seconds are.
-        criterion, period, harmonics, seconds, seed: see `excite`; by default 5 harmonics, 3 with
-            `until`.
-        quiet: no progress bars and no tables.
-        progress: False for no progress bars alone.
+        criterion, period, harmonics, seconds, seed: see `excite`.
 
     Returns:
-        The summary, and what is in session.json.
+        The summary and the content of session.json.
 
     Raises:
-        DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
+        DrakeTeleopError: if the input is unusable or no trajectory respects all limits.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
-        opened = stage("Read the robot")
+        read = stage("Read the robot")
         if model is None:
             _refuse(sensor_frame, package_paths, acceleration, payload)
             robot = RobotFromScenario(setup)
@@ -127,7 +114,7 @@ def excite_command(
                 acceleration=acceleration,
                 payload=payload,
             )
-        opened(1.0)
+        read(1.0)
         reached = {}
         if tolerance is None:
             found = excite(
@@ -140,15 +127,15 @@ def excite_command(
                 progress=stage,
             )
         else:
-            told = stage("Shorten the motion")
+            report = stage("Shorten the motion")
             result = shortest(
                 robot,
                 tolerance,
                 harmonics=3 if harmonics is None else harmonics,
                 seed=seed,
-                progress=lambda done, best: told(done, f"{best:.3g} s" if best < np.inf else ""),
+                progress=lambda done, best: report(done, f"{best:.3g} s" if best < np.inf else ""),
             )
-            told(1.0)
+            report(1.0)
             found = result.excitation
             shares = dict(zip(tolerance.entries, result.reached.tolist(), strict=True))
             reached = {"until": str(tolerance), "reached": shares, "reliable": RELIABLE}
@@ -174,7 +161,7 @@ def _refuse(*options: object) -> None:
 
 
 def summarise(found: Excitation) -> dict[str, Any]:
-    """The figures of summary.json."""
+    """Return the values of summary.json."""
     robot, trajectory = found.robot, found.trajectory
     names = (*_OFFSETS, *_PHI)
     return {
@@ -202,7 +189,7 @@ def _words(name: str, robot: Robot) -> str:
 
 
 def table(found: Excitation) -> pl.DataFrame:
-    """One period at 1 kHz, both ends included."""
+    """Return one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}
@@ -214,7 +201,7 @@ def table(found: Excitation) -> pl.DataFrame:
 
 
 def draw(found: Excitation) -> Figure:
-    """Joint angles, wrench of the heaviest load against the limit, the criterion's fall."""
+    """Draw joint angles, wrench of the heaviest load with its limit, and the criterion."""
     with house_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
@@ -222,7 +209,7 @@ def draw(found: Excitation) -> Figure:
         _draw_wrench(forces, torques, found)
         progress.step(*found.history.T, where="post", color=BLUE)
         progress.set(
-            title=f"{found.criterion} on the way to {found.values[found.criterion]:.4g}",
+            title=f"{found.criterion} down to {found.values[found.criterion]:.4g}",
             xlabel="evaluations",
             yscale="log",
         )

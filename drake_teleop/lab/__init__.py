@@ -1,1 +1,1 @@
-"""Work with a station: run it, identify its load, excite, analyse, compare, reproduce, study."""
+"""Experiments with a station."""

@@ -1,7 +1,4 @@
-"""The identification of section IV: the slave runs an excitation trajectory, the estimator learns.
-
-Nothing of the plant's truth is used: what is known comes from the wrist sensor's samples.
-"""
+"""Identification of the load in simulation from wrist sensor samples alone (paper, section IV)."""
 
 from __future__ import annotations
 
@@ -13,10 +10,9 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.arrays import learnt
+from drake_teleop.common.arrays import Array, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Progress, Stage, show_progress
@@ -45,26 +41,20 @@ from drake_teleop.station.slave.arm import ArmModel, accelerations
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeIdentificationStation
 
-Array = NDArray[np.float64]
-
-# The trajectory belongs to the arm, not to the run's seed.
+# The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0
-#: By all that a design depends on: the trajectory and its kappa; half of the time of a first run.
-_DESIGNS: dict[str, tuple[FourierTrajectory, float]] = {}
+#: Trajectory and its kappa_w10 by a hash of all inputs of the design.
+_DESIGN_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LoadIdentification:
-    """What an identification run gives.
+    """Result of an identification run.
 
     Attributes:
-        trajectory: the joint trajectory that was run.
-        result: the recorded signals.
-        estimate: (16,) Eq. (7), [offsets; phi] of the recursive estimator in the loop at the end.
-        batch: the same record by batch total least squares, see `batch_identification`.
-        kappa_w10: condition number of the motion, see `excitation/criteria.py`.
-        real_time_factor: of the simulation.
-        method: of the recursive estimator, one of `load.identification.METHODS`.
+        estimate: (16,) Eq. (7), [offsets; phi], final estimate of the recursive estimator.
+        batch: batch total least squares on the same record.
+        real_time_factor: simulated over elapsed time.
     """
 
     trajectory: FourierTrajectory
@@ -80,21 +70,13 @@ class LoadIdentification:
 
     @property
     def identification(self) -> Identification:
-        """The recursive estimate, with the batch's uncertainties and residuals.
-
-        The batch judges its uncertainty from the residuals, the recursive estimator from what the
-        noise is said to be.
-        """
+        """Recursive estimate with uncertainties and residuals of the batch."""
         return dataclasses.replace(
             self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """How large the wrench is that the estimate leaves in this free motion, for detection.
-
-        Args:
-            arm: the slave's, for its kinematics.
-        """
+        """Fit the noise floor in this free motion."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -105,27 +87,27 @@ class LoadIdentification:
 
     @property
     def recursive_against_batch(self) -> float:
-        """Largest difference of the two estimates, in standard deviations."""
+        """Largest difference of both estimates, in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
 
 
 def slave_arm(scenario: Scenario) -> ArmModel:
-    """The arm of a scenario's slave, with tool and payload as its load."""
+    """Return the arm of the slave with tool and payload as its load."""
     check_scenario(scenario)
     return NominalSlave(scenario.slave).arm
 
 
 def true_load(scenario: Scenario) -> Array:
-    """(16,) Eq. (7) as the simulation has it, for comparisons: no offsets; tool and payload."""
+    """Return (16,) the true [offsets; phi], with zero offsets."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
-    """The shipped scenario "identification" with the slave and the sensor of another scenario.
+    """Return the shipped scenario "identification" with slave and sensor of `scenario`.
 
-    If contact is to be detected, it is logged at the rate at which that is done: the noise floor
-    tells how alike samples are that follow each other.
+    With contact detection it logs at the estimator rate, because the noise floor includes the
+    correlation of consecutive samples.
     """
     check_scenario(scenario)
     rates = scenario.rates
@@ -149,24 +131,20 @@ def identify_load(
     trajectory: FourierTrajectory | None = None,
     log: Path | None = None,
 ) -> LoadIdentification:
-    """Runs an excitation trajectory, and identifies.
+    """Run an excitation trajectory and identify the load.
 
     Args:
-        scenario: whose load estimator learns: the shipped "identification", or that with the slave
-            and the sensor of another one (`identification_scenario`).
-        progress: whether bars are shown, or where: see `pages/progress.py`.
-        trajectory: to run, of the scenario's duration; if there is none, one is designed, once in
-            each process for all seeds.
-        log: as `simulate` has it.
+        progress: True shows progress bars; a `Stage` receives the progress.
+        trajectory: of the scenario's duration; None: designed once for each process.
+        log: log folder, see `simulate`.
 
     Raises:
-        DrakeTeleopError: if the load estimator does not learn, no trajectory respects the limits
-            of arm and sensor, or the one that was given does not, or has another duration.
+        DrakeTeleopError: if the load estimator is off, or a trajectory violates limits or duration.
     """
     check_scenario(scenario)
     if not scenario.load_estimator.enabled:
         raise DrakeTeleopError(
-            "the load estimator is off, so the load would not be learnt",
+            "the load estimator is off, so it cannot identify the load",
             where="scenario:load_estimator.enabled",
             remedy="call identified_load(scenario) of drake_teleop.lab.identified_load, or pass "
             'LoadScenario("identification")',
@@ -176,13 +154,13 @@ def identify_load(
     simulation = scenario.simulation
     with show_progress(progress) as stage:
         if trajectory is None:
-            trajectory, kappa = _designed(scenario, stage)
+            trajectory, kappa = _design_trajectory(scenario, stage)
         else:
             robot = RobotFromScenario(scenario)
-            _check_given(robot, trajectory, simulation.duration)
+            _check_trajectory(robot, trajectory, simulation.duration)
             kappa = criteria_of(robot, trajectory)["kappa_w10"]
         station = MakeIdentificationStation(scenario, trajectory)
-        result, factor = timed(station, simulation, stage("Identify the load"), log)
+        result, factor = simulate_with_timing(station, simulation, stage("Identify the load"), log)
     usable = result["saturated"][:, 0] == 0
     wrench, s, omega, alpha = (signal[usable] for signal in sensor_samples(result))
     with one_blas_thread():
@@ -196,22 +174,17 @@ def identify_load(
 def batch_identification(
     scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
 ) -> Identification:
-    """The load and the offsets by total least squares, with the noise of the scenario's sensor.
-
-    White noise of wrench and motion as its data sheet has it, and its random walks: the offsets are
-    those at the start of the record.
+    """Identify load and offsets (at the start of the record) by total least squares.
 
     Args:
-        scenario: with the sensor and the estimation of its motion.
-        wrench, s, omega, alpha: (N, 6), (N, 3) samples, as for `identify`.
-        rate_hz: of these samples.
+        wrench, s, omega, alpha: (N, 6), (N, 3) samples at `rate_hz`.
     """
     sensor, rates = scenario.wrist_sensor, scenario.rates
     motion = estimated_motion_std(
         scenario.motion_estimation, sensor, slave_arm(scenario).num_joints, 1 / rates.sensor_hz
     )
     walk = sensor.random_walk()
-    if scenario.motion_estimation.source != "accelerometer":  # the encoders do not wander
+    if scenario.motion_estimation.source != "accelerometer":  # encoders have no random walk
         walk[6:] = 0.0
     noise = Noise(
         wrench=sensor.wrench_std(),
@@ -224,22 +197,18 @@ def batch_identification(
     return found.identification
 
 
-def _designed(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
-    """The trajectory of a scenario and its kappa, a copy; designed once for all seeds.
-
-    And for all rates of the log: where contact is detected, it has more rows.
-    """
-    same = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
+def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTrajectory, float]:
+    design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]
-    key = sha256(repr((dataclasses.asdict(same), models)).encode()).hexdigest()
-    if key not in _DESIGNS or scenario.environment:  # which may be in files, and they may change
+    key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
+    if key not in _DESIGN_CACHE or scenario.environment:  # its files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
-        _DESIGNS[key] = found, criteria_of(robot, found)["kappa_w10"]
-    return copy.deepcopy(_DESIGNS[key])
+        _DESIGN_CACHE[key] = found, criteria_of(robot, found)["kappa_w10"]
+    return copy.deepcopy(_DESIGN_CACHE[key])
 
 
-def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
+def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: float) -> None:
     if len(trajectory.q0) != robot.arm.num_joints:
         raise DrakeTeleopError(
             f"it moves {len(trajectory.q0)} joints, the arm has {robot.arm.num_joints}",
@@ -256,10 +225,10 @@ def _check_given(robot: Robot, trajectory: FourierTrajectory, duration: float) -
         raise DrakeTeleopError(f"it uses {worst}", where="trajectory")
 
 
-def timed(
+def simulate_with_timing(
     station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
-    """`simulate`, and its real-time factor: simulated over elapsed time, compilation included."""
+    """Simulate a station; return result and real-time factor."""
     start = time.perf_counter()
     result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start
@@ -267,7 +236,7 @@ def timed(
 
 
 def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
-    """What the wrist sensor gave: wrench (N, 6), s, omega, alpha (N, 3) in S."""
+    """Return wrench (N, 6), s, omega, alpha (N, 3) of the wrist sensor in S."""
     return (
         result["measured_wrench_S"],
         result["specific_force_S"],

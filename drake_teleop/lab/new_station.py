@@ -1,8 +1,7 @@
-"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station of one's own, to start from.
+"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station with a custom arm.
 
-Reads the arm, looks for a place in front of it where the tool points down and the arm can go to all
-sides, chooses scales that fit the haptic device, writes a short commented scenario, and runs it
-once: in free motion, and down onto a wall.
+It finds a start with the tool down, chooses scales that match the device, writes a commented
+scenario, and runs it: free motion, then contact with a wall.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.common.writing import make_folder, whole_file
@@ -36,76 +36,73 @@ from drake_teleop.station.slave.plant import ParseSlave, finalize, lowest_point
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Tool
 
-#: The cube in which the Phantom's grip can go from where scenarios start, half its edge [m] (E).
-_PHANTOMS = 0.08
-#: A tool to be replaced [kg, m].
-_STAND_IN = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[Ball(radius=0.012, position=[0, 0, 0.1])])
-_HALVES = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # of cubes that are tried [m]
-_POSTURES, _PLACES = 20_000, 24  # at random; of them looked at
-_TURNS = (0.0, 90.0, -90.0, 180.0)  # of the tool about the vertical that are tried [deg]
-# What turns z onto another axis, as URDF says it.
-_ONTO_Z = {
+#: Half edge of the Phantom's workspace cube around the default start [m] (E).
+_PHANTOM_HALF_M = 0.08
+#: Placeholder of a tool [kg, m].
+_TIP = Ball(radius=0.012, position=[0, 0, 0.1])
+_PLACEHOLDER_TOOL = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[_TIP])
+_CUBE_HALVES_M = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
+_NUM_POSTURES, _NUM_PLACES = 20_000, 24  # random postures; examined places
+_TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
+# URDF rpy of the rotation from z to another axis.
+_RPY_ONTO_Z = {
     "x": "0 1.5708 0",
     "-x": "0 -1.5708 0",
     "y": "-1.5708 0 0",
     "-y": "1.5708 0 0",
     "-z": "3.1416 0 0",
 }
-_ASIDE = 0.1  # of a way: so far beside its end an arm of few joints may come
-_ROOM = 0.1  # of half a joint's range to its limit, which is enough
-_STEEP = np.cos(np.radians(40.0))  # z_S so far from straight down at most
-_LIKED = np.array([0.6, 0.0, 0.4])  # in reaches: where most arms can go to all sides
-_SWING, _PRESS = 0.04, 0.01  # of the slave: free motion, depth in the wall, at most [m]
-# N, of a hard press: the device displays that and 1.5 times the weight.
-_CONTACT = 30.0
-# N/m: the wall, and how stiff the hand may feel it. The paper's station is stable up to 680 N/m
-# with a hand of medium grip; `analyze` says what this one is.
-_WALL, _FELT = 2000.0, 400.0
-_FREQUENCY, _HURRY = 1.0, 0.5  # of the swing [Hz]; share of the joints' speeds that it may take
+_MAX_RELATIVE_ERROR = 0.1  # position error of an arm of few joints, over the displacement
+_SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
+_MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
+_PREFERRED_POSITION = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
+_MAX_SWING_M, _MAX_DEPTH_M = 0.04, 0.01  # of the slave: amplitude, depth in the wall
+# Contact force [N] that the device displays in addition to 1.5 times the weight.
+_CONTACT_FORCE_N = 30.0
+# Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
+# 680 N/m with medium grip.
+_WALL_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+_SWING_HZ, _MAX_SPEED_USE = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
 
 
 class Place(NamedTuple):
-    """Where an arm can start, the tool down.
+    """Start of an arm with the tool down.
 
     Attributes:
         pose: (7,) X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: whether x_S is along x_W, as where a station is told the position alone.
+        by_position: True if the position alone defines the pose.
         q: (n,) joint positions [rad].
-        half: half the edge of the cube around it that can be reached, so turned [m]; 0: none.
-        room: how far the joint that is nearest to a limit is from it, over half its range.
+        half: half edge of the reachable cube [m].
+        room: smallest distance of a joint to its limit, over half its range.
     """
 
-    pose: NDArray[np.float64]
+    pose: Array
     by_position: bool
-    q: NDArray[np.float64]
+    q: Array
     half: float
     room: float
 
     @property
-    def position(self) -> NDArray[np.float64]:
+    def position(self) -> Array:
         """(3,) p_WS [m]."""
         return self.pose[4:]
 
     @property
     def home(self) -> list[float]:
-        """What `slave.home` has to be; empty if the position alone says it."""
+        """Value of `slave.home`; empty if the position is sufficient."""
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What was found for an arm and a device.
+    """Start, scales and motions for an arm and a device.
 
     Args:
-        joints: names of the arm's joints up to the sensor.
-        tool_mass: what hangs on the sensor [kg].
-        own_tool: whether the model has it.
-        place: where it starts.
-        translation_scale, force_scale: slave over master; master over slave.
-        swing: of the slave in free motion [m]; the wall is 1.5 times as far below the tool.
+        tool_mass: mass beyond the sensor [kg].
+        own_tool: True if the model contains the tool.
+        swing: amplitude of the slave in free motion [m].
         lowest: p_W of the tool's lowest point at the start [m].
-        assumptions: what the models do not say.
-        about_z: what is odd about the sensor's axes, if anything.
+        about_z: note about unusual axes of the sensor.
     """
 
     joints: tuple[str, ...]
@@ -115,9 +112,9 @@ class Plan:
     translation_scale: float
     force_scale: float
     swing: float
-    lowest: NDArray[np.float64]
+    lowest: Array
     assumptions: tuple[str, ...]
-    about_z: str
+    axis_note: str
 
 
 def new_command(
@@ -131,55 +128,50 @@ def new_command(
     sensor: str | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Writes `station.yaml` into a folder, and runs it into `first_run` there.
+    """Write `station.yaml` into a folder, run it into `first_run`, and return the summary.
 
     Args:
-        folder: new, or with no station.yaml.
-        arm: its model, see `Slave.model`.
-        sensor_frame: frame or link of the model at which the wrist sensor measures.
-        package_paths: for package:// addresses.
-        tool: model of the tool; None: what the arm's model has beyond the sensor, or a stand-in.
-        device: the haptic device.
-        sensor: preset of the wrist sensor; None: as scenarios have it.
-        quiet: no progress bars and no tables.
-
-    Returns:
-        The summary of the run, as of `run_command`.
+        tool: model file; None: the bodies beyond the sensor, or a placeholder.
+        sensor: preset of the wrist sensor; None: the default sensor.
 
     Raises:
-        DrakeTeleopError: for a model that cannot be used, an arm that cannot point its tool down
-            anywhere, a device or a sensor that is not known, or a folder with a station.
+        DrakeTeleopError: for an unusable model, an arm that cannot point its tool down, an unknown
+            name, or an existing station.
     """
     scenario = folder / "station.yaml"
     if scenario.exists():
         raise DrakeTeleopError(
-            "is there already", where=str(scenario), remedy="edit it, or name another folder"
+            "already exists", where=str(scenario), remedy="edit it, or give another folder"
         )
     for kind, name, known in (
         ("device", device, (PHANTOM, *FIGURES)),
         ("sensor", sensor, (None, *PRESETS)),
     ):
         if name not in known:
-            later = "; a leader arm is written into the station afterwards, as master.leader"
-            raise DrakeTeleopError(
-                f"{name!r} is none that is known",
-                where=f"--{kind}",
-                remedy=f"one of {', '.join(filter(None, known))}{later if name == LEADER else ''}",
-            )
+            remedy = f"choose one of {', '.join(filter(None, known))}"
+            if name == LEADER:
+                remedy += "; add a leader arm to station.yaml afterwards, as master.leader"
+            raise DrakeTeleopError(f"there is no {kind} {name!r}", where=f"--{kind}", remedy=remedy)
     plan = plan_station(arm, sensor_frame, package_paths, tool, device)
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
-    paths = [_from(folder, path) for path in package_paths]
-    tools = None if tool is None else _from(folder, tool)
+    slave_data: dict[str, Any] = {"model": _relative_path(folder, arm)}
+    if package_paths:
+        slave_data["package_paths"] = [_relative_path(folder, path) for path in package_paths]
+    slave_data["sensor_frame"] = sensor_frame
+    tool_path = None if tool is None else _relative_path(folder, tool)
     try:
-        text = _text(plan, _from(folder, arm), sensor_frame, paths, tools, device, sensor)
+        text = _scenario_text(plan, slave_data, tool_path, device, sensor)
         with whole_file(scenario) as unfinished:
             unfinished.write_text(text, encoding="utf-8")
             slave = LoadScenario(unfinished).slave
             read = [slave.path, *slave.packages, *(slave.files()[1:] if tool else ())]
             given = [path.resolve() for path in (arm, *package_paths, *([tool] if tool else ()))]
             if read != given or slave.sensor_frame != sensor_frame:
-                raise DrakeTeleopError("is read as another station", where=str(scenario))
+                raise DrakeTeleopError(
+                    "does not describe the given models (their names cannot be written)",
+                    where=str(scenario),
+                )
     except BaseException:
         for each in made:
             with suppress(OSError):
@@ -197,119 +189,118 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM,
 ) -> Plan:
-    """Place and scales for an arm and a device; arguments and errors as of `new_command`."""
+    """Choose start and scales for an arm and a device."""
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
         package_paths=[str(path) for path in package_paths],
-        tool=_STAND_IN if tool is None else Tool(model=str(tool)),
+        tool=_PLACEHOLDER_TOOL if tool is None else Tool(model=str(tool)),
     )
-    model, assumptions = _read(slave)
-    own_tool = tool is None and float(model.phi_load[0]) > _STAND_IN.mass + 1e-6
+    model, assumptions = _read_arm(slave)
+    own_tool = tool is None and float(model.phi_load[0]) > _PLACEHOLDER_TOOL.mass + 1e-6
     if own_tool:
         slave.tool = None
-        model, assumptions = _read(slave)
+        model, assumptions = _read_arm(slave)
     place = find_place(model)
     slave.position, slave.home = place.position.tolist(), place.home
     figures = FIGURES.get(device)
-    room = _PHANTOMS if figures is None else min(figures.size) / 2.0
+    room = _PHANTOM_HALF_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
     mass = float(model.phi_load[0])
-    translation_scale = _rounded(min(place.half / room, 1.0))
-    most = min(peak / (1.5 * 9.81 * mass + _CONTACT), _FELT / (_WALL * translation_scale), 1.0)
-    swing = min(_SWING, place.half / 2.0, room * translation_scale / 2.0)
+    translation_scale = _round_down(min(place.half / room, 1.0))
+    force_scale = min(
+        peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
+        _MAX_DISPLAYED_STIFFNESS / (_WALL_STIFFNESS * translation_scale),
+        1.0,
+    )
+    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
     return Plan(
         joints=tuple(model.joint_names),
         tool_mass=mass,
         own_tool=own_tool,
         place=place,
         translation_scale=translation_scale,
-        force_scale=_rounded(most),
-        swing=_rounded(swing * min(1.0, _HURRY / _speed_use(model, place, swing))),
+        force_scale=_round_down(force_scale),
+        swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
         lowest=lowest_point(slave),
         assumptions=tuple(assumptions),
-        about_z=_about_z(model),
+        axis_note=_axis_advice(model),
     )
 
 
 def find_place(arm: ArmModel, seed: int = 0) -> Place:
-    """Where the arm can hold the tool down and go to all sides, its position to a centimetre.
-
-    Args:
-        arm: with limits.
-        seed: of the postures that are tried.
+    """Find a start with the tool down and reachable space in all directions.
 
     Raises:
-        DrakeTeleopError: if there is no such place.
+        DrakeTeleopError: if there is none.
     """
     random = np.random.default_rng(seed)
-    postures = random.uniform(arm.lower, arm.upper, (_POSTURES, arm.num_joints))
-    poses = np.empty((_POSTURES, 7))
+    postures = random.uniform(arm.lower, arm.upper, (_NUM_POSTURES, arm.num_joints))
+    poses = np.empty((_NUM_POSTURES, 7))
     for q, pose in zip(postures, poses, strict=True):
         pose_into(arm.table, q, pose)
     x, y = poses[:, 1], poses[:, 2]
     down_z = 1.0 - 2.0 * (x * x + y * y)  # z_W of z_S
-    down = down_z < -_STEEP
+    down = down_z < -_MIN_COS_TILT
     reach = np.quantile(np.hypot(poses[:, 4], poses[:, 5]), 0.98)
-    fit = np.flatnonzero(down & _before(poses[:, 4:], reach))
-    away = np.linalg.norm(poses[fit, 4:] - reach * _LIKED, axis=1)
-    if arm.num_joints < 6:  # they turn the tool where they carry it, so each pose is one of a kind
-        steepest = fit[np.argsort(down_z[fit])[:_PLACES]]
-        found = [_of_few(arm, postures[k], poses[k]) for k in steepest]
+    fit = np.flatnonzero(down & _is_in_front(poses[:, 4:], reach))
+    distances = np.linalg.norm(poses[fit, 4:] - reach * _PREFERRED_POSITION, axis=1)
+    if arm.num_joints < 6:  # position and orientation are coupled
+        steepest = fit[np.argsort(down_z[fit])[:_NUM_PLACES]]
+        found = [_place_of_short_arm(arm, postures[k], poses[k]) for k in steepest]
     else:
-        looked_at = fit[np.argsort(away)][:: max(len(fit) // _PLACES, 1)]
-        found = [_place(arm, np.round(poses[k, 4:], 2), turn) for turn in _TURNS for k in looked_at]
+        looked_at = fit[np.argsort(distances)][:: max(len(fit) // _NUM_PLACES, 1)]
+        found = [
+            _place_with_cube(arm, np.round(poses[k, 4:], 2), yaw_deg)
+            for yaw_deg in _TOOL_YAWS_DEG
+            for k in looked_at
+        ]
     best = max(found, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
-            "nowhere can the arm hold its sensor with z downwards and move to all sides",
+            "no place found where the arm can hold z_S downwards and move in all directions",
             where="new",
-            remedy=_about_z(arm) or "check the joints' limits, and which way sensor_frame points",
+            remedy=_axis_advice(arm) or "check joint limits and the orientation of sensor_frame",
         )
     return best
 
 
 def _merit(place: Place) -> tuple[float, bool, float]:
-    """By which places are compared: a joint that leaves its range at once is the worst."""
-    return min(place.room, _ROOM), place.by_position, place.half
+    return min(place.room, _SUFFICIENT_MARGIN), place.by_position, place.half
 
 
-def _about_z(arm: ArmModel) -> str:
-    """What to do if another axis of S than z is along the last joint, as tools are; or nothing."""
+def _axis_advice(arm: ArmModel) -> str:
+    """Return advice if another axis of S is along the last joint."""
     n = arm.num_joints
-    # The axis of the last joint, away from it, in S.
+    # Axis of the last joint in S, directed away from the joint.
     along = arm.table[n, ROTATION:TRANSLATION].reshape(3, 3)[2]
     along = along * (-1.0 if arm.table[n, TRANSLATION + 2] < 0.0 else 1.0)
     k = int(np.argmax(np.abs(along)))
     axis = ("-" if along[k] < 0.0 else "") + "xyz"[k]
-    if axis not in _ONTO_Z:
+    if axis not in _RPY_ONTO_Z:
         return ""
     return (
-        f"z_S points to the tool, and here {axis}_S is along the last joint: if the tool is, fix a"
-        f' link to sensor_frame by <origin rpy="{_ONTO_Z[axis]}"/>, and name that'
+        f"z_S must point to the tool, but {axis}_S is along the last joint; if the tool is too, add"
+        f' a link fixed to sensor_frame by <origin rpy="{_RPY_ONTO_Z[axis]}"/> and name that link'
     )
 
 
-def _before(places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    """Which places (k, 3) are in front of the base, neither on its post nor behind it, nor low."""
+def _is_in_front(places: Array, reach: float) -> NDArray[np.bool_]:
     x, y, z = places.T / reach
     r = np.hypot(x, y)
     result: NDArray[np.bool_] = (r > 0.35) & (r < 0.85) & (x > 0.9 * r) & (z > 0.15) & (z < 0.8)
     return result
 
 
-def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
-    """A place, with the largest of `_HALVES` whose corners can be reached.
-
-    It stays away from the base by as much.
-    """
-    R_WS = RotationMatrix.MakeZRotation(np.radians(turn)) @ R_WS_HOME
+def _place_with_cube(arm: ArmModel, position: Array, yaw_deg: float) -> Place:
+    """Return a place with the largest reachable cube of `_CUBE_HALVES_M`."""
+    R_WS = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
     q, status = tool_down(arm, position, R_WS)
-    place = Place(np.array([*w, *position]), turn == 0.0, q, 0.0, _room(arm, q))
+    place = Place(np.array([*w, *position]), yaw_deg == 0.0, q, 0.0, _joint_margin(arm, q))
     if status != IkStatus.OK:
         return place._replace(room=0.0)
-    for half in (half for half in _HALVES if 2.0 * half <= np.hypot(*position[:2])):
+    for half in (half for half in _CUBE_HALVES_M if 2.0 * half <= np.hypot(*position[:2])):
         corners = (position + half * np.array(signs) for signs in product((-1.0, 1.0), repeat=3))
         if all(
             find_posture(arm, np.array([*w, *corner]), q)[1] == IkStatus.OK for corner in corners
@@ -318,36 +309,35 @@ def _place(arm: ArmModel, position: NDArray[np.float64], turn: float) -> Place:
     return place._replace(room=0.0)
 
 
-def _of_few(arm: ArmModel, q: NDArray[np.float64], pose: NDArray[np.float64]) -> Place:
-    """A posture of an arm of five joints or less as a place: how far its position can go.
-
-    The tool turns on the way, as it has to.
-    """
+def _place_of_short_arm(arm: ArmModel, q: Array, pose: Array) -> Place:
+    """Return a place of an arm with at most five joints."""
     reached = np.empty(7)
 
-    def goes(way: NDArray[np.float64]) -> bool:
-        target = pose + np.append(np.zeros(4), way)
+    def is_reachable(displacement: Array) -> bool:
+        target = pose + np.append(np.zeros(4), displacement)
         pose_into(arm.table, find_posture(arm, target, q)[0], reached)
-        return bool(np.linalg.norm(reached[4:] - target[4:]) < _ASIDE * np.linalg.norm(way))
+        return bool(
+            np.linalg.norm(reached[4:] - target[4:])
+            < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement)
+        )
 
-    ways = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
-    halves = (half for half in _HALVES if all(goes(half * way) for way in ways))
-    return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_room(arm, q))
+    displacements = [sign * axis for axis in np.eye(3) for sign in (-1.0, 1.0)]
+    halves = (h for h in _CUBE_HALVES_M if all(is_reachable(h * d) for d in displacements))
+    return Place(pose, by_position=False, q=q, half=next(halves, 0.0), room=_joint_margin(arm, q))
 
 
-def _room(arm: ArmModel, q: NDArray[np.float64]) -> float:
+def _joint_margin(arm: ArmModel, q: Array) -> float:
     return float((np.minimum(q - arm.lower, arm.upper - q) / (arm.upper - arm.lower)).min() * 2.0)
 
 
 def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
-    """The largest share of its speed that a joint takes for the swing up and down."""
     above = place.pose.copy()
     above[6] += swing
-    way = np.abs(find_posture(arm, above, place.q)[0] - place.q)
-    return float((2.0 * np.pi * _FREQUENCY * way / arm.velocity_limit).max())
+    displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
+    return float((2.0 * np.pi * _SWING_HZ * displacement / arm.velocity_limit).max())
 
 
-def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
+def _read_arm(slave: Slave) -> tuple[ArmModel, list[str]]:
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
     finalize(plant)
@@ -355,76 +345,71 @@ def _read(slave: Slave) -> tuple[ArmModel, list[str]]:
     return arm, [*parsed.assumptions, *assumed]
 
 
-def _rounded(value: float) -> float:
-    """To two digits, downwards."""
+def _round_down(value: float) -> float:
+    """Round down to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
 
 
-def _from(folder: Path, path: Path) -> str:
+def _relative_path(folder: Path, path: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-def _text(
-    plan: Plan,
-    arm: str,
-    sensor_frame: str,
-    package_paths: list[str],
-    tool: str | None,
-    device: str,
-    sensor: str | None,
+def _scenario_text(
+    plan: Plan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
 ) -> str:
-    """The scenario, with comments on what was found."""
     s, swing = plan.translation_scale, plan.swing
     x, y, z = plan.lowest
-    down = 1.5 * swing + min(_PRESS, swing / 4.0)
-    home, packages = plan.place.home, {"package_paths": package_paths} if package_paths else {}
-    start = {"home": home} if home else {"position": _rounded_row(plan.place.position)}
-    slave: dict[str, Any] = {"model": arm, **packages, "sensor_frame": sensor_frame, **start}
+    down = 1.5 * swing + min(_MAX_DEPTH_M, swing / 4.0)
+    if plan.place.by_position:
+        slave["position"] = _round_row(plan.place.position)
+    else:
+        slave["home"] = plan.place.home
     comments = {
         "slave.position": "of the sensor at the start, tool down [m]",
         "slave.home": "joints at the start, tool down [rad, m]",
-        "kinematic_scaling": f"the arm can go {1e3 * plan.place.half:g} mm to all sides",
-        "force_scaling": "sigma 1: the hand feels the whole tool; force_scale: see analyze",
-        "operator.intent": "of the hand: a swing up and down, and then down onto the wall",
+        "kinematic_scaling": f"the arm can move {1e3 * plan.place.half:g} mm in all directions",
+        "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
+        "operator.intent": "of the hand: up and down, then down onto the wall",
         "rates": "of the device",
     }
     if tool is not None:
         slave["tool"] = {"model": tool}
     elif plan.own_tool:
-        slave["tool"], comments["slave.tool"] = None, "what the model has beyond the sensor"
+        slave["tool"], comments["slave.tool"] = None, "the bodies of the model beyond the sensor"
     else:
-        slave["tool"] = {"mass": _STAND_IN.mass, "com": _STAND_IN.com}
-        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_STAND_IN.shapes[0])]}
-        comments["slave.tool"] = "a stand-in: put your tool's file (model: ...) or its numbers here"
-    swings = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
-    swings |= {"frequency": _FREQUENCY, "translation": _rounded_row([0.0, 0.0, swing / s])}
-    presses = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
-    presses |= {"translation": _rounded_row([0.0, 0.0, -down / s])}
-    wall = {"_tag": "!Wall", "position": _rounded_row([x, y, z - 1.5 * swing]), "stiffness": _WALL}
+        slave["tool"] = {"mass": _PLACEHOLDER_TOOL.mass, "com": _PLACEHOLDER_TOOL.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(_PLACEHOLDER_TOOL.shapes[0])]}
+        comments["slave.tool"] = "a placeholder: put model file or numbers of your tool here"
+    swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
+    swing_motion |= {"frequency": _SWING_HZ, "translation": _round_row([0.0, 0.0, swing / s])}
+    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
+    press_motion |= {"translation": _round_row([0.0, 0.0, -down / s])}
+    wall_position = _round_row([x, y, z - 1.5 * swing])
+    wall = {"_tag": "!Wall", "position": wall_position, "stiffness": _WALL_STIFFNESS}
     data = {
-        "description": f"{Path(arm).stem} led by {device}",
+        "description": f"{Path(slave['model']).stem} commanded by {device}",
         "simulation": {"duration": 5.0, "settle": 0.8},
-        **_rates(device),
+        **_device_rates(device),
         "slave": slave,
         "master": {"model": device},
         **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
         "kinematic_scaling": {"translation_scale": s},
         "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
         "environment": [wall],
-        "operator": {"grip": "medium", "intent": [swings, presses]},
+        "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
     }
     head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
     return yaml_text(data, head=[head], comments=comments)
 
 
-def _rates(device: str) -> dict[str, Any]:
-    """Those of a device that is slower than the hand, or `analyze` refuses them."""
+def _device_rates(device: str) -> dict[str, Any]:
+    """Return slow rates for a slow device, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 
 
-def _rounded_row(values: Any) -> list[float]:
+def _round_row(values: Any) -> list[float]:
     return [float(f"{value:.4g}") for value in values]
 
 
@@ -437,13 +422,13 @@ def _print(plan: Plan, scenario: Path) -> None:
     for name, value in (
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
-        ("Start", f"sensor at {_rounded_row(plan.place.position)} m, tool down"),
-        ("Room around it", f"{1e3 * plan.place.half:g} mm to all sides"),
+        ("Start", f"sensor at {_round_row(plan.place.position)} m, tool down"),
+        ("Reachable around it", f"{1e3 * plan.place.half:g} mm in all directions"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)
     console = Console()
     console.print(table)
-    notes = [f"note: {plan.about_z}"] if plan.about_z else []
+    notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
     for line in [*notes, *(f"assumed: {assumed}" for assumed in plan.assumptions)]:
         console.print(line, highlight=False, markup=False)

@@ -1,21 +1,7 @@
-"""`drake-teleop run SCENARIO`: one scenario, its log, its picture and its figures.
+"""`drake-teleop run SCENARIO`: run one scenario; write its log, picture and summary.
 
-What the station knows about its load, by one rule:
-
-- A scenario whose load estimator is enabled starts from nothing and learns while it runs. If its
-  operator wants nothing either (the shipped "identification"), the slave alone runs an excitation
-  trajectory as long as the scenario.
-- Every other scenario does what an honest user would: it first identifies the load with that
-  trajectory and its own sensor, from the sensor's samples alone; or it takes what was found when
-  that was done before, see `drake_teleop.lab.identified_load`.
-
-The same scenario gives the same bytes in every file but `session.json`, which holds
-
-=========================== =====================================================================
-load_source                 which load was used: "learnt while it ran", "identified before the run",
-                            "cache", identified before an earlier run, or "of the drive"
-real_time_factor            simulated over elapsed time, this machine, compilation included
-=========================== =====================================================================
+An enabled load estimator starts without a load; without intent and task of the operator, the slave
+runs an excitation trajectory. Otherwise the load is identified first or read from the cache.
 """
 
 from __future__ import annotations
@@ -23,9 +9,6 @@ from __future__ import annotations
 import time
 from pathlib import Path
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import Progress, Stage, show_progress
@@ -38,10 +21,7 @@ from drake_teleop.common.writing import (
     write_picture,
     write_table,
 )
-from drake_teleop.lab.identification import (
-    identify_load,
-    timed,
-)
+from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
 from drake_teleop.station.replay import write_replay
@@ -50,10 +30,8 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 from drake_teleop.station.scenario_reference import write_scenario
 from drake_teleop.station.station import MakeTeleopStation
 
-Array = NDArray[np.float64]
-
-_LEARNT = "learnt while it ran"
-_WRITTEN_AT_THE_END = (
+_DURING_RUN = "learnt while it ran"
+_FINAL_FILES = (
     "sensor_log.parquet",
     "identification.json",
     "overview.png",
@@ -63,7 +41,7 @@ _WRITTEN_AT_THE_END = (
 
 
 class RecordedDrive(Protocol):
-    """A drive that can be repeated; `drake_teleop.live.session.read_drive` returns one."""
+    """Drive that can be repeated, see `drake_teleop.live.session.read_drive`."""
 
     @property
     def folder(self) -> Path:
@@ -71,7 +49,7 @@ class RecordedDrive(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario that was driven, with the duration of the drive."""
+        """Scenario of the drive, with the duration of the drive."""
 
     @property
     def load(self) -> IdentifiedLoad | None:
@@ -91,43 +69,34 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Runs one scenario.
-
-    Writes log.parquet, sensor_log.parquet (canonical, for `drake-teleop identify`), overview.png,
-    replay.html (the film in 3D), scenario.yaml (all fields, as they were run), identification.json
-    (unless the scenario learnt while it ran), session.json and summary.json into `out`. The log is
-    a folder, written while the station runs; all but the scenario follow at the end, the summary
-    last. What an earlier run left there is removed first; a run that fails before it begins leaves
-    nothing.
+    """Run one scenario; write all results into a folder, without files of an earlier run.
 
     Args:
-        scenario: the name of a shipped one, or a YAML file.
-        out: the folder.
-        drive: a recorded drive, which is repeated instead of the scenario.
-        seed: instead of the scenario's.
-        fresh: whether to identify the load anew although it was kept.
-        quiet: no progress bars and no table.
-        progress: False for no progress bars alone.
+        scenario: name of a shipped scenario, or a YAML file.
+        drive: recorded drive that is repeated instead.
+        seed: replaces the scenario's seed.
+        fresh: True ignores a cached load.
 
     Returns:
-        The summary, and what is in session.json.
+        The summary and the content of session.json.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used, a joint leaves its range, or a file cannot
-            be written; then saying what was.
-        KeyboardInterrupt: saying what was recorded until then.
+        DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
+        KeyboardInterrupt: with the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
     if drive is not None and out.resolve() == drive.folder.resolve():
-        raise DrakeTeleopError("is the drive itself", where=str(out), remedy="give another --out")
+        raise DrakeTeleopError(
+            "is the folder of the drive", where=str(out), remedy="give another --out"
+        )
     setup = LoadScenario(scenario or "") if drive is None else drive.scenario
     if seed is not None:
         setup = replace(setup, simulation__seed=seed)
     with output_folder(out):
         with show_progress(progress and not quiet) as stage:
-            run = _logged(setup, out, stage, fresh, drive)
-            written = stage("Write pictures and film")
+            run = _run_with_log(setup, out, stage, fresh, drive)
+            written = stage("Write pictures and 3D replay")
             write_picture(out / "overview.png", overview(run.result))
             written(0.3)
             write_replay(out / "replay.html", run.result, run.scenario)
@@ -144,31 +113,30 @@ def run_command(
     return summary | session
 
 
-def _logged(
+def _run_with_log(
     setup: Scenario, out: Path, stage: Stage, fresh: bool, drive: RecordedDrive | None
 ) -> ScenarioRun:
-    """Runs it with its log and its scenario in a folder, without what an earlier run left there."""
-    log, its_scenario = out / "log.parquet", out / "scenario.yaml"
-    # It must not be taken for what belongs to this run, should this one be interrupted.
+    log, scenario_file = out / "log.parquet", out / "scenario.yaml"
+    # After an interruption, old files must not look like results of this run.
     remove_log(log)
-    for name in _WRITTEN_AT_THE_END:
+    for name in _FINAL_FILES:
         with naming(out / name):
             (out / name).unlink(missing_ok=True)
-    earlier = its_scenario.exists()
-    write_scenario(its_scenario, setup)
+    had_scenario = scenario_file.exists()
+    write_scenario(scenario_file, setup)
     try:
         if drive is not None:
-            return _repeated(drive, stage, log)
+            return _repeat_drive(drive, stage, log)
         return run_scenario(setup, stage, log, fresh=fresh)
     except BaseException as error:
         if log.is_dir() and not any(log.iterdir()):
             log.rmdir()
-        if not log.exists() and not earlier:
-            its_scenario.unlink(missing_ok=True)
+        if not log.exists() and not had_scenario:
+            scenario_file.unlink(missing_ok=True)
         if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(_kept(log)) from error
+            raise KeyboardInterrupt(_describe_log(log)) from error
         if isinstance(error, CannotWrite):
-            raise DrakeTeleopError(str(error), remedy=_kept(log)) from error
+            raise DrakeTeleopError(str(error), remedy=_describe_log(log)) from error
         raise
 
 
@@ -179,47 +147,43 @@ def run_scenario(
     *,
     fresh: bool = False,
 ) -> ScenarioRun:
-    """Runs a scenario by the rule at the top of this module.
-
-    Args:
-        scenario: what to run.
-        progress: whether bars are shown, or where: see `pages/progress.py`.
-        log: as `simulate` has it.
-        fresh: as for `identified_load`.
+    """Run a scenario, with its load as described at the top.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used or a joint leaves its range.
+        DrakeTeleopError: for an unusable scenario or a joint outside its range.
     """
     check_scenario(scenario)
-    learns = scenario.load_estimator.enabled
-    if learns and not scenario.operator.intent and scenario.operator.task is None:
+    estimates_load = scenario.load_estimator.enabled
+    if estimates_load and not scenario.operator.intent and scenario.operator.task is None:
         found = identify_load(scenario, progress, log=log)
         return ScenarioRun(
-            scenario, found.result, found.identification, _LEARNT, found.real_time_factor
+            scenario, found.result, found.identification, _DURING_RUN, found.real_time_factor
         )
-    identification, estimate, floor, source = None, None, None, _LEARNT
+    identification, estimate, floor, source = None, None, None, _DURING_RUN
     with show_progress(progress) as stage:
-        if not learns:
+        if not estimates_load:
             load = identified_load(scenario, stage, fresh=fresh)
             identification, estimate, floor = load.identification, load.estimate, load.noise_floor
             source = "cache" if load.from_cache else "identified before the run"
         station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=floor)
-        result, factor = timed(station, scenario.simulation, stage("Run the scenario"), log)
+        result, factor = simulate_with_timing(
+            station, scenario.simulation, stage("Run the scenario"), log
+        )
     return ScenarioRun(scenario, result, identification, source, factor)
 
 
-def _repeated(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
-    begin = time.perf_counter()
+def _repeat_drive(drive: RecordedDrive, progress: Stage, log: Path) -> ScenarioRun:
+    start = time.perf_counter()
     result = drive.repeat(progress("Repeat the drive"), log)
-    factor = drive.scenario.simulation.duration / (time.perf_counter() - begin)
+    factor = drive.scenario.simulation.duration / (time.perf_counter() - start)
     identification = None if drive.load is None else drive.load.identification
     return ScenarioRun(drive.scenario, result, identification, "of the drive", factor)
 
 
-def _kept(log: Path) -> str:
+def _describe_log(log: Path) -> str:
     if not log.exists():
         return ""
-    return f"{log} has the {len(SimulationResult.scan_parquet(log).t)} samples until then"
+    return f"{log} contains the {len(SimulationResult.scan_parquet(log).t)} samples until then"
 
 
 def _print(summary: dict[str, Any], out: Path) -> None:
@@ -235,29 +199,29 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     console = Console()
     console.print(summary["description"] or summary["scenario"], style="bold", markup=False)
     console.print(table)
-    hint = "; --fresh identifies it anew" if summary["load_source"] == "cache" else ""
+    hint = "; --fresh repeats the identification" if summary["load_source"] == "cache" else ""
     console.print(f"load: {summary['load_source']}{hint}", highlight=False)
     for k, (start, stop) in enumerate(summary["true_contact_s"]):
         noticed = ""
         if "contact_noticed_ms" in summary:
             slave, hand = (summary[f"contact_{at}_ms"][k] for at in ("noticed", "at_hand"))
-            noticed = f", noticed after {_ms(slave)}, at the hand after {_ms(hand)}"
+            noticed = f", noticed after {_format_ms(slave)}, at the hand after {_format_ms(hand)}"
         console.print(f"contact from {start:.4f} to {stop:.4f} s{noticed}", highlight=False)
     if "contact_by" in summary:
         console.print(f"contact by {summary['contact_by']}", highlight=False)
-    for name, way in summary.get("moved_mm", {}).items():
-        turn = f"{way:.1f} mm and turned by {summary['turned_deg'][name]:.1f} degrees"
-        console.print(f"{name} was moved by {turn}", highlight=False)
+    for name, displacement in summary.get("moved_mm", {}).items():
+        motion = f"{displacement:.1f} mm and rotated by {summary['turned_deg'][name]:.1f} degrees"
+        console.print(f"{name} was moved by {motion}", highlight=False)
     if summary.get("failure"):
         console.print(f"[bold red]the task failed:[/] {summary['failure']}", highlight=False)
-    for words in summary.get("assumed", ()):
-        console.print(f"assumed: {words}", highlight=False, markup=False)
+    for assumption in summary.get("assumed", ()):
+        console.print(f"assumed: {assumption}", highlight=False, markup=False)
     for warning in summary["warnings"]:
         console.print(f"[bold yellow]warning:[/] {warning}", highlight=False)
     console.print(
-        f"written to {out}; its film: {out / 'replay.html'}", highlight=False, markup=False
+        f"written to {out}; 3D replay: {out / 'replay.html'}", highlight=False, markup=False
     )
 
 
-def _ms(delay: float | None) -> str:
+def _format_ms(delay: float | None) -> str:
     return "never" if delay is None else f"{delay:.1f} ms"

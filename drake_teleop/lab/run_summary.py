@@ -1,27 +1,20 @@
-"""Figures and picture of a run.
-
-`summary.json` contains, beside the scenario:
+"""Summary and overview picture of a run. `summary.json` contains, besides the scenario:
 
 =========================== =====================================================================
-peak_measured_force_N       largest measured |f|, offsets removed; likewise peak_measured_torque_Nm;
-                            this and the next two with the load estimate of the end
-peak_contact_force_N        largest calculated contact force; likewise peak_contact_torque_Nm
-residual_force_max_N        largest contact force calculated while there was no contact; null if
-                            there was contact throughout; likewise residual_torque_max_Nm
+peak_measured_force_N       largest measured |f| without offsets; also peak_measured_torque_Nm
+peak_contact_force_N        largest contact force from the final load estimate; also ..._torque_Nm
+residual_force_max_N        the same outside contacts, or null; also residual_torque_max_Nm
 true_contact_s              [start, end] of each contact
-contact_noticed_ms          with contact_detection: how long after the beginning of each contact the
-                            detector noticed it, null if it did not; likewise contact_at_hand_ms
-false_contacts              how often the detector began to notice a contact that there was not
-success, task_time_s, ...   with a task, see `drake_teleop.station.task_measures`; null for
-                            what did not happen
-failure                     with a task: why it failed, in words; null if it did not
+contact_noticed_ms          delay of each detection, or null; also contact_at_hand_ms
+false_contacts              number of detections without true contact
+success, task_time_s, ...   with a task, see `drake_teleop.station.task_measures`
+failure                     with a task: reason of its failure, or null
 peak_force_to_master_N      largest force that the device displayed
-joint_speed_use             largest share of a joint's speed limit; likewise joint_torque_use
-mass_error_percent          of the estimate at the end; likewise com_error_mm
-assumed                     what the models of arm and tool do not say, if anything
-contact_by                  if Drake's contact results are used, which takes longer: why
-moved_mm                    with bodies that move: how far each is at the end from where it was;
-                            likewise turned_deg
+joint_speed_use             largest share of a joint's speed limit; also joint_torque_use
+mass_error_percent          error of the final estimate; also com_error_mm
+assumed                     values that the models of arm and tool do not contain
+contact_by                  reason why Drake's slower contact results are used
+moved_mm                    displacement of each movable body at the end; also turned_deg
 warnings                    faults and their times, see `drake_teleop.station.run_warnings`
 =========================== =====================================================================
 """
@@ -36,7 +29,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import learnt
+from drake_teleop.common.arrays import Array, learnt
 from drake_teleop.common.quaternions import conjugate, logarithm, multiply
 from drake_teleop.common.style import contact_spans
 from drake_teleop.lab.identification import sensor_samples, slave_arm
@@ -49,20 +42,16 @@ from drake_teleop.station.signals import POSE_OF
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave
 from drake_teleop.station.task_measures import task_failure, task_measures
 
-Array = NDArray[np.float64]
-
-# After a contact has ended the sensor's filter still shows it for this long [s].
-FILTER_TAIL = 0.01
+# Settling time of the sensor's filter after a contact [s].
+FILTER_TAIL_S = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """A scenario that was run.
+    """Scenario with its results.
 
     Attributes:
-        scenario: with the seed that was used.
-        result: the recorded signals.
-        identification: what was found beforehand; None if the scenario learnt while it ran.
+        identification: load identified before the run, if any.
         load_source: as in session.json.
         real_time_factor: simulated over elapsed time.
     """
@@ -75,21 +64,18 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """(N,) whether the tool touches something, from the simulation's truth.
-
-    A touch with its bounces is one contact: gaps shorter than FILTER_TAIL are closed.
-    """
+    """Return (N,) true contact; gaps below FILTER_TAIL_S are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
-    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL
+    return _time_since(touching, result.t) + _time_until(touching, result.t) < FILTER_TAIL_S
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """(N, 6) Eq. (13) from the recorded samples and the load estimate of the end.
+    """Return (N, 6) Eq. (13) with the final load estimate.
 
     Raises:
-        DrakeTeleopError: if that load was never learnt.
+        DrakeTeleopError: if no load was identified.
     """
     estimate = result["load_estimate"][-1]
     learnt("load_estimate", estimate[6:])
@@ -98,15 +84,15 @@ def calculated_contact_wrench(result: SimulationResult) -> Array:
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
-    """The figures of summary.json (see the top of this module)."""
+    """Return the values of summary.json."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
     measured = result["measured_wrench_S"] - estimate[:6]
     calculated = calculated_contact_wrench(result)
     contact = in_contact(result)
-    # Of the bounces that a touch begins with, the first may have been between two samples.
-    free = _time_since(contact, result.t) > FILTER_TAIL
-    free &= _time_until(contact, result.t) > FILTER_TAIL
+    # The first bounce of a contact may be between two samples.
+    free = _time_since(contact, result.t) > FILTER_TAIL_S
+    free &= _time_until(contact, result.t) > FILTER_TAIL_S
     mass, com = _mass_and_com(estimate[6:])
     true_mass, true_com = _mass_and_com(arm.phi_load)
     n = arm.num_joints
@@ -119,8 +105,8 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         **_peaks("peak_contact", "", calculated),
         **_peaks("residual", "_max", calculated[free]),
         "true_contact_s": [list(span) for span in contact_spans(result.t, contact)],
-        "joint_speed_use": _use(result["slave_state"][:, n:], arm.velocity_limit),
-        "joint_torque_use": _use(result["joint_torque"], arm.effort_limit),
+        "joint_speed_use": _largest_use(result["slave_state"][:, n:], arm.velocity_limit),
+        "joint_torque_use": _largest_use(result["joint_torque"], arm.effort_limit),
         "mass_error_percent": 100 * abs(mass / true_mass - 1),
         "com_error_mm": 1e3 * float(np.linalg.norm(com - true_com)),
     }
@@ -128,9 +114,9 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
         summary |= _peaks("peak", "_to_master", result["force_to_master"])
     if "contact" in result:
         summary |= _detection_figures(result, contact_spans(result.t, contact))
-    if beyond := _beyond(run.scenario):
+    if beyond := _unmodelled_contact(run.scenario):
         summary["contact_by"] = f"Drake's contact results (slower): {beyond}"
-    summary |= _moved(result)
+    summary |= _body_displacements(result)
     if run.scenario.operator.task is not None:
         figures = task_measures(result, run.scenario)
         summary |= {name: None if np.isnan(x) else x for name, x in figures.items()}
@@ -142,11 +128,11 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
 
 
 def overview(result: SimulationResult) -> Figure:
-    """The picture of a run: the wrenches, the motion, what the hand feels; contact shaded."""
-    wanted = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
+    """Draw wrenches, motion and force to the master."""
+    signals = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
     if "contact_wrench_S" not in result:
-        wanted = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
-    figure = result.plot(*wanted, contact=in_contact(result))
+        signals = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
+    figure = result.plot(*signals, contact=in_contact(result))
     figure.align_ylabels()
     return figure
 
@@ -154,7 +140,6 @@ def overview(result: SimulationResult) -> Figure:
 def _detection_figures(
     result: SimulationResult, spans: list[tuple[float, float]]
 ) -> dict[str, Any]:
-    """When each contact was noticed, at the slave and by the hand, and what was none."""
     t, summary = result.t, {}
     for name, key in (("contact", "contact_noticed_ms"), ("contact_at_hand", "contact_at_hand_ms")):
         flagged = t[result[name][:, 0] > 0]
@@ -168,12 +153,12 @@ def _detection_figures(
             for times, (start, _) in zip(found, spans, strict=True)
         ]
     onsets = t[1:][np.diff(result["contact"][:, 0]) > 0]
-    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL for a, b in spans)]
+    false = [x for x in onsets if not any(a <= x <= b + FILTER_TAIL_S for a, b in spans)]
     return summary | {"false_contacts": len(false)}
 
 
-def _beyond(scenario: Scenario) -> str:
-    """What of the surroundings the compiled contact law does not know, see `Contact`."""
+def _unmodelled_contact(scenario: Scenario) -> str:
+    """Return the surroundings that the compiled contact law lacks."""
     surroundings = scenario.surroundings
     if surroundings is None:
         return ""
@@ -181,15 +166,14 @@ def _beyond(scenario: Scenario) -> str:
     return AddSlavePlant(builder, scenario.slave, surroundings).contact.beyond
 
 
-def _moved(result: SimulationResult) -> dict[str, dict[str, float]]:
-    """How far each body of the surroundings has moved and turned since t = 0."""
-    moved, turned = {}, {}
+def _body_displacements(result: SimulationResult) -> dict[str, dict[str, float]]:
+    displacements, rotations = {}, {}
     for signal in (name for name in result.signals if name.startswith(POSE_OF)):
         name, first, last = signal.removeprefix(POSE_OF), *result[signal][[0, -1]]
-        moved[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
-        turn = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
-        turned[name] = float(np.degrees(np.linalg.norm(turn)))
-    return {"moved_mm": moved, "turned_deg": turned} if moved else {}
+        displacements[name] = 1e3 * float(np.linalg.norm(last[4:] - first[4:]))
+        rotation = logarithm(multiply(tuple(last[:4]), conjugate(tuple(first[:4]))))
+        rotations[name] = float(np.degrees(np.linalg.norm(rotation)))
+    return {"moved_mm": displacements, "turned_deg": rotations} if displacements else {}
 
 
 def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
@@ -201,13 +185,13 @@ def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
 
 
 def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
-    """(N,) time since the last sample in contact; 0 in contact, inf before the first."""
+    """Return (N,) time since the last contact; inf before the first."""
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
 
 
 def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
-    """(N,) time until the next sample in contact; 0 in contact, inf after the last."""
+    """Return (N,) time until the next contact; inf after the last."""
     return _time_since(contact[::-1], -t[::-1])[::-1]
 
 
@@ -215,5 +199,5 @@ def _mass_and_com(phi: Array) -> tuple[float, Array]:
     return float(phi[0]), phi[1:4] / phi[0]
 
 
-def _use(values: Array, limit: Array) -> float:
+def _largest_use(values: Array, limit: Array) -> float:
     return float(np.max(np.abs(values) / limit))

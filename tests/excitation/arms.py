@@ -1,4 +1,4 @@
-"""Two arms that are not the station's, as people find them, and what they do with a trajectory."""
+"""Two arms other than the station's, and their simulated execution of a trajectory."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pydrake.trajectories import PiecewisePolynomial
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.slave.models import ParseModel
 
-# Of the simulation [s]; rest before the motion, without and with recording, and after it [s].
+# Step [s]; rest before the motion without and with recording, and after it [s].
 _STEP, _SETTLING, _RESTING = 2e-4, 0.5, 0.2
 
 
 def write_urdf(folder: Path) -> Path:
-    """Six joints, base hanging free, a gripper with a finger, meshes (OBJ, STL) there and not.
+    """Write six joints with a free base, a gripper with a finger, and existing and missing meshes.
 
-    No accelerations; one joint is continuous, one has no speed.
+    No joint has an acceleration limit; one is continuous, one has no speed limit.
     """
     package = folder / "somewhere" / "parts"
     package.mkdir(parents=True)
@@ -93,7 +93,7 @@ def write_urdf(folder: Path) -> Path:
 
 
 def write_sdf(folder: Path) -> Path:
-    """Seven joints, all limits given, nothing beyond the last link's frame `wrist`."""
+    """Write seven joints with all limits; the last link has the frame `wrist`."""
     links, joints, z = [], [], 0.0
     axes = ("0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
     reach = (0.16, 0.2, 0.2, 0.2, 0.2, 0.2, 0.1)
@@ -126,14 +126,14 @@ def write_sdf(folder: Path) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What an arm did, at 1 kHz.
+    """Executed motion at 1 kHz.
 
     Attributes:
         t: (N,) [s], from 0.2 s before the trajectory to 0.2 s after it.
         q: (N, n) joint angles [rad].
-        truth: (N, 15 + n) what a sensor at S is given: `sensor_chain.read_into`.
+        truth: (N, 15 + n) input of a sensor at S, see `sensor_chain.read_into`.
         pose: (N, 7) [quaternion wxyz, position] of S in the world.
-        phi: (10,) the load, about the origin of S.
+        phi: (10,) load about the origin of S.
     """
 
     t: np.ndarray
@@ -144,11 +144,7 @@ class Recording:
 
 
 def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -> Recording:
-    """Lets an arm run an exported trajectory in Drake, with one more body on its sensor frame.
-
-    Motors with stiff servos follow the angles and speeds of the table, with tracking errors; they
-    hold what is beyond the sensor.
-    """
+    """Simulate an exported trajectory with stiff servos and an extra body on the sensor frame."""
     builder = DiagramBuilder()
     plant = builder.AddSystem(MultibodyPlant(_STEP))
     model = ParseModel(plant, path, frame)
@@ -169,13 +165,13 @@ def execute(path: Path, frame: str, table: pl.DataFrame, load: SpatialInertia) -
         if f"q_{joint.name()}" in table.columns:
             for row, symbol in enumerate(("q", "qd", "qdd")):
                 commanded[:, row, k] = table[f"{symbol}_{joint.name()}"]
-    # Held at rest before and after.
+    # Rest before and after.
     start, period = _SETTLING + _RESTING, table["t"][-1]
     times = np.concatenate([[0.0], start + table["t"].to_numpy(), [start + period + 1.0]])
     commanded = commanded[[0, *range(table.height), -1]]
     commands = builder.AddSystem(
         TrajectorySource(
-            # Without corners, which would alias into samples at the same rate.
+            # Corners would alias into samples of the same rate.
             PiecewisePolynomial.CubicHermite(
                 times,
                 commanded[:, :2].reshape(len(times), -1).T,
@@ -213,9 +209,9 @@ def _beyond(joints, body):
 
 
 def _motion_of(plant, context, frame_S):
-    """(9,) specific force, angular velocity and acceleration of S, in S.
+    """Return (9,) specific force, angular velocity and acceleration of S, in S.
 
-    With the speeds in the middle of the step in which the accelerations act.
+    Velocities are those in the middle of the step in which the accelerations act.
     """
     v = plant.GetVelocities(context)
     port = plant.get_generalized_acceleration_output_port(frame_S.model_instance())

@@ -1,4 +1,4 @@
-"""Capsules around shapes: they hold them, and not much more."""
+"""Tight bounding capsules of shapes."""
 
 from __future__ import annotations
 
@@ -9,38 +9,42 @@ import pytest
 from pydrake.geometry import Box, Cylinder
 from pydrake.geometry import Capsule as CapsuleShape
 
-from drake_teleop.lab.excitation.capsules import Capsule, bounding_capsule
-from drake_teleop.lab.excitation.scene import CLEARANCE, _kept_distance
+from drake_teleop.lab.excitation.collision import (
+    CLEARANCE,
+    Capsule,
+    _minimum_distance,
+    bounding_capsule,
+)
 
 
 @pytest.mark.parametrize("long", [0, 1, 2])
-def test_a_capsule_around_a_beam_lies_along_it(long):
+def test_capsule_of_a_beam_is_parallel_to_it(long):
     size = np.full(3, 0.1)
     size[long] = 1.0
     capsule = bounding_capsule(Box(size))
     for corner in product(*[(-s / 2, s / 2) for s in size]):
         assert capsule.holds(Capsule(np.array([corner, corner]), 0.0))
-    # The beam's edges are 0.071 m from its axis; a ball about it would have 0.505 m.
+    # The beam's edges are 0.071 m from its axis; a ball would need 0.505 m.
     assert 0.0707 <= capsule.radius < 0.15
     ends = np.delete(capsule.ends, long, axis=1)
     np.testing.assert_array_equal(ends, 0.0)
     assert np.abs(capsule.ends[:, long]).max() <= 0.5
 
 
-def test_a_short_beam_has_the_smallest_of_some_capsules():
-    """Ends at 0.9 of its half length: 3 % less volume than at the whole, 6 % less than at 0.8."""
+def test_capsule_of_a_short_beam_has_minimum_volume():
+    """Ends at 0.9 of the half length: 3 % less volume than at 1.0, 6 % less than at 0.8."""
     capsule = bounding_capsule(Box(0.1, 0.1, 0.3))
     np.testing.assert_allclose(np.abs(capsule.ends[:, 2]), 0.9 * 0.15)
     assert capsule.radius == pytest.approx(np.linalg.norm([0.05, 0.05, 0.015]))
 
 
-def test_a_capsule_around_a_rod_is_hardly_thicker():
+def test_capsule_of_a_cylinder_is_tight():
     capsule = bounding_capsule(Cylinder(0.05, 0.8))
     assert 0.05 <= capsule.radius < 0.07
     assert np.ptp(capsule.ends[:, 2]) <= 0.8
 
 
-def test_a_capsule_around_a_capsule_is_that_capsule():
+def test_capsule_of_a_capsule_is_itself():
     capsule = bounding_capsule(CapsuleShape(0.05, 0.8))
     np.testing.assert_array_equal(capsule.ends, [[0.0, 0.0, -0.4], [0.0, 0.0, 0.4]])
     assert capsule.radius == 0.05
@@ -48,17 +52,17 @@ def test_a_capsule_around_a_capsule_is_that_capsule():
 
 @pytest.mark.parametrize(("aside", "radius", "held"), [(0, 0.09, True), (0, 0.11, False),
                          (0.05, 0.04, True), (0.05, 0.06, False), (0.15, 0.0, False)])  # fmt: skip
-def test_a_capsule_holds_another_with_all_of_its_thickness(aside, radius, held):
+def test_containment_of_capsules_includes_their_radius(aside, radius, held):
     ends = np.array([[0.0, 0.0, -0.2], [0.0, 0.0, 0.2]])
     assert Capsule(ends, 0.1).holds(Capsule(0.5 * ends + [0.0, aside, 0.0], radius)) is held
 
 
-def test_what_capsules_keep_allows_for_three_quarters_of_what_they_are_too_large():
-    """Shapes that nearly touch, capsules 0 to 100 mm nearer: 25 mm are allowed for."""
+def test_minimum_distance_subtracts_the_quartile_of_the_excess():
+    """Shapes near contact, capsules 0 to 100 mm nearer: the correction is 25 mm."""
     touching, far = np.linspace(-0.01, 0.004, 101), np.full(101, 0.2)
     nearer = touching - np.linspace(0.0, 0.1, 101)
-    kept = _kept_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
+    kept = _minimum_distance(np.concatenate([touching, far]), np.concatenate([nearer, far]))
     assert kept == pytest.approx(CLEARANCE - 0.025)
-    # But where shapes are free, capsules stay so in nine of ten postures.
+    # Capsules remain free in 90 % of the free postures.
     free = np.linspace(0.06, 0.16, 101)
-    assert _kept_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)
+    assert _minimum_distance(free, free - 0.07) == pytest.approx(0.0, abs=1e-12)

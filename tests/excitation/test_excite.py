@@ -1,4 +1,4 @@
-"""Designs for the station's arm and for others: feasible, checked by other means, and of use."""
+"""Excitations of the station's arm and of other arms: feasibility, check, identification."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def designed(slave):
 
 @pytest.fixture(scope="module")
 def short(slave):
-    """A quick one, for what asks nothing of its quality."""
+    """Return a quick design, for tests that do not need its quality."""
     return excite(slave, starts=1, period=2.4, harmonics=2)
 
 
@@ -73,7 +73,7 @@ def urdf(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed):
+def test_design_for_the_slave_has_a_good_criterion_within_all_limits(slave, designed):
     assert designed.values["kappa_w10"] < 4.3
     assert designed.history[-1, 1] == pytest.approx(designed.values["kappa_w10"], rel=0.01)
     _, qd, qdd = designed.trajectory.evaluate(np.array([0.0, 6.0]))
@@ -83,13 +83,13 @@ def test_the_slaves_motion_is_good_at_rest_and_uses_no_limit_up(slave, designed)
         "position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance"
     }  # fmt: skip
     assert all(0 < use.share <= 1 for use in designed.uses)
-    # Some limit is what stops it, or more would have been better.
+    # A limit must be active, otherwise the optimum would be larger.
     assert designed.uses[0].share > 0.97
     assert slave.limits.phi[0] == pytest.approx(1.3 * 3.13)
 
 
 @pytest.mark.slow
-def test_same_seed_same_trajectory_other_seed_another(slave, short):
+def test_trajectory_depends_on_the_seed_only(slave, short):
     again, other = (
         excite(slave, starts=1, period=2.4, harmonics=2, seed=seed).trajectory for seed in (0, 1)
     )
@@ -98,19 +98,18 @@ def test_same_seed_same_trajectory_other_seed_another(slave, short):
 
 
 @pytest.mark.slow
-def test_the_executed_motion_keeps_the_limits(slave):
-    """The shipped trajectory in the whole simulation, with the station's joint control."""
+def test_executed_motion_respects_the_limits(slave):
     found = identify_load(LoadScenario("identification"))
     t, state = found.result.t, found.result["slave_state"]
     assert np.all(np.diff(t) < 1.001e-3)
     q, qd = state[:, :6], state[:, 6:]
     asked, _, _ = found.trajectory.evaluate(t)
-    # What was executed is not what was asked for: the control follows it with a lag.
+    # The control follows the trajectory with a lag.
     assert 0.01 < np.abs(q - asked).max() < 0.2
     uses = check_motion(slave, t, q, qd, np.gradient(qd, t, axis=0))
     assert len(uses) == len(LIMITS)
     assert all(use.share < 0.995 for use in uses)
-    # The motors' own torque, and what the sensor itself has read.
+    # Torque of the motors, and samples of the sensor.
     limits, wrench = slave.limits, found.result["measured_wrench_S"]
     assert np.all(np.abs(found.result["joint_torque"]) < limits.effort)
     norms = [np.linalg.norm(wrench[:, part], axis=1).max() for part in (slice(0, 3), slice(3, 6))]
@@ -119,8 +118,7 @@ def test_the_executed_motion_keeps_the_limits(slave):
 
 
 @pytest.mark.slow
-def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, monkeypatch):
-    """The link with the sensor is where the arm's own kinematics has it."""
+def test_replay_shows_the_designed_motion(slave, short, tmp_path, monkeypatch):
     shown = {}
 
     class Canvas:
@@ -155,7 +153,7 @@ def test_the_film_shows_the_motion_that_was_designed(slave, short, tmp_path, mon
 
 @njit
 def record(constants, memory, estimator, remembered, table, truth, noise, samples):
-    """The sensor's chain and the motion estimation, over a whole record."""
+    """Return a record through sensor chain and motion estimation."""
     reading = np.empty(truth.shape[1] - 2)
     for k in range(len(truth)):
         read_into(constants, memory, noise[k // NOISE_BLOCK], truth[k], reading)
@@ -165,10 +163,7 @@ def record(constants, memory, estimator, remembered, table, truth, noise, sample
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["accelerometer", "fused", "encoders"])
 def test_predicted_and_observed_scatter_agree(slave, short, source):
-    """200 records of one motion: noise, walks, quantisation, filter, estimated motion.
-
-    What the sensor is given is the same each time, so it is calculated once.
-    """
+    """200 noisy records of one motion; the noise-free sensor input is calculated once."""
     sensor, motion, period = WristSensorConfig(), MotionEstimationConfig(source), 1 / 2000
     table, phi = slave.arm.table, slave.limits.phi / 1.3
     t = np.arange(0.0, 2.4, period)
@@ -195,11 +190,11 @@ def test_predicted_and_observed_scatter_agree(slave, short, source):
 
 
 @pytest.mark.slow
-def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, designed):
+def test_prediction_uses_the_heaviest_load_and_the_sensor(slave, designed):
     motion = sensor_motion(slave, designed.trajectory)
     predicted = predicted_deviations(*motion, 1e-3, slave.noise, slave.limits.phi)
     np.testing.assert_allclose(designed.deviations, predicted, rtol=1e-12)
-    # The accelerometer alone makes it worse than corrected by the encoders, these alone better.
+    # Deviations: encoders only < fused < accelerometer only.
     encoders, fused, accelerometer = (
         predicted_deviations(
             *motion,
@@ -214,11 +209,11 @@ def test_what_is_predicted_is_of_the_heaviest_load_and_of_the_sensor(slave, desi
 
 
 @pytest.mark.slow
-def test_the_check_finds_every_kind_of_violation(slave, short):
-    """The same motion in a world where each limit in turn is a little less than what it uses."""
+def test_check_finds_a_violation_of_each_limit(slave, short):
+    """Each limit in turn is a little below its use by the same motion."""
     uses = {use.limit: use.share for use in short.uses}
     limits = slave.limits
-    # Nothing may be so near that the check looks at it; with this clearance it does.
+    # Without this clearance all pairs could be beyond the search distance.
     wide = dataclasses.replace(slave, limits=limits._replace(clearance=0.2))
     distance = (
         0.2 / next(use for use in check(wide, short.trajectory) if use.limit == "clearance").share
@@ -240,7 +235,7 @@ def test_the_check_finds_every_kind_of_violation(slave, short):
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("axis", range(3))
-def test_a_box_is_left_on_either_side(slave, axis, side):
+def test_check_finds_both_sides_of_the_box(slave, axis, side):
     limits, still = slave.limits, np.zeros((1, 6))
     aside = limits.box_middle + 5 * side * limits.box_half * np.eye(3)[axis]
     moved = dataclasses.replace(slave, limits=limits._replace(box_middle=aside))
@@ -250,7 +245,7 @@ def test_a_box_is_left_on_either_side(slave, axis, side):
 
 
 @pytest.mark.slow
-def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
+def test_check_finds_self_collision_and_table_contact(slave):
     t = np.zeros((6, 2))
     for q, bodies in (
         ([0, -1.9, -2.4, 0, -1.5, 0], {"tool", "link_1", "base", "link_2", "link_6", "link_5"}),
@@ -262,8 +257,8 @@ def test_an_arm_that_folds_into_itself_and_the_table_is_caught(slave):
         assert bodies & set(clearance.what.split(" and "))
 
 
-def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
-    """A shape larger than its link, as the convex hull of a mesh is."""
+def test_shapes_that_touch_in_the_start_posture_are_excluded(urdf):
+    """A shape larger than its link, such as the convex hull of a mesh."""
     text = urdf.read_text()
     assert text.count('size="0.2 0.2 0.1"') == 1
     slave = Slave(
@@ -273,21 +268,20 @@ def test_what_touches_where_the_arm_stands_is_not_kept_apart(urdf):
         home=[0.0, 0.3, 1.4, 0.0, 1.4, 0.0],
     )
     free = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
-    assert not any("not kept apart" in text for text in free.assumptions)
+    assert not any("no clearance required" in text for text in free.assumptions)
     urdf.write_text(text.replace('size="0.2 0.2 0.1"', 'size="0.6 0.6 1.6"'))
     found = RobotFromScenario(replace(LoadScenario("free_motion_force"), slave=slave))
-    named = next(text for text in found.assumptions if "not kept apart" in text)
+    named = next(text for text in found.assumptions if "no clearance required" in text)
     assert "l0 and l3" in named and "l0 and l6" not in named
     assert "l0 and l2" not in named  # they touch in all postures
     still = FourierTrajectory(found.home, np.zeros((1, 6)), np.zeros((1, 6)), 1.0)
     assert all(use.share < 1 for use in check(found, still))
-    assert len(found.limits.pairs) > 0  # of the others
+    assert len(found.limits.pairs) > 0  # other pairs
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["contact_transition", "peg_in_slot"])
-def test_what_a_scenario_has_to_touch_is_not_touched(name):
-    """The sheet spring, or the slot, stands in the room in which the tool moves."""
+def test_environment_of_the_scenario_is_avoided(name):
     robot = RobotFromScenario(LoadScenario(name))
     found = excite(robot, starts=2, period=2.4, harmonics=2)
     assert all(use.share <= 1 for use in found.uses)
@@ -303,7 +297,7 @@ def test_what_a_scenario_has_to_touch_is_not_touched(name):
 
 
 @pytest.mark.slow
-def test_what_the_readme_shows(tmp_path, monkeypatch):
+def test_readme_output(tmp_path, monkeypatch):
     (tmp_path / "models").symlink_to(models_dir())
     monkeypatch.chdir(tmp_path)
     type_in("README.md", ".venv/bin/drake-teleop excite")
@@ -313,7 +307,7 @@ def test_what_the_readme_shows(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, capsys):
+def test_infeasible_design_writes_no_file(slave, tmp_path, capsys):
     box = slave.limits._replace(box_half=np.full(3, 0.01))
     with pytest.raises(DrakeTeleopError, match="no trajectory was found that respects all limits"):
         excite(dataclasses.replace(slave, limits=box), harmonics=2, starts=1)
@@ -327,7 +321,7 @@ def test_an_infeasible_design_is_never_returned_nor_written(slave, tmp_path, cap
 
 
 @pytest.mark.slow
-def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
+def test_identification_refuses_an_unsuitable_trajectory(short):
     scenario = LoadScenario("identification")
     with pytest.raises(DrakeTeleopError, match=r"period is 2\.4 s, the simulation lasts 6 s"):
         identify_load(scenario, trajectory=short.trajectory)
@@ -339,7 +333,7 @@ def test_a_trajectory_that_does_not_fit_the_run_is_refused(short):
         identify_load(fitting, trajectory=dataclasses.replace(short.trajectory, **less))
 
 
-def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
+def test_missing_values_of_a_urdf_are_listed_as_assumptions(urdf):
     robot = RobotFromModel(urdf, "l6", WristSensorConfig())
     assert robot.arm.joint_names == ("j1", "j2", "j3", "j4", "j5", "j6")
     words = "; ".join(robot.assumptions)
@@ -347,7 +341,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert "a speed limit of 3.142 rad/s for j5" in words
     assert "acceleration limits that reach full speed in 0.4 s (--acceleration) for all" in words
     assert "shapes are missing of l3, l4, l5: meshes were not found (--package-path" in words
-    # 80 % of what the model says; the gripper with its finger is the load, and 30 % more.
+    # 80 % of the model's limits; the load is gripper and finger plus 30 %.
     np.testing.assert_allclose(robot.limits.effort, 0.8 * np.array([200, 200, 150, 30, 30, 15]))
     np.testing.assert_allclose(robot.limits.acceleration[:2], [7.5, 6.25])
     assert robot.limits.phi[0] == pytest.approx(1.3 * 0.9)
@@ -360,7 +354,7 @@ def test_what_a_urdf_lacks_is_assumed_and_named(urdf):
     assert found.limits.phi[0] == pytest.approx(3.0)
 
 
-def test_a_mesh_that_cannot_be_read_is_named(urdf):
+def test_error_names_an_unreadable_mesh(urdf):
     parts = urdf.parent / "somewhere" / "parts"
     (parts / "forearm.obj").rename(parts / "forearm.dae")
     urdf.write_text(urdf.read_text().replace("forearm.obj", "forearm.dae"))
@@ -369,8 +363,8 @@ def test_a_mesh_that_cannot_be_read_is_named(urdf):
     assert "shapes are missing of l3: .dae meshes cannot be read (convert them to .obj" in words
 
 
-def test_links_that_always_touch_are_neighbours(urdf):
-    """Two pairs, not next to each other in the chain: it is not Drake that leaves them out."""
+def test_links_that_always_touch_are_excluded(urdf):
+    """The two pairs are not adjacent, so Drake's own filter does not exclude them."""
     text = urdf.read_text()
     for shape in (
         '<mesh filename="package://absent/wrist.stl"/>',
@@ -393,7 +387,7 @@ def test_links_that_always_touch_are_neighbours(urdf):
         ('"floating">', "l3 floats on l2"),
     ],
 )
-def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
+def test_chain_with_an_unsupported_joint_is_refused(urdf, joint, expected):
     text = urdf.read_text().replace('name="j3" type="revolute">', f'name="j3" type={joint}')
     urdf.write_text(text)
     with pytest.raises(DrakeTeleopError, match=expected):
@@ -422,7 +416,7 @@ def test_a_chain_that_drake_would_cut_is_refused(urdf, joint, expected):
         ('izz="0.015"', 'izz="-0.015"', "link l3: no body has this inertia"),
     ],
 )
-def test_what_cannot_be_true_of_an_arm_is_refused(urdf, old, new, expected):
+def test_implausible_model_is_refused(urdf, old, new, expected):
     text = urdf.read_text()
     assert old in text
     urdf.write_text(text.replace(old, new, 1))
@@ -430,7 +424,7 @@ def test_what_cannot_be_true_of_an_arm_is_refused(urdf, old, new, expected):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
 
-def test_an_sdf_is_checked_too(tmp_path):
+def test_implausible_sdf_is_refused(tmp_path):
     path = write_sdf(tmp_path)
     path.write_text(path.read_text().replace("<izz>0.04</izz>", "<izz>4</izz>", 1))
     with pytest.raises(DrakeTeleopError, match="link l0: no body has this inertia"):
@@ -453,8 +447,8 @@ def _joint(parent, child):
         (("ab", "cb"), "m::m::b hangs on two joints, ab and cb"),
     ],
 )
-def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
-    """Drake reads what a model includes, after `check_model`."""
+def test_included_models_are_checked(tmp_path, ends, expected):
+    """Drake reads included models after `check_model`."""
     (tmp_path / "inside.sdf").write_text(_SDF.format(_LINKS + "".join(_joint(*e) for e in ends)))
     model = tmp_path / "model.sdf"
     model.write_text(_SDF.format(f"<include><uri>{tmp_path.as_uri()}/inside.sdf</uri></include>"))
@@ -462,7 +456,7 @@ def test_the_tree_of_another_file_is_checked_too(tmp_path, ends, expected):
         ParseModel(MultibodyPlant(0.0), model, "c")
 
 
-def test_models_inside_a_model_have_names_of_their_own(tmp_path):
+def test_nested_models_may_repeat_names(tmp_path):
     joints = _joint("a", "b") + _joint("b", "c")
     inside = [f"<model name='{name}'>{_LINKS}{joints}</model>" for name in ("n", "o")]
     inside += ["<link name='hand'/>", _joint("o::b", "hand"), _joint("n::c", "o::a")]
@@ -474,19 +468,19 @@ def test_models_inside_a_model_have_names_of_their_own(tmp_path):
 @pytest.mark.parametrize(
     "entity", ["<!DOCTYPE robot SYSTEM 'a.dtd'>", "<!DOCTYPE robot [<!ENTITY e SYSTEM 'a.txt'>]>"]
 )
-def test_no_part_of_a_model_is_left_out_unsaid(urdf, entity):
+def test_undefined_xml_entity_is_refused(urdf, entity):
     urdf.write_text(entity + urdf.read_text().replace("</robot>", "&e;</robot>"))
     with pytest.raises(DrakeTeleopError, match=r"is not XML \(the entity e is not in this file"):
         ParseModel(MultibodyPlant(0.0), urdf, "l6")
 
 
-def test_the_world_hangs_on_nothing(urdf):
+def test_world_as_child_of_a_joint_is_refused(urdf):
     urdf.write_text(urdf.read_text().replace('"l6"', '"world"'))
     with pytest.raises(DrakeTeleopError, match="world hangs on j6"):
         ParseModel(MultibodyPlant(0.0), urdf, "l3")
 
 
-def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
+def test_late_error_of_drake_is_one_error(urdf, monkeypatch):
     def refused(_):
         raise RuntimeError("form one or more loops")
 
@@ -495,7 +489,7 @@ def test_what_drake_refuses_at_last_is_one_error(urdf, monkeypatch):
         RobotFromModel(urdf, "l6", WristSensorConfig())
 
 
-def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
+def test_package_may_have_the_name_drake(tmp_path):
     (tmp_path / "drake").mkdir()
     (tmp_path / "drake" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     shape = "<geometry><mesh><uri>package://drake/a.obj</uri></mesh></geometry>"
@@ -506,11 +500,8 @@ def test_a_package_may_have_the_name_of_drakes_own(tmp_path):
     assert not any("shapes" in words for words in found.assumptions)
 
 
-def test_a_floor_without_end_is_kept_clear_of(tmp_path):
-    """A pendulum of 0.4 m above it, of which nobody knows how far it may swing.
-
-    While 1001 samples are looked at, it is said how far that is, now and then.
-    """
+def test_clearance_to_a_plane_is_checked(tmp_path):
+    """A pendulum of 0.4 m above the floor."""
     model = tmp_path / "pendulum.xml"
     model.write_text("""<mujoco model="m"><worldbody><geom type="plane" size="0 0 1" pos="0 0 0.8"/>
     <body name="base" pos="0 0 1"><geom type="sphere" size="0.01" mass="1"/><body name="l1">
@@ -527,7 +518,7 @@ def test_a_floor_without_end_is_kept_clear_of(tmp_path):
         assert (share <= 1) == is_free
 
 
-def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
+def test_drake_elements_are_read_with_any_namespace(tmp_path):
     path, plant = write_sdf(tmp_path), MultibodyPlant(0.0)
     path.write_text(path.read_text().replace('"drake.mit.edu"', f'"{tmp_path}"'))
     ParseModel(plant, path, "wrist")
@@ -535,7 +526,7 @@ def test_elements_of_drakes_own_are_read_whatever_address_they_have(tmp_path):
     np.testing.assert_array_equal(plant.GetAccelerationUpperLimits(), 10.0 + 2.0 * np.arange(7))
 
 
-def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
+def test_zero_range_and_zero_mass_are_replaced_by_assumptions(urdf):
     text = urdf.read_text().replace('lower="0.1" upper="2.6"', 'lower="0" upper="0"')
     nothing = re.sub(r'"0.3"/>(<inertia .*?/>)', '"0"/>', text, count=1)
     urdf.write_text(nothing)
@@ -550,13 +541,13 @@ def test_limits_and_inertias_of_nothing_are_assumptions(urdf):
         (["--sensor-frame", "nose"], "no frames are named 'nose'"),
         (["--sensor-frame", "l6", "--acceleration", "1,2"], "2 acceleration limits for 6 joints"),
         (["--sensor-frame", "l6", "--acceleration", "fast"], "--acceleration"),
-        (["--sensor-frame", "l6", "--payload", "0.1"], "holds 0.9 kg beyond the sensor"),
+        (["--sensor-frame", "l6", "--payload", "0.1"], "already contains 0.9 kg beyond the sensor"),
         (["--sensor-frame", "l6", "--payload", "1e-9"], "1e-09 kg is outside 0.001 to 10000 kg"),
         (["--sensor-frame", "l0"], "no moving joint"),
         ([], "--sensor-frame"),
     ],
 )
-def test_a_model_that_cannot_be_used_is_one_error_line(urdf, tmp_path, capsys, options, expected):
+def test_unusable_model_gives_one_error_line(urdf, tmp_path, capsys, options, expected):
     out = str(tmp_path / "out")
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--model", str(urdf), *options, "--quiet", "--out", out])
@@ -568,7 +559,7 @@ def test_a_model_that_cannot_be_used_is_one_error_line(urdf, tmp_path, capsys, o
 
 @pytest.mark.parametrize("text", ["", "<robot", "<robot name='r'><link name='a'/>", "hello"])
 @pytest.mark.parametrize("name", ["a.urdf", "a.sdf", "a.txt"])
-def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text):
+def test_file_without_robot_gives_one_error_line(tmp_path, capsys, name, text):
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(SystemExit) as stop:
@@ -578,7 +569,7 @@ def test_a_file_that_is_no_robot_is_one_error_line(tmp_path, capsys, name, text)
     assert error.startswith("error: ") and error.count("\n") == 1 and name in error
 
 
-def test_options_of_models_need_one(capsys, tmp_path):
+def test_model_options_require_a_model(capsys, tmp_path):
     with pytest.raises(SystemExit) as stop:
         main(["excite", "--payload", "2", "--quiet", "--out", str(tmp_path)])
     assert (stop.value.code, capsys.readouterr().err) == (2, "error: --payload: needs --model\n")
@@ -588,7 +579,7 @@ def test_options_of_models_need_one(capsys, tmp_path):
     scope="module", params=[(write_urdf, "l6", 6), (write_sdf, "wrist", 7)], ids=["urdf", "sdf"]
 )
 def foreign(request, tmp_path_factory):
-    """An arm, its trajectory by the command line, and how it ran it with 1.2 kg on the sensor."""
+    """Return an arm, its trajectory from the command line, and its execution with 1.2 kg."""
     write, frame, joints = request.param
     folder = tmp_path_factory.mktemp("arm")
     path, out = write(folder), folder / "excite"
@@ -603,7 +594,7 @@ def foreign(request, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_written_for_any_arm(foreign):
+def test_files_for_other_arms(foreign):
     out, joints, recording = foreign
     summary = json.loads((out / "summary.json").read_text())
     assert all(use["share"] <= 1 for use in summary["limit_use"].values())
@@ -614,13 +605,13 @@ def test_what_is_written_for_any_arm(foreign):
     q = table.select([f"q_j{k + 1}" for k in range(joints)]).to_numpy()
     trajectory = FourierTrajectory.load(out / "excitation.yaml")
     np.testing.assert_allclose(trajectory.evaluate(table["t"].to_numpy())[0], q, atol=1e-12)
-    # It was run, but not exactly.
+    # Executed with tracking errors.
     executed = recording.q[200:-200]
     assert 1e-4 < np.abs(executed - q).max() < 0.01
 
 
 def write_canonical(folder, t, readings, recording):
-    """Wrench and IMU by one clock."""
+    """Write wrench and IMU with one clock."""
     rng = np.random.default_rng(1)
     omega = recording.truth[:, 9:12] + 2e-3 * rng.standard_normal((len(t), 3))
     parts = {
@@ -637,7 +628,7 @@ def write_canonical(folder, t, readings, recording):
 
 
 def write_described(folder, t, readings, recording):
-    """Wrench of the other sign, and the pose that the arm's controller gives, at 500 Hz."""
+    """Write the opposite wrench, and the controller's pose at 500 Hz."""
     names = ["fx", "fy", "fz", "tx", "ty", "tz"]
     pl.DataFrame({"t": t} | dict(zip(names, -readings[:, :6].T, strict=True))).write_csv(
         folder / "wrench.csv"
@@ -659,8 +650,8 @@ def write_described(folder, t, readings, recording):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("write_log", [write_canonical, write_described])
-def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
-    """Excited, executed, measured with a noisy sensor, written as a log, identified."""
+def test_identified_load_of_another_arm_is_true(foreign, write_log, tmp_path):
+    """Design, execution, noisy measurement, log file, identification."""
     _, joints, recording = foreign
     sensor = dataclasses.replace(
         without(PRESETS["ati_gamma_imu"], "place", "latency"), acceleration_offset=[0.0] * 6
@@ -678,7 +669,7 @@ def test_identify_closes_the_loop_on_any_arm(foreign, write_log, tmp_path):
     assert stop.value.code == 0
     found = Identification.load(tmp_path / "load" / "identification.json")
     assert found.identifiable.all()
-    # A motion differentiated from poses has errors of its own, about as large as the stated ones.
+    # Differentiated poses add errors of about the stated size.
     deviations = found.standard_deviations[6:] * (1.0 if write_log is write_canonical else 2.0)
     assert np.abs((found.phi - recording.phi) / deviations).max() < 3.9  # 99.9 % for all ten
     mass, com, inertia = mass_com_inertia(recording.phi)

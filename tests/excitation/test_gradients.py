@@ -1,4 +1,4 @@
-"""Criteria and limits: what their docstrings say, and gradients against finite differences."""
+"""Criteria and limits: documented values, and gradients against finite differences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from drake_teleop.lab.excitation.criteria import (
     Scales,
     characteristic_length,
 )
-from drake_teleop.lab.excitation.design import _Search
 from drake_teleop.lab.excitation.limits import (
     CLEARANCE_SCALE,
     LIMITS,
@@ -26,8 +25,8 @@ from drake_teleop.lab.excitation.limits import (
     limit_uses,
     motions_of,
 )
-from drake_teleop.lab.excitation.prediction import SensorNoise, _correction, predicted_deviations
-from drake_teleop.lab.excitation.problem import Problem, Task
+from drake_teleop.lab.excitation.optimizer import Problem, Task, _Search
+from drake_teleop.lab.excitation.prediction import SensorNoise, _error_filter, predicted_deviations
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import regressor
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig, motion_gains
@@ -49,7 +48,7 @@ def value(name: str, samples: np.ndarray, duration: float = 1.0) -> float:
     return Criterion(name, SCALES).value(*samples, duration)
 
 
-def test_condition_numbers_are_what_their_docstring_says():
+def test_condition_numbers_match_their_definition():
     samples = motion(300)
     V = regressor(*samples)
     rows = np.array(3 * [0.3] + 3 * [0.02])
@@ -61,8 +60,8 @@ def test_condition_numbers_are_what_their_docstring_says():
     assert value("kappa16", samples) == pytest.approx(np.linalg.cond(with_offsets), rel=1e-7)
 
 
-def test_the_floor_of_kappa10_is_reached_and_never_passed():
-    """sqrt(8/3) for any motion; reached by isotropic, uncorrelated s and alpha, alpha^2 = 3 s^2."""
+def test_kappa10_reaches_its_lower_bound():
+    """The bound sqrt(8/3) needs isotropic, uncorrelated s and alpha with alpha^2 = 3 s^2."""
     axes = np.vstack([np.eye(3), -np.eye(3)])
     s = np.repeat(axes, 6, axis=0)
     alpha = np.sqrt(3) * np.tile(axes, (6, 1))
@@ -74,18 +73,18 @@ def test_the_floor_of_kappa10_is_reached_and_never_passed():
 
 
 @pytest.mark.parametrize("name", CRITERIA)
-def test_a_motion_that_determines_too_little_has_no_finite_value(name):
+def test_singular_motion_has_infinite_criteria(name):
     s = np.random.default_rng(5).standard_normal((50, 3))
     assert value(name, (s, 0 * s, 0 * s)) == np.inf
 
 
-def test_an_unknown_criterion_lists_the_known_ones():
+def test_unknown_criterion_error_lists_the_known_ones():
     with pytest.raises(DrakeTeleopError, match="kappa_w10, kappa10"):
         Criterion("kappa11", SCALES)
 
 
 def test_predicted_deviations_are_those_of_white_noise():
-    """Spread of weighted least squares over 400 draws, and A16 and D16 from the same covariance."""
+    """Scatter of weighted least squares over 400 draws; A16 and D16 from the same covariance."""
     samples = motion(200, seed=2)
     sigma = np.repeat(SCALES.noise, 3)
     rows = np.concatenate([np.tile(np.eye(6), (200, 1, 1)), regressor(*samples)], axis=2)
@@ -105,21 +104,21 @@ def test_predicted_deviations_are_those_of_white_noise():
     assert value("D16", samples, 0.2) == pytest.approx(mean_axis, rel=1e-6)
 
 
-def test_what_the_filter_leaves_of_an_accelerations_noise_has_the_filters_poles():
-    """Of the station's filter, a step of which predicts by (1, T, T^2 / 2) and then corrects."""
-    T = 1 / 32000  # so short that the filter is nearly the continuous one
+def test_error_filter_has_the_poles_of_the_motion_filter():
+    """One filter step predicts by (1, T, T^2 / 2) and then corrects."""
+    T = 1 / 32000  # the filter is then nearly continuous
     for filter_ in motion_gains(MotionEstimationConfig("fused"), WristSensorConfig(), 6, T):
-        numerator, denominator = _correction(filter_, T)
+        numerator, denominator = _error_filter(filter_, T)
         predict = np.array([[1.0, T, T**2 / 2], [0.0, 1.0, T], [0.0, 0.0, 1.0]])
         correct = np.eye(3) - np.outer(filter_.gains, [1.0, 0.0, 0.0])
         poles = np.sort_complex(np.log(np.linalg.eigvals(correct @ predict).astype(complex)) / T)
         found = np.sort_complex(np.roots(denominator).astype(complex))
         np.testing.assert_allclose(found, poles, rtol=0.015)
-        # All of it at high frequencies, nothing at rest: there the encoders are believed.
+        # High frequencies pass; at zero frequency the encoders replace the accelerometer.
         assert numerator[0] == denominator[0] and numerator[-1] == 0.0
 
 
-def test_the_length_is_never_above_the_radius_of_gyration():
+def test_characteristic_length_is_at_most_the_radius_of_gyration():
     assert characteristic_length(PHI) == pytest.approx(0.1, rel=0.05)
     far = phi_from_mass_com_inertia(2.0, [0, 0, 0.3], 0.01 * np.eye(3))
     assert characteristic_length(far) == 0.1
@@ -128,7 +127,7 @@ def test_the_length_is_never_above_the_radius_of_gyration():
 
 
 def limits_of(arm) -> Limits:
-    """All of them in reach of a moderate motion, three capsules, one of them still."""
+    """Return limits near a moderate motion, with three capsules, one of them fixed."""
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
     return Limits(
         q_middle=middle,
@@ -165,7 +164,7 @@ def arm():
     ("name", "sliding"), [*((name, []) for name in CRITERIA), ("kappa_w10", [0, 3])]
 )
 def test_gradients_of_criterion_and_limits(arm, name, sliding):
-    # With damping, which the station's arm has not; and as if some of its joints slid.
+    # Add damping, and make some joints prismatic.
     table = arm.table.copy()
     table[:-1, 23] = 0.5
     table[sliding, SLIDES] = 1.0
@@ -184,7 +183,7 @@ def test_gradients_of_criterion_and_limits(arm, name, sliding):
         np.testing.assert_allclose(gradients[:, k] / scale, numeric / scale, rtol=0, atol=2e-5)
 
 
-def test_the_largest_use_of_each_limit_is_that_of_its_definition(arm):
+def test_largest_use_of_each_limit_matches_its_definition(arm):
     limits, rng = limits_of(arm), np.random.default_rng(3)
     q = np.array([0.1, -0.5, -1.8, 0.2, -0.9, 3.0]) + 0.3 * rng.normal(size=(30, 6))
     qd, qdd = rng.normal(size=(2, 30, 6))
@@ -206,11 +205,11 @@ def test_the_largest_use_of_each_limit_is_that_of_its_definition(arm):
         "clearance": 1.0 - (distances - limits.distances) / CLEARANCE_SCALE,
     }.items():
         assert found[name] == pytest.approx(expected.max(), rel=1e-12), name
-    # 1 is where two capsules keep just what they have to.
+    # A use of 1 is the minimum distance.
     assert (found["clearance"] > 1.0) == (distances < limits.distances).any()
 
 
-def test_candidates_begin_all_over_the_middle_of_the_range(arm):
+def test_candidates_cover_the_middle_of_the_range(arm):
     limits, rng = limits_of(arm), np.random.default_rng(1)
     home = np.zeros(6)
     problem = Problem(Task(arm.table, limits, Criterion("kappa_w10", SCALES), home, 6.0, 3))
@@ -221,8 +220,7 @@ def test_candidates_begin_all_over_the_middle_of_the_range(arm):
     assert np.abs(near - home).max() < 0.5
 
 
-def test_slow_candidates_are_large_as_the_square_of_their_period(arm):
-    """Of the same accelerations, where velocities and the range have room."""
+def test_candidate_size_grows_with_the_square_of_the_period(arm):
     wide = np.full(6, 1e3)
     limits = limits_of(arm)._replace(q_half=wide, velocity=wide, acceleration=np.ones(6))
     coefficients = []
@@ -234,8 +232,7 @@ def test_slow_candidates_are_large_as_the_square_of_their_period(arm):
 
 
 def test_the_best_candidates_within_the_limits_are_followed_first():
-    """Slack in the limits is worth nothing, but what is beyond them costs."""
-    numbers = count(-1)  # the search evaluates one before it begins
+    numbers = count(-1)  # the search evaluates one in advance
     uses = {0: 1.5, 60: 0.1}
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.array([next(numbers)]),
@@ -248,7 +245,7 @@ def test_the_best_candidates_within_the_limits_are_followed_first():
     assert [int(next(followed)[0]) for _ in range(8)] == list(range(1, 9))
 
 
-def test_what_is_better_is_noted_with_its_start_and_its_evaluations():
+def test_improving_iterates_are_recorded_with_start_and_evaluations():
     values = iter([3.0, 2.0, 2.5, 1.5])
     problem = SimpleNamespace(
         candidate=lambda rng, near_home: np.zeros(1),
@@ -259,13 +256,13 @@ def test_what_is_better_is_noted_with_its_start_and_its_evaluations():
     search = _Search(problem, 9, None, lambda *_: None)
     search.start = 7
     for k in range(4):
-        search._at(np.array([float(k)]), 3.0, 5.0)
+        search._evaluate_once(np.array([float(k)]), 3.0, 5.0)
     noted = [(x.evaluations, x.start, x.value, x.trajectory) for x in search.found]
     assert noted == [(1, 7, 3.0, 0), (2, 7, 2.0, 1), (4, 7, 1.5, 3)]
 
 
 def test_distances_of_capsules():
-    """Crossing lines, parallel segments, end to end, and points."""
+    """Crossing lines, parallel segments, collinear segments, points."""
     ends = np.array(
         [
             [[-1.0, 0, 0], [1, 0, 0]],

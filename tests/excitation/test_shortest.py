@@ -1,4 +1,4 @@
-"""The shortest motion that makes a load known."""
+"""Shortest motion for a tolerance of the load."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.excitation import shortest as module
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.excite import sensor_motion
+from drake_teleop.lab.excitation.optimizer import Task
 from drake_teleop.lab.excitation.prediction import predicted_covariance
-from drake_teleop.lab.excitation.problem import Task
 from drake_teleop.lab.excitation.robot import Robot, RobotFromScenario
 from drake_teleop.lab.excitation.shortest import ShortestProblem, reliable_factor, shortest
 from drake_teleop.load.tolerance import deviations_of, errors_of, read_tolerance
@@ -30,13 +30,13 @@ def problem_of(slave: Robot, times: float = 1.0) -> ShortestProblem:
     return ShortestProblem(task, times * errors_of(ASKED, slave.limits.phi), slave, None)
 
 
-def test_ten_numbers_at_once_need_more_than_one() -> None:
+def test_reliable_factor_grows_with_the_number_of_tolerances() -> None:
     assert reliable_factor(1) == pytest.approx(1.96, abs=0.001)
     assert pytest.approx(0.95, abs=1e-3) == (1 - 2 * 0.0025573) ** 10
     assert reliable_factor(10) == pytest.approx(2.7996, abs=1e-3)
 
 
-def test_gradients_are_differences(slave: Robot) -> None:
+def test_gradients_equal_finite_differences(slave: Robot) -> None:
     problem, rng = problem_of(slave), np.random.default_rng(0)
     x = problem.candidate(rng, near_home=True)
     x[-1] = np.log(1.2)
@@ -47,8 +47,7 @@ def test_gradients_are_differences(slave: Robot) -> None:
         np.testing.assert_allclose(differences, 2 * at.gradients @ step, rtol=1e-4, atol=1e-11)
 
 
-def test_what_is_asked_is_the_deviation_over_the_period(slave: Robot) -> None:
-    """Of the samples of the grid, all of which white noise of the sensor's density falls on."""
+def test_tolerance_use_follows_from_white_noise_over_the_period(slave: Robot) -> None:
     problem = problem_of(slave)
     x = problem.candidate(np.random.default_rng(1), near_home=True)
     x[-1] = np.log(2.0)
@@ -60,18 +59,18 @@ def test_what_is_asked_is_the_deviation_over_the_period(slave: Robot) -> None:
 
 
 @pytest.mark.slow
-def test_it_reaches_what_is_asked_within_all_limits(
+def test_shortest_motion_reaches_the_tolerance_within_all_limits(
     slave: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_IN_VAIN", 0)
+    monkeypatch.setattr(module, "_MAX_VAIN_ROUNDS", 0)
     found = shortest(slave, read_tolerance("mass 0.5 %, com 0.5 mm, inertia 5 %"), starts=1)
     assert 3 / 15.0 <= found.excitation.trajectory.period < 0.5
     assert 0.3 < found.reached.max() <= 1.0
     assert all(use.share <= 1.0 for use in found.excitation.uses)
 
 
-def test_the_search_knows_what_is_predicted(slave: Robot) -> None:
-    """But for random walks; without the accelerometer's noise it would be wrong 2 to 5 times."""
+def test_search_noise_is_close_to_the_prediction(slave: Robot) -> None:
+    """Without the accelerometer's noise the factor would be 2 to 5."""
     problem, errors = problem_of(slave), errors_of(ASKED, slave.limits.phi)
     x = problem.candidate(np.random.default_rng(2), near_home=True)
     x[-1] = np.log(1.2)
@@ -81,7 +80,7 @@ def test_the_search_knows_what_is_predicted(slave: Robot) -> None:
     np.testing.assert_allclose(known, deviations_of(errors, covariance), rtol=0.03)
 
 
-def test_what_is_out_of_reach_is_said(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_LOST", 1)
+def test_unreachable_tolerance_is_an_error(slave: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_MAX_EMPTY_ROUNDS", 1)
     with pytest.raises(DrakeTeleopError, match="no motion within the limits"):
         shortest(slave, read_tolerance("inertia 0.00001 %"), starts=1)

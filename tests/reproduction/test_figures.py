@@ -1,4 +1,4 @@
-"""The figures' layout: one scale, the master's axis, what is marked where."""
+"""Layout of the figures: equal scales, axis of the master, marks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def render(figure) -> bytes:
     return buffer.getvalue()
 
 
-def test_all_subplots_have_the_same_scale_and_show_everything():
+def test_subplots_share_a_scale_that_contains_all_data():
     figure = scaling()
     low, high = figure.axes[0].get_ylim()
     assert all(axes.get_ylim() == (low, high) for axes in figure.axes)
@@ -47,15 +47,15 @@ def test_all_subplots_have_the_same_scale_and_show_everything():
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_the_right_hand_axis_is_the_masters():
+def test_right_axis_shows_values_at_the_master():
     figure = scaling()
-    render(figure)  # secondary axes get their limits when they are drawn
+    render(figure)  # drawing sets the limits of secondary axes
     (right,) = figure.axes[0].child_axes
     np.testing.assert_allclose(np.array(right.get_ylim()) * 17.5, figure.axes[0].get_ylim())
     assert right.get_ylabel() == "at the master [N]"
 
 
-def test_notes_state_the_peaks_and_the_titles_sigma():
+def test_notes_contain_peaks_and_titles_contain_sigma():
     first, middle, last = scaling().axes
     assert first.get_title("right").startswith("peak 100 N")
     assert "5.71 N at the master" in first.get_title("right")
@@ -65,13 +65,13 @@ def test_notes_state_the_peaks_and_the_titles_sigma():
 
 
 @pytest.mark.parametrize(("stretch", "unit", "end"), [(1, "t [ms]", 800.0), (5, "t [s]", 4.0)])
-def test_time_is_in_milliseconds_as_in_the_paper_until_it_gets_long(stretch, unit, end):
+def test_time_axis_is_in_milliseconds_up_to_two_seconds(stretch, unit, end):
     bottom = scaling(stretch * T).axes[-1]
     assert bottom.get_xlabel() == unit
     assert bottom.get_xlim() == (0, end)
 
 
-def test_contact_is_shaded_and_marked_where_it_is():
+def test_contact_is_shaded_and_marked():
     upper, lower = contact().axes
     assert upper.get_ylim() == lower.get_ylim()
     for axes in (upper, lower):
@@ -88,7 +88,7 @@ def test_contact_is_shaded_and_marked_where_it_is():
     assert "threshold 3.00 N" in lower.get_title("right")
 
 
-def test_no_contact_at_all_is_drawn_without_its_mark():
+def test_figure_without_contact_has_no_contact_mark():
     upper, lower = contact(contact=np.zeros(len(T), bool), turning_s=None).axes
     assert not upper.patches and not upper.texts
     assert [text.get_text() for text in lower.texts] == ["detected"]
@@ -96,6 +96,6 @@ def test_no_contact_at_all_is_drawn_without_its_mark():
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_the_same_data_draw_the_same_picture():
+def test_picture_is_reproducible():
     assert render(scaling()) == render(scaling())
     assert render(contact()) != render(contact(detected_s=0.3))

@@ -1,4 +1,4 @@
-"""The report: verdicts follow from the numbers, the page stands alone, nothing is made up."""
+"""Report: verdicts from numbers, self-contained page."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write(path, summary=SUMMARY, replay="replay.html", setup=None) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def test_only_what_was_found_and_is_in_the_paper_agrees():
+def test_only_found_and_reported_values_agree():
     rows = compare_with_paper(SUMMARY)
     verdicts = {row.what: row.verdict for row in rows}
     assert set(verdicts.values()) == {"agrees", "as set", "within our bound", "for the record"}
@@ -74,7 +74,7 @@ def test_only_what_was_found_and_is_in_the_paper_agrees():
     assert rows[0].accepted == "90 to 115 N"
 
 
-def test_what_the_paper_does_not_report_never_agrees():
+def test_unreported_values_never_agree():
     for origin in ("set", "found"):
         row = Comparison("Mass", "not reported", "0.1 %", origin, "at most 0.2 %", True)
         assert (row.verdict, row.pill) == ("within our bound", "")
@@ -97,7 +97,7 @@ def test_what_the_paper_does_not_report_never_agrees():
         ("identification.mass_error_percent", 0.3, "Mass", "beyond our bound"),
     ],
 )
-def test_each_figure_that_goes_wrong_cries_and_only_that_one(name, value, what, verdict, tmp_path):
+def test_each_wrong_value_changes_only_its_own_verdict(name, value, what, verdict, tmp_path):
     wrong = SUMMARY | {name: value}
     (row,) = (row for row in compare_with_paper(wrong) if row.pill == "differs")
     assert what in row.what
@@ -112,29 +112,29 @@ def test_each_figure_that_goes_wrong_cries_and_only_that_one(name, value, what, 
     assert line.startswith(row.what) and line.endswith(verdict)
 
 
-def test_captions_speak_of_this_run():
+def test_captions_contain_values_of_the_run():
     text = captions(SUMMARY)
     assert "99.4 N" in text["fig6"] and "1.21 N remain" in text["fig6"]
     assert "5.10 N m" in text["fig7"]
     assert "at 220 ms" in text["fig8"] and "2.5 ms after" in text["fig8"]
-    assert "no threshold on it tells" in text["fig8"]
+    assert "no threshold on it separates" in text["fig8"]
     other = captions(SUMMARY | {"contact.raw_detectable": True, "contact.false_alarm_0_6_s": True})
-    assert "a threshold on it tells" in other["fig8"]
+    assert "a threshold on it separates" in other["fig8"]
     assert "it also crosses it" in other["fig8"]
 
 
-def test_parameters_are_printed_to_the_digits_that_mean_something():
+def test_parameters_are_printed_with_significant_digits():
     rows = parameter_rows(TRUE, TRUE + 0.01, STD)
     assert (rows[0].symbol, rows[0].index, rows[0].unit) == ("f", "o,x", "N")
     assert (rows[0].true, rows[0].estimate) == ("1.000", "1.010")
     assert (rows[0].error, rows[0].deviation) == ("+0.010", "0.012")
     assert (rows[6].symbol, rows[6].unit, rows[6].true) == ("m", "kg", "7.000")
-    # Moments and inertias are printed in g m and g m^2.
+    # Printed in g m and g m^2.
     assert (rows[7].true, rows[7].error) == ("8000", "+10")
     assert [row.index for row in rows[10:]] == ["xx", "xy", "xz", "yy", "yz", "zz"]
 
 
-def test_the_page_stands_alone(tmp_path):
+def test_page_is_self_contained(tmp_path):
     page = write(tmp_path / "report.html")
     sources = re.findall(r'(?:src|href)="([^"]{0,40})', page)
     assert [s for s in sources if not s.startswith("data:image/png;base64,")] == 2 * ["replay.html"]
@@ -144,11 +144,11 @@ def test_the_page_stands_alone(tmp_path):
         assert f"<code>{name}</code>" in page
 
 
-def test_no_replay_no_frame(tmp_path):
+def test_page_without_replay_has_no_frame(tmp_path):
     assert "<iframe" not in write(tmp_path / "report.html", replay=None)
 
 
-def test_the_same_run_gives_the_same_page(tmp_path):
+def test_page_is_reproducible(tmp_path):
     first, again = write(tmp_path / "a.html"), write(tmp_path / "b.html")
     assert first == again
     assert first != write(tmp_path / "c.html", SUMMARY | {"free_force.peak_raw_N": 98.0})

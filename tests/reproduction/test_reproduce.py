@@ -1,4 +1,4 @@
-"""`drake-teleop reproduce`: the figures of the paper, and that they follow from the physics."""
+"""`drake-teleop reproduce`: values of the paper's figures, and their dependence on physics."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import pytest
 from shown import type_in
 
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.lab.reproduction.reaction import eliminated_reaction
-from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
-from drake_teleop.lab.reproduction.reproduce import (
+from drake_teleop.lab.reproduction.experiments import (
     SIGMAS,
     ContactMotion,
-    contact_figures,
-    free_figures,
+    contact_values,
+    eliminated_reaction,
     free_motion,
+    free_values,
     raw_excess,
 )
+from drake_teleop.lab.reproduction.report import compare_with_paper, flat, unaccepted
 from drake_teleop.lab.run_summary import in_contact
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -79,7 +79,7 @@ def test_the_contact_is_as_in_figure_8(run):
 
 
 @pytest.mark.slow
-def test_the_load_is_found_from_the_sensors_samples(run):
+def test_load_is_identified_from_sensor_samples(run):
     figures = run[0]["identification"]
     assert figures["mass_error_percent"] <= 0.2
     assert figures["com_error_mm"] <= 0.5
@@ -89,14 +89,14 @@ def test_the_load_is_found_from_the_sensors_samples(run):
 
 @pytest.mark.slow
 def test_the_speed_was_measured(run):
-    """No bound: a test is never timed."""
+    """Without bound: tests do not measure time."""
     speed = run[0]["speed"]
     assert speed["real_time_factor"] > 0
     assert speed["cost_over_bare_plant"] > 1
 
 
 @pytest.mark.slow
-def test_everything_is_as_accepted(run):
+def test_all_rows_are_accepted(run):
     assert unaccepted(run[0]) == []
 
 
@@ -116,7 +116,7 @@ def test_everything_is_written(run):
     assert page.count("data:image/png;base64,") == 3
     assert "contact.true_s" in page
     assert (out / "replay.html").stat().st_size > 1e6
-    # With each record its scenario, for `replay`.
+    # Each record has its scenario, for `replay`.
     scenarios = sorted(path.stem for path in (out / "logs").glob("*.yaml"))
     assert [f"{name}.parquet" for name in scenarios] == sorted(
         path.name for path in (out / "logs").glob("*.parquet") if "sensor_log" not in path.name
@@ -130,8 +130,7 @@ def test_everything_is_written(run):
 
 
 @pytest.mark.slow
-def test_the_bottom_plots_are_what_the_hand_gets(run):
-    """Computed afterwards from the samples, they are the loop's own output, scaled."""
+def test_bottom_plots_equal_the_output_of_the_loop(run):
     _, out = run
     load = Identification.load(out / "identification.json")
     for name in ("free_motion_force", "free_motion_torque", "contact_transition"):
@@ -152,8 +151,8 @@ def test_the_bottom_plots_are_what_the_hand_gets(run):
 
 
 @pytest.mark.slow
-def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
-    """The identification's log, without the states of the plant, gives the same load."""
+def test_sensor_log_alone_gives_the_same_load(run):
+    """The log without states of the plant gives the same load."""
     _, out = run
     result = log(out, "identification")
     assert "contact_wrench_S" not in result
@@ -164,7 +163,7 @@ def test_the_estimators_in_loop_and_on_the_log_had_only_the_sensor(run):
     )
 
 
-# What the figures do when something is wrong.
+# Values for synthetic motions.
 
 
 def force(*components: float) -> np.ndarray:
@@ -173,7 +172,7 @@ def force(*components: float) -> np.ndarray:
 
 @pytest.fixture
 def motion() -> ContactMotion:
-    """100 N of swing, and 15 N of contact at 0.22 s, at 2 kHz without noise but for 0.5 N."""
+    """Return 100 N of motion and 15 N of contact at 0.22 s, at 2 kHz, with 0.5 N of noise."""
     t = np.arange(0.0, 0.8, 5e-4)
     free = np.zeros((len(t), 6))
     free[:, 2] = -30 + 70 * np.cos(2 * np.pi * (t - 0.05) / 0.38)
@@ -197,8 +196,8 @@ def motion() -> ContactMotion:
     )
 
 
-def test_a_clean_contact_is_detected_at_once_and_hidden_in_the_raw_force(motion):
-    figures = contact_figures(motion)
+def test_contact_is_detected_at_once_but_not_in_the_raw_force(motion):
+    figures = contact_values(motion)
     assert figures["true_s"] == figures["detected_s"] == pytest.approx(0.22)
     assert figures["raw_detectable"] is False
     assert np.all(raw_excess(motion) <= 0)
@@ -207,15 +206,15 @@ def test_a_clean_contact_is_detected_at_once_and_hidden_in_the_raw_force(motion)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_any_axis_of_the_raw_force_that_tells_the_contact_counts(motion, axis):
+def test_raw_force_detects_contact_by_any_axis(motion, axis):
     told = motion.raw.copy()
     told[motion.contact, axis] += 180.0
-    figures = contact_figures(dataclasses.replace(motion, raw=told))
+    figures = contact_values(dataclasses.replace(motion, raw=told))
     assert figures["raw_detectable"] is True
 
 
-def test_the_length_of_the_raw_force_counts_too(motion):
-    """Each component inside its range, but never so long all together."""
+def test_raw_force_detects_contact_by_its_norm(motion):
+    """Each component is inside its range, but not the norm."""
     free, told = motion.raw_free.copy(), motion.raw.copy()
     free[:100, 0] = told[:100, 0] = 80.0
     told[motion.contact, 0] = 80.0
@@ -224,31 +223,31 @@ def test_the_length_of_the_raw_force_counts_too(motion):
     assert excess[3] > 0
 
 
-def test_a_crossing_at_the_second_turn_is_a_false_alarm(motion):
+def test_crossing_at_the_second_reversal_is_a_false_alarm(motion):
     calculated = motion.calculated.copy()
     calculated[np.argmin(np.abs(motion.touched.t - 0.6)), 2] = 2.0
-    figures = contact_figures(dataclasses.replace(motion, calculated=calculated))
+    figures = contact_values(dataclasses.replace(motion, calculated=calculated))
     assert figures["false_alarm_0_6_s"] is True
 
 
-def test_without_elimination_nothing_is_detected(motion):
+def test_contact_is_not_detected_without_elimination(motion):
     largest = 1.5 * np.abs(motion.raw_free[:, 2]).max()
-    figures = contact_figures(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
+    figures = contact_values(dataclasses.replace(motion, calculated=motion.raw, threshold=largest))
     assert figures["detected_s"] is None
     assert np.isnan(flat({"contact": figures})["contact.detected_s"])
 
 
-def test_without_contact_there_is_no_time_of_it(motion):
+def test_contact_time_is_null_without_contact(motion):
     nothing = np.zeros(len(motion.touched.t), dtype=bool)
-    figures = contact_figures(
+    figures = contact_values(
         dataclasses.replace(motion, contact=nothing, calculated=motion.calculated_free)
     )
     assert figures["true_s"] is figures["detected_s"] is None
     assert figures["raw_detectable"] is False
 
 
-def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn():
-    """Rotations about all axes, so that each term of V is in it; a little of the load is not."""
+def test_elimination_removes_the_reaction_force_of_the_plant():
+    """Rotations about all axes excite each term of V."""
     sine = Sine(
         duration=5.0, ramp=0.4, frequency=2.0, translation=[0.02] * 3, rotation=[0.3, 0.4, 0.5]
     )
@@ -263,8 +262,8 @@ def test_nothing_is_left_of_the_plants_own_reaction_force_while_all_joints_turn(
     assert 0 < left[3:].max() < 1e-12
 
 
-def test_a_wrong_mass_is_seen_in_what_is_left():
-    """The figures follow from the physics: 10 % of mass too much leaves 10 % of the force."""
+def test_wrong_mass_increases_the_residual():
+    """A mass error of 10 % leaves 10 % of the force."""
     scenario = replace(
         LoadScenario("free_motion_force"), simulation__settle=0.7, simulation__duration=0.4
     )
@@ -272,6 +271,6 @@ def test_a_wrong_mass_is_seen_in_what_is_left():
     estimate[6:] *= 1.1
     motion = free_motion(scenario, estimate, lambda done: None)
     assert tuple(motion.scaled) == SIGMAS
-    figures = free_figures(motion, motion.scaled[0.0], 2, "N")
+    figures = free_values(motion, motion.scaled[0.0], 2, "N")
     assert figures["residual_max_N"] == pytest.approx(0.1 * figures["peak_raw_N"], rel=0.05)
     assert figures["half_ratio"] == pytest.approx(0.45, abs=0.01)

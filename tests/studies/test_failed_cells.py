@@ -1,4 +1,4 @@
-"""Where all runs fail nothing is shown, and nothing else is averaged over what is not there."""
+"""Effects and pictures of studies with failed runs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,23 @@ from scipy.special import stdtrit
 from scipy.stats import qmc
 
 from drake_teleop.lab.studies import pictures
-from drake_teleop.lab.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, comparable, reasons
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.effects import effects, main_effects, pair_means
-from drake_teleop.lab.studies.factorial import Factorial, filled, interval
-from drake_teleop.lab.studies.level_model import level_model
+from drake_teleop.lab.studies.effects import (
+    Factorial,
+    effects,
+    filled,
+    interval,
+    main_effects,
+    pair_means,
+)
+from drake_teleop.lab.studies.level_model import (
+    NO_RUN,
+    NO_SUCCESS,
+    NOT_COMPARABLE,
+    comparable,
+    level_model,
+    reasons,
+)
 
 EFFORT = "effort_Ns"
 SIGMAS, GAMMAS = [0.0, 0.1, 0.5, 1.0], [0.25, 1.0, 4.0, 8.0, 16.0]
@@ -31,12 +43,12 @@ TOUCH = Study(
 
 
 def fails(sigma: float, gamma: float) -> bool:
-    """As in `scaling_touch`: a large gamma needs a large sigma. 16 never works."""
+    """Return failures as in `scaling_touch`: a large gamma needs a large sigma; 16 always fails."""
     return gamma > 8 or sigma < {4.0: 0.5, 8.0: 1.0}.get(gamma, 0.0)
 
 
 def effort(sigma: float, gamma: float) -> float:
-    """Steepest where both are small, so that no straight line goes on beyond."""
+    """Return a nonlinear effort, so that a linear extrapolation is wrong."""
     return 1.0 + 10.0 * sigma**2 / gamma + np.log2(gamma) ** 2
 
 
@@ -49,7 +61,7 @@ def rows_of(study: Study, noise: float = 0.0) -> pl.DataFrame:
     return pl.DataFrame(rows, infer_schema_length=None)
 
 
-def test_a_cell_without_a_successful_run_stays_empty():
+def test_cell_without_successful_run_has_no_value():
     rows = rows_of(TOUCH)
     (pair,) = pair_means(TOUCH, rows, EFFORT)
     expected = [
@@ -60,11 +72,10 @@ def test_a_cell_without_a_successful_run_stays_empty():
     assert set(pair.why[np.isfinite(pair.mean)]) == {""}
 
 
-def test_no_effect_is_averaged_over_what_is_not_there():
-    """Levels differ by what they do at the same combinations; the table says at how many."""
+def test_effects_compare_equal_combinations_only():
     found = main_effects(TOUCH, rows_of(TOUCH, noise=0.1), EFFORT)
     sigma, gamma = found["force_scaling.sigma"], found["force_scaling.gamma"]
-    # All sigmas have gamma 0.25 and 1; sigma 1 alone has every gamma that any has.
+    # All sigmas have gamma 0.25 and 1; sigma 1 has all successful gammas.
     assert (sigma.compared, sigma.left_out) == (2, 3)
     assert (gamma.compared, gamma.left_out) == (1, 3)
     truth = np.array([np.mean([effort(s, g) for g in GAMMAS[:2]]) for s in SIGMAS])
@@ -79,7 +90,7 @@ def test_no_effect_is_averaged_over_what_is_not_there():
     assert not gamma.fitted
 
 
-def test_the_table_says_what_is_left_out():
+def test_effects_table_lists_excluded_combinations():
     table = effects(TOUCH, rows_of(TOUCH)).filter(factor="force_scaling.gamma")
     assert table["level"].to_list() == ["0.25", "1", "4", "8", "16"]
     assert table["runs"].to_list() == [16, 16, 8, 4, 0]
@@ -88,7 +99,7 @@ def test_the_table_says_what_is_left_out():
     assert table["why"].to_list() == [None] * 4 + [NO_SUCCESS]
 
 
-def test_pictures_hatch_what_is_empty_and_say_why():
+def test_pictures_hatch_empty_cells_with_a_legend():
     rows = rows_of(TOUCH)
     main, pairs = (
         pictures.main_effects(TOUCH, rows, [EFFORT]),
@@ -101,11 +112,11 @@ def test_pictures_hatch_what_is_empty_and_say_why():
         assert [text.get_text() for text in figure.legends[0].get_texts()] == [NO_SUCCESS]
     words = [axes.get_title(loc="right") for axes in main.axes]
     assert words == ["over 2 of 5 combinations of the rest", "over 1 of 4 combinations of the rest"]
-    # Colours are of runs that there were.
+    # Only cells with runs have colours.
     assert pairs.axes[0].images[0].get_clim() == pytest.approx((1.9, effort(1.0, 0.25) + 0.9))
 
 
-def test_the_levels_are_as_many_as_any_combination_has():
+def test_largest_comparable_set_of_levels_is_used():
     there = np.array([[1, 1, 0, 0], [1, 1, 1, 1], [0, 0, 1, 0]], dtype=bool)
     rows, columns = comparable(there)
     assert rows.tolist() == [True, True, False] and columns.tolist() == [True, True, False, False]
@@ -115,7 +126,7 @@ def test_the_levels_are_as_many_as_any_combination_has():
 
 
 def test_levels_that_never_meet_are_not_compared():
-    """One sigma has only small gammas, the other one only large ones."""
+    """One sigma has only small gammas, the other only large ones."""
     factors = [Factor("a.x", values=[0.0, 1.0]), Factor("a.y", values=[0.0, 1.0, 2.0])]
     study = Study(factors=factors, measures=[EFFORT])
     rows = pl.DataFrame(study.rows(study.points()))
@@ -128,7 +139,7 @@ def test_levels_that_never_meet_are_not_compared():
 
 
 def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
-    """A point with one run of six is as uncertain as that run, not as six of its like."""
+    """A point with one run of six is as uncertain as one run."""
     random, inside, narrow = np.random.default_rng(2), [], []
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = np.ones((6, 6), dtype=bool)
@@ -143,8 +154,8 @@ def test_intervals_hold_where_some_seeds_of_a_point_are_missing():
     assert np.mean(narrow) < 0.8
 
 
-def test_their_widths_are_those_of_least_squares():
-    """With a column for each point and each seed, and what Student's interval shows of it."""
+def test_half_widths_equal_least_squares():
+    """Reference: regression with a column for each point and each seed."""
     random = np.random.default_rng(4)
     levels = [np.repeat([0, 1, 2], 2), np.tile([0, 1], 3)]
     seen = random.random((6, 4)) < 0.7
@@ -165,7 +176,7 @@ def test_their_widths_are_those_of_least_squares():
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-def test_a_regression_does_not_go_on_beyond_the_edge_of_failures():
+def test_regression_does_not_extrapolate_into_failed_cells():
     factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
     points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(6)
     known = points[:, 0] - points[:, 1] < 0.4
@@ -179,13 +190,13 @@ def test_a_regression_does_not_go_on_beyond_the_edge_of_failures():
     lost = model.failed[0, 1]
     assert np.argwhere(lost).tolist() == [[2, 0], [3, 0], [3, 1], [4, 0], [4, 1]]
     assert np.array_equal(cells, ~lost.ravel())
-    # The edge goes through one of them: one of its four points is on this side.
+    # The edge of failures crosses one cell: one of its four points succeeded.
     x, y = (model.factors[k].index for k in (0, 1))
     assert known[(x == 3) & (y == 1)].sum() == 1
 
 
 def looked(design: str) -> tuple[Study, pl.DataFrame]:
-    """A study whose points leave out a corner, and more cells by chance."""
+    """Return a study without points in a corner and in some random cells."""
     factors = [Factor(f"a.{name}", low=0.0, high=1.0) for name in "xy"]
     study = Study(factors=factors, design=design, samples=32, objective=EFFORT, measures=[EFFORT])
     points = qmc.Sobol(2, seed=np.random.default_rng(0)).random_base2(5)
@@ -194,7 +205,7 @@ def looked(design: str) -> tuple[Study, pl.DataFrame]:
     return study, pl.DataFrame(rows).with_columns((pl.col("a.x") + pl.col("a.y")).alias(EFFORT))
 
 
-def test_a_cell_where_no_point_lies_is_empty_but_says_no_more():
+def test_cell_without_point_is_empty_but_does_not_exclude_levels():
     study, rows = looked("sobol")
     (pair,) = pair_means(study, rows, EFFORT)
     points = rows.select("a.x", "a.y").to_numpy()
@@ -205,7 +216,7 @@ def test_a_cell_where_no_point_lies_is_empty_but_says_no_more():
     assert all(found.left_out == 0 for found in main_effects(study, rows, EFFORT).values())
 
 
-def test_an_adaptive_design_says_nothing_of_where_it_did_not_look():
+def test_adaptive_design_has_no_value_in_unsearched_cells():
     study, rows = looked("adaptive")
     for found in main_effects(study, rows, EFFORT).values():
         assert found.left_out > 0

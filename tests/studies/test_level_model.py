@@ -1,4 +1,4 @@
-"""Effects from designs that are not balanced: intervals hold what they promise, for any design."""
+"""Effects of unbalanced designs: coverage of the intervals."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ EDGES = np.linspace(0.0, 1.0, 6)
 
 
 def known(points):
-    """Straight in x, bent in y, both together, and nothing in z."""
+    """Linear in x, quadratic in y, with their product; independent of z."""
     x, y, _ = points.T
     return 5 * x + np.sin(5 * y) + 3 * x * y
 
 
 def true_effects() -> list[np.ndarray]:
-    """The means of `known` over each fifth of each factor, less the mean of all."""
+    """Return the means of `known` over each fifth of each factor, minus the mean of all."""
     middles = (EDGES[1:] + EDGES[:-1]) / 2 - 0.5
     bent = -np.diff(np.cos(5 * EDGES)) / 5 / np.diff(EDGES)
     return [6.5 * middles, bent - bent.mean() + 1.5 * middles, np.zeros(5)]
 
 
 def true_effects_with_a_corner_missing() -> list[np.ndarray]:
-    """Of x over the fifths of y at which each of x has a value, and the other way round."""
+    """Return effects of x over the fifths of y without failures, and vice versa."""
     middles = (EDGES[1:] + EDGES[:-1]) / 2 - 0.5
     x, y, z = true_effects()
     return [x + 3 * (0.7 - 0.5) * middles, y + 3 * (0.3 - 0.5) * middles, z]
@@ -43,7 +43,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
     inside, plain, null = [], [], []
     for draw in range(200):
         points = qmc.Sobol(3, seed=np.random.default_rng(draw)).random_base2(6)
-        table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # what a seed does to all
+        table = known(points)[:, None] + random.normal(0, 1.0, seeds)  # shift of a seed
         table = table + random.normal(0, noise, table.shape)
         known_there = ~(corner & (points[:, 0] > 0.6) & (points[:, 1] < 0.4))
         model = level_model(UNIT, points.T.tolist(), known_there)
@@ -57,7 +57,7 @@ def test_all_effects_are_in_their_intervals_in_nine_of_ten_sobol_designs(noise, 
         plain.append(np.ptp(cells))
         null.append(np.ptp(found[2]))
     assert np.mean(inside) >= 0.9
-    # Not by being wide: a factor that does nothing shows less than in plain means of cells.
+    # The intervals are not trivially wide: an irrelevant factor shows less than in plain means.
     assert np.median(null) < 0.5 * np.median(plain)
 
 
@@ -77,12 +77,12 @@ def sobol(samples: int, repeats: int = 1, seed: int = 0) -> Study:
 
 
 def force(x, y, word, seed):
-    """What the third factor does is 0.02 N, beside 6 N of the others."""
+    """The third factor contributes 0.02 N, the others 6 N."""
     return 6 * x * (1 + y) + np.sin(5 * y) + 0.02 * (word == "real") + 0.1 * seed
 
 
-def test_a_factor_that_does_nothing_shows_nothing():
-    """Plain means of its three cells differ by 2.2 N here, because x and y differ in them."""
+def test_irrelevant_factor_has_no_significant_effect():
+    """Plain means of its three levels differ by 2.2 N, because x and y differ."""
     study = sobol(32, repeats=2, seed=104)
     rows = made_up(study, force)
     plain = rows.group_by("a.w").agg(pl.col("hand_work_J").mean())["hand_work_J"].to_numpy()
@@ -92,11 +92,11 @@ def test_a_factor_that_does_nothing_shows_nothing():
     assert np.ptp(plain) > 2.0
     assert np.ptp(word.effect) < 0.1
     assert np.all(np.abs(word.effect - np.array([-0.02, 0.04, -0.02]) / 3) <= word.effect_half)
-    # What the others do is seen; x is strongest at its ends.
+    # The effects of the others are visible; x is strongest at its ends.
     assert np.all(np.abs(found["a.x"].effect) > found["a.x"].effect_half)
 
 
-def test_intervals_are_wide_if_seeds_differ_in_what_a_factor_does():
+def test_intervals_contain_seed_dependent_effects():
     study = sobol(64, repeats=3)
     alike = main_effects(study, made_up(study, force), "hand_work_J")
     rows = made_up(study, lambda x, y, w, seed: force(x, y, w, seed) + seed * x)
@@ -105,7 +105,7 @@ def test_intervals_are_wide_if_seeds_differ_in_what_a_factor_does():
     assert apart["a.y"].effect_half[0] < 1.5 * alike["a.y"].effect_half[0]
 
 
-def test_what_is_exact_has_a_width_of_rounding():
+def test_exact_fit_has_a_width_of_rounding():
     study = sobol(64)
     found = main_effects(study, made_up(study, lambda x, y, w, seed: 3 * x), "hand_work_J")
     for name, truth in (("a.x", 3 * np.array([-0.4, -0.2, 0, 0.2, 0.4])), ("a.y", np.zeros(5))):
@@ -113,8 +113,7 @@ def test_what_is_exact_has_a_width_of_rounding():
         assert np.all(found[name].effect_half < 1e-8)
 
 
-def test_a_point_that_failed_does_not_move_the_others():
-    """A factorial design without some of its points is not balanced any more."""
+def test_failed_point_does_not_change_other_effects():
     factors = [Factor("a.x", values=[0.0, 1.0, 4.0]), Factor("a.y", values=[1.0, 2.0, 3.0, 5.0])]
     study = Study(factors=factors, repeats=2, measures=["hand_work_J"])
     rows = made_up(study, lambda x, y, seed: 2.0 * x + 10.0 * y + seed, ("a.x", "a.y"))
@@ -124,14 +123,14 @@ def test_a_point_that_failed_does_not_move_the_others():
     )
     np.testing.assert_allclose(effects(study, broken)["effect"], whole["effect"], atol=1e-9)
     assert effects(study, broken)["runs"].sum() == 2 * (24 - 4)
-    # One run of a point, and its seed does not weigh less or more than before.
+    # One run of a point; the weight of its seed does not change.
     broken = rows.with_columns(
         hand_work_J=pl.when(pl.col("run") == 3).then(None).otherwise("hand_work_J")
     )
     np.testing.assert_allclose(effects(study, broken)["mean"], whole["mean"], atol=1e-9)
 
 
-def test_means_over_pairs_are_those_of_the_function():
+def test_pair_means_equal_the_function():
     study = sobol(64)
     rows = made_up(study, lambda x, y, w, seed: 8 * x * y + (3 * y if w == "real" else 0))
     pairs = {found.fields: found for found in pair_means(study, rows, "hand_work_J")}
@@ -144,7 +143,7 @@ def test_means_over_pairs_are_those_of_the_function():
     assert pair_means(few, made_up(few, force), "hand_work_J") == []
 
 
-def test_too_few_points_say_nothing():
+def test_too_few_points_give_no_effects():
     study = sobol(2)
     found = main_effects(study, made_up(study, force), "hand_work_J")
     assert all(np.isnan(one.effect).all() for one in found.values())
@@ -152,6 +151,6 @@ def test_too_few_points_say_nothing():
     assert main_effects(study, nothing, "hand_work_J") == {}
 
 
-def test_words_that_no_run_has_are_no_levels():
+def test_words_without_run_are_not_levels():
     factor = Factor("a.w", words=["a", "b", "c"])
     assert levels_of(factor, ["c", "a", "c"]).names == ["a", "c"]

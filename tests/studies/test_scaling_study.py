@@ -1,4 +1,4 @@
-"""The answer: what is put into the rows comes out of it, and it says how sure it is."""
+"""Answer of the scaling study for synthetic rows."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from shown import type_in
 from drake_teleop.common.resources import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
+    SELECTIONS,
     TASKS,
-    WAYS,
     answer,
     choice_picture,
 )
@@ -24,7 +24,7 @@ STUDIES = sorted(path.stem for path in studies_dir().glob("*.yaml"))
 
 
 def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndarray]]:
-    """Effort rises with both, force falls with gamma, time has its least in the middle."""
+    """Effort rises with both scales, force falls with gamma, time has a minimum in the middle."""
     noise = np.random.default_rng(0)
     sigma, gamma = np.meshgrid([0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8], indexing="ij")
     means = {
@@ -42,8 +42,8 @@ def tables(seeds: int = 20, spread: float = 0.05) -> dict[str, dict[str, np.ndar
     }
 
 
-def test_the_best_point_of_each_way_of_counting():
-    # (sigma, gamma) as indices: no inertia always; little, medium and much contact.
+def test_best_point_of_each_selection():
+    # Indices of (sigma, gamma).
     for criteria, best in ((("effort",), (0, 0)), (("time",), (0, 3)), (("force",), None)):
         found = answer(tables(), criteria)
         place = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
@@ -52,11 +52,11 @@ def test_the_best_point_of_each_way_of_counting():
         assert found.merit[4, 2] == pytest.approx(1.0)  # the reference against itself
         assert found.best.sum() == pytest.approx(1.0)
     assert answer(tables(), ("effort",)).best[0, 0] > 0.95
-    # Nothing there depends on sigma, and it does not pretend to know.
+    # Without dependence on sigma the choice must be uncertain.
     assert answer(tables(), ("force",)).best.max() < 0.95
 
 
-def test_points_that_fail_too_often_are_no_choice():
+def test_points_with_many_failures_are_excluded():
     failing = tables()
     failing["press"]["success"][0, 0, :2] = 0.0  # one in ten
     failing["press"]["effort"][0, 0, :2] = np.nan
@@ -66,7 +66,7 @@ def test_points_that_fail_too_often_are_no_choice():
 
 
 @pytest.mark.parametrize(("failing", "best"), [(2, 1.0), (3, 0.0)])
-def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, best):
+def test_seeds_with_failed_reference_are_excluded(failing, best):
     rows = tables(seeds=3)
     rows["press"]["success"][4, 2, :failing] = 0.0
     rows["press"]["effort"][4, 2, :failing] = np.nan
@@ -75,14 +75,14 @@ def test_a_reference_that_fails_leaves_the_seeds_at_which_it_does_not(failing, b
     assert found.best.sum() == pytest.approx(best)
 
 
-def test_the_picture_of_the_choice_has_one_scale_and_no_empty_cell():
+def test_choice_picture_has_one_scale_and_no_empty_cell():
     failing = tables()
     failing["press"]["success"][:2, 0, :3] = 0.0  # three of twenty
-    answers = {way: answer(failing, criteria) for way, criteria in WAYS.items()}
+    answers = {way: answer(failing, criteria) for way, criteria in SELECTIONS.items()}
     sigmas, gammas = [0, 0.1, 0.25, 0.5, 1], [0.25, 0.5, 1, 2, 4, 8]
     figure = choice_picture(answers, sigmas, gammas)
     images = [image for axes in figure.axes for image in axes.images]
-    assert len(images) == len(WAYS)
+    assert len(images) == len(SELECTIONS)
     assert len({image.norm for image in images}) == 1
     for axes, found in zip(figure.axes, answers.values(), strict=False):
         words = {text.get_position(): text.get_text() for text in axes.texts}
@@ -92,7 +92,7 @@ def test_the_picture_of_the_choice_has_one_scale_and_no_empty_cell():
         assert np.isfinite(axes.images[0].norm([0.1, 1.0, 10.0])).all()
 
 
-def test_more_seeds_make_surer():
+def test_more_seeds_give_narrower_intervals():
     widths = [np.mean(found.high - found.low) for found in (
         answer(tables(seeds, 0.3), ("effort", "time", "force")) for seeds in (10, 160)
     )]  # fmt: skip
@@ -106,7 +106,7 @@ def test_the_shipped_studies_load(name):
     assert study.scenario in ScenarioNames()
 
 
-def test_they_are_a_thousand_runs_over_the_same_scales():
+def test_shipped_studies_share_their_scales():
     studies = {name: LoadStudy(name) for name in STUDIES}
     assert sum(study.size() * study.repeats for study in studies.values()) >= 1000
     scales = [
@@ -119,8 +119,8 @@ def test_they_are_a_thousand_runs_over_the_same_scales():
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_the_answer_of_a_folder(tmp_path, monkeypatch):
-    """The studies are not run here; their rows are made up."""
+def test_scaling_study_command_writes_its_answer(tmp_path, monkeypatch):
+    """With synthetic rows instead of runs."""
 
     def made_up(name, out, *, repeats, **others):
         study = LoadStudy(name)

@@ -1,4 +1,4 @@
-"""`drake-teleop study`: the design, the store that survives a kill, the same rows everywhere."""
+"""`drake-teleop study`: design, crash-safe store, reproducible rows."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.studies import study as studies
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.measures import default_measures, measured
-from drake_teleop.lab.studies.runs import ONCE, Told, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST, StudyProgress, run_study
 from drake_teleop.lab.studies.store import Store, open_store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.signals import SIGNALS
 
-# Learns while it moves, so that no identification comes first.
+# The estimator runs in the loop, so no identification is needed.
 SCENARIO = """
 simulation: {duration: 0.05, settle: 0.02}
 operator:
@@ -48,7 +48,7 @@ factors:
   - {field: simulation.max_step, values: [1e-3]}
 repeats: 2
 """
-# A study without a station, killed 8 times; its runs take 1 ms, and every seventh fails.
+# A study without a station is killed 8 times; runs take 1 ms, every seventh fails.
 FAKE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
@@ -56,7 +56,7 @@ import joblib, polars
 from drake_teleop.lab.studies import runs
 from drake_teleop.lab.studies.design import Factor, Study
 
-runs._CHUNKS = 150  # as many runs in a part as a larger study has
+runs._NUM_CHUNKS = 150  # as many runs in a part as a larger study has
 
 def work(values, seed):
     time.sleep(pause)
@@ -112,9 +112,9 @@ def serial(files):
 
 @pytest.fixture
 def two_runs(monkeypatch):
-    """A study has one seed and two points, and this process alone; one load serves all.
+    """Reduce a study to one seed, two points and this process; one load serves all.
 
-    That each slave, sensor and seed has its own is tested in test_identified_load.py.
+    `test_identified_load.py` tests the loads of slaves, sensors and seeds.
     """
     loads: list[IdentifiedLoad] = []
 
@@ -141,8 +141,8 @@ def two_runs(monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
-    """Down to two runs each, they come to their end."""
+def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
+    """With two runs each."""
     monkeypatch.chdir(tmp_path)
     page = (Path(__file__).parents[2] / "docs" / "studies.md").read_text(encoding="utf-8")
     (file,) = re.findall("```yaml\n(scenario: .*?)```", page, re.S)
@@ -150,7 +150,7 @@ def test_what_the_pages_show(two_runs, tmp_path, monkeypatch):
     type_in("docs/studies.md", "drake-teleop study")
     (script,) = re.findall("```python\n(from pathlib.*?)```", page, re.S)
     names: dict = {}
-    exec(compile(script, "studies.md", "exec"), names)  # and finds that all is done
+    exec(compile(script, "studies.md", "exec"), names)  # all runs are complete
     assert names["summary"] == json.loads(Path("out/study/summary.json").read_text())
     type_in("README.md", ".venv/bin/drake-teleop study")
     for out in ("study", "touch"):
@@ -163,7 +163,7 @@ def parts(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_a_row_for_each_run(serial):
+def test_table_has_a_row_for_each_run(serial):
     summary, out = serial
     rows = pl.read_parquet(out / "runs.parquet").sort("run")
     assert rows["run"].to_list() == list(range(12))
@@ -176,10 +176,10 @@ def test_a_row_for_each_run(serial):
     assert summary["runs"] == 12
     assert summary["points"] == 6
     assert summary["failed"] == rows["error"].count() == 0
-    # Seeds are those of the repeats, for every point; another one gives other noise.
+    # All points share the seeds of the repeats; another seed gives other noise.
     assert rows["seed"].to_list() == [0, 2] * 6
     assert rows["rms_force_to_master_N"].n_unique() == 12
-    # A load that is felt in full is heavier than one that is not.
+    # The full load gives a larger force.
     mean = rows.group_by("force_scaling.sigma").agg(pl.col("rms_force_to_master_N").mean())
     assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
 
@@ -194,9 +194,7 @@ def test_processes_give_the_same_bytes(serial, files):
 
 
 @pytest.mark.slow
-def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
-    serial, files, monkeypatch
-):
+def test_local_dask_cluster_gives_the_same_bytes(serial, files, monkeypatch):
     out, write, seen = files / "dask", Store.write, set()
 
     def look_and_write(store, rows):
@@ -210,14 +208,14 @@ def test_a_dask_cluster_gives_the_same_bytes_and_is_for_this_machine_alone(
     assert seen and seen <= THIS_MACHINE
 
 
-def test_without_dask_the_extra_is_named(files, monkeypatch):
+def test_error_without_dask_names_the_extra(files, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(DrakeTeleopError, match=r"pip install '\.\[cluster\]' in"):
         study_command(files / "study.yaml", files / "none", cluster="local", quiet=True)
 
 
 @pytest.mark.slow
-def test_a_study_of_stations_that_was_stopped_goes_on(serial, files, monkeypatch):
+def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
     out, work, calls = files / "stopped", studies.StationWork.__call__, []
 
     def stopping(self, values, seed):
@@ -234,11 +232,11 @@ def test_a_study_of_stations_that_was_stopped_goes_on(serial, files, monkeypatch
 
 
 @pytest.mark.slow
-def test_kills_lose_and_double_no_row(tmp_path):
+def test_kills_neither_lose_nor_duplicate_rows(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
     script, killed, whole, report = (tmp_path / name for name in names)
     script.write_text(FAKE)
-    # What it prints is also what processes of its own print whose parent is killed.
+    # The output also contains that of its child processes after a kill.
     answer = subprocess.run(
         [sys.executable, *map(str, (script, killed, whole, report))],
         capture_output=True,
@@ -258,7 +256,7 @@ def test_kills_lose_and_double_no_row(tmp_path):
     assert rows["hand_work_J"].null_count() == failed["hand_work_J"].null_count() == failed.height
 
 
-def test_a_run_that_fails_is_a_row(files):
+def test_failed_run_is_a_row_with_an_error(files):
     (files / "failing.yaml").write_text(
         STUDY.replace(
             "values: [1e-3]", "values: [1e-3]}\n  - {field: force_scaling.eta, values: [1]"
@@ -273,7 +271,7 @@ def test_a_run_that_fails_is_a_row(files):
 
 
 @pytest.mark.slow
-def test_another_study_does_not_mix_with_the_rows(serial, files):
+def test_folder_of_another_study_is_refused(serial, files):
     before = parts(serial[1])
     (files / "other.yaml").write_text(STUDY + "seed: 1\n")
     with pytest.raises(DrakeTeleopError, match="another study"):
@@ -282,8 +280,7 @@ def test_another_study_does_not_mix_with_the_rows(serial, files):
 
 
 @pytest.mark.parametrize("damage", ["empty", "no rows", "damaged"])
-def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, damage):
-    """In the folder of a study that is complete but for that."""
+def test_empty_part_is_repeated_and_other_files_are_ignored(tmp_path, damage):
     study = Study(factors=[Factor("force_scaling.sigma", values=[0.0, 0.5, 1.0])], measures=[])
     calls: list[int] = []
 
@@ -310,7 +307,7 @@ def test_a_part_without_rows_is_run_again_and_other_files_are_ignored(tmp_path, 
     assert run().equals(rows) and not calls
 
 
-def test_two_processes_do_not_write_at_once(tmp_path):
+def test_second_process_in_a_folder_is_refused(tmp_path):
     with (
         open_store(tmp_path, {}),
         pytest.raises(DrakeTeleopError, match="another process"),
@@ -321,7 +318,7 @@ def test_two_processes_do_not_write_at_once(tmp_path):
         pass
 
 
-def test_an_interrupt_says_what_is_kept(tmp_path):
+def test_interrupt_reports_stored_runs(tmp_path):
     calls = []
 
     def work(values, seed):
@@ -334,11 +331,11 @@ def test_an_interrupt_says_what_is_kept(tmp_path):
     with pytest.raises(KeyboardInterrupt, match="keeps 2 of 4 runs"):
         run_study(study, tmp_path, work, {}, jobs=1)
     assert run_study(study, tmp_path, work, {}, jobs=1).height == 4
-    assert len(calls) == 5  # the third one again
+    assert len(calls) == 5  # the third run again
 
 
 def dying(own: int, at: float):
-    """A run that ends its process at one value; a closure, so that nobody has to import this."""
+    """Return a run that ends its process at one value; a closure needs no import."""
 
     def work(values, seed):
         assert os.getpid() != own
@@ -351,7 +348,7 @@ def dying(own: int, at: float):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
-def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
+def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
     factor = Factor("a.b", low=0.0, high=9.0, levels=10)
     study = Study(factors=[factor], measures=["hand_work_J"])
     rows = run_study(study, tmp_path, dying(os.getpid(), at=3.0), {}, jobs=2, cluster=cluster)
@@ -366,12 +363,12 @@ def test_a_run_that_ends_its_process_is_a_row(tmp_path, cluster):
 @pytest.mark.slow
 def test_processes_that_never_begin_are_an_error(tmp_path):
     study = Study(factors=[Factor("a.b", values=[1.0, 2.0, 3.0])])
-    with pytest.raises(DrakeTeleopError, match="processes end before they begin"):
+    with pytest.raises(DrakeTeleopError, match="processes ended before their first run"):
         run_study(study, tmp_path, Unreadable(), {}, jobs=2)
 
 
 class Unreadable:
-    """A work that ends each process that receives it."""
+    """Work that ends each process that unpickles it."""
 
     def __reduce__(self):
         return os._exit, (1,)
@@ -410,7 +407,7 @@ def alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    # One that has ended and that nobody has buried yet.
+    # A zombie process.
     return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
 
 
@@ -423,7 +420,6 @@ def wait_for(condition, seconds=60.0):
 
 @pytest.mark.slow
 def test_factors_over_flags_and_vectors(files, tmp_path):
-    """They reach the scenario, and the table has a column of their kind."""
     path = files / "kinds.yaml"
     path.write_text("""
 scenario: tiny.yaml
@@ -441,12 +437,12 @@ factors:
     )
     assert rows["rms_force_to_master_N"].n_unique() == 8
     heavy = rows.filter(pl.col("wrist_sensor.ideal"))["rms_force_to_master_N"].to_list()
-    # All that is felt of a load that is being learnt is in proportion to it, offsets apart.
+    # The displayed force is proportional to the load, without offsets.
     assert heavy[1] / heavy[0] == pytest.approx((3.13 + 2) / 3.13, rel=0.1)
 
 
 def bowl(values, seed):
-    """Smallest at (0.3, "b"), with noise that is the same at all points."""
+    """Minimum at (0.3, "b"), with equal noise at all points."""
     away = (values["a.x"] - 0.3) ** 2 + (values["a.w"] != "b")
     if values["a.w"] == "c" and values["a.x"] > 0.9:
         raise ValueError("out of reach")
@@ -479,19 +475,19 @@ def test_an_adaptive_design_finds_the_best_point(searched):
     )
     assert best["a.w"] == "b"
     assert best["a.x"] == pytest.approx(0.3, abs=0.01)
-    # It looks where it is good: chance would have a third of the points there.
+    # The search concentrates there; random points would have one third.
     late = rows.filter(pl.col("point") >= 20)
     assert (late["a.w"] == "b").mean() > 0.5
     assert len(rows.select("a.x", "a.w").unique()) == 40
 
 
 @pytest.mark.slow
-def test_an_adaptive_design_goes_on_after_any_stop(tmp_path, searched):
+def test_adaptive_design_continues_after_any_stop(tmp_path, searched):
     calls = []
 
     def stopping(values, seed):
         calls.append(values)
-        if len(calls) % 15 == 0:  # of every batch of 8 at another run
+        if len(calls) % 15 == 0:  # at another run of each batch of 8
             raise KeyboardInterrupt
         return bowl(values, seed)
 
@@ -516,7 +512,7 @@ def test_sobol_points_are_balanced():
     study = Study(factors=factors, design="sobol", samples=64, seed=5)
     points = study.points()
     numbers = np.array([point["a.b"] for point in points])
-    # One in each of 64 equal parts of the range, and every half has as many of both words.
+    # One point in each of 64 parts of the range, and equal words in each half.
     np.testing.assert_array_equal(np.sort((numbers + 1) / 4 * 64 // 1), np.arange(64))
     words = np.array([point["a.c"] for point in points])
     assert [sum(words[numbers < 1] == word) for word in "xy"] == [16, 16]
@@ -533,7 +529,7 @@ def test_a_factorial_design_has_every_combination_once():
 
 
 def test_measures_of_a_known_motion():
-    """A hand pulls with (3, 4, 0) N at 0.2 m/s along x; the display shows 2 sin t along z."""
+    """The hand pulls (3, 4, 0) N at 0.2 m/s along x; the display has 2 sin t along z."""
     t = np.linspace(0.0, 2 * math.pi, 20001)
     signals = {name: np.zeros((len(t), 6)) for name in ("hand_wrench_E", "twist_master")}
     signals |= {
@@ -543,7 +539,7 @@ def test_measures_of_a_known_motion():
     signals["hand_wrench_E"][:, 5] = 0.1
     signals["twist_master"][:, 0], signals["twist_master"][:, 5] = 0.2, 0.5
     signals["force_to_master"][:, 2] = 2 * np.sin(t)
-    signals["force_to_master"][:, 3] = 9.0  # torques do not count
+    signals["force_to_master"][:, 3] = 9.0  # torques are ignored
     signals["true_contact_wrench_W"][100, :3] = 2.0, -3.0, 6.0
     result = SimulationResult(t, signals, [SIGNALS[name] for name in signals])
     found = measured(result, Scenario(), default_measures(), 1.0)
@@ -559,8 +555,7 @@ def test_measures_of_a_known_motion():
     )
 
 
-def test_a_preset_brings_its_values():
-    """A factor acts as if it stood in the file: a preset is more than its name."""
+def test_preset_as_factor_sets_its_values():
     work = studies.StationWork({}, "x", (), 1.0)
     ideal = work.scenario({"wrist_sensor.preset": "ideal"}, 3)
     assert ideal.simulation.seed == 3
@@ -578,18 +573,21 @@ def test_a_preset_brings_its_values():
         (("[0, 0.5, 1]", "[0, -0.5]"), "factors[0].force_scaling.sigma: -0.5"),
         (("[light, firm]", "[light, iron]"), "factors[1].operator.grip: 'iron' is not known"),
         (("words", "values"), "factors[1].values[0]: expected a number"),
-        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: what it varies over"),
-        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: what it varies over"),
-        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: the range ends at 0"),
+        (("values: [0, 0.5, 1]", "low: 1"), "factors[0]: its values are ambiguous"),
+        (("values: [0, 0.5, 1]", "values: []"), "factors[0]: its values are ambiguous"),
+        (("values: [0, 0.5, 1]", "low: 1, high: 0"), "factors[0].high: 0 is not above low"),
         (("[0, 0.5, 1]", "[0, .inf]"), "factors[0]: its numbers, or their range, are not finite"),
         (("[0, 0.5, 1]", "[.nan]"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "vectors: [[0, .inf]]"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: 0, high: .inf"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: -.inf, high: .inf"), "factors[0]: its numbers"),
         (("values: [0, 0.5, 1]", "low: -1e308, high: 1e308"), "factors[0]: its numbers"),
-        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value stands there twice"),
+        (("[0, 0.5, 1]", "[1, 1]"), "factors[0]: a value is repeated"),
         (("operator.grip, words: [light, firm]", "force_scaling.sigma, values: [1]"), "twice"),
-        (("force_scaling.sigma", "simulation.seed"), "factors[0].field: the seed is no factor"),
+        (
+            ("force_scaling.sigma", "simulation.seed"),
+            "factors[0].field: the seed cannot be a factor",
+        ),
         (("tiny.yaml", "none.yaml"), "there is no scenario"),
         (("repeats: 2", "repeats: 0"), "repeats: 0 is outside 1 to"),
         (("repeats: 2", "repeat: 2"), "did you mean 'repeats'"),
@@ -598,13 +596,13 @@ def test_a_preset_brings_its_values():
         (("repeats: 2", "design: sobol\nsamples: 48"), "samples: 48 Sobol points"),
         (("repeats: 2", "measures: [joy]"), "there is no measure 'joy'"),
         (("repeats: 2", "measures: [hand_work]"), "did you mean 'hand_work_J'"),
-        (("repeats: 2", "design: adaptive"), "objective: '' is no objective"),
-        (("repeats: 2", "objective: hand_work_J"), "no objective for a design that is factorial"),
-        ((STUDY, "scenario: tiny.yaml"), "factors: nothing is varied"),
+        (("repeats: 2", "design: adaptive"), "objective: '' cannot be the objective"),
+        (("repeats: 2", "objective: hand_work_J"), "cannot be the objective of design 'factorial'"),
+        ((STUDY, "scenario: tiny.yaml"), "factors: there are no factors"),
         ((STUDY, "- 1"), "expected a mapping"),
     ],
 )
-def test_a_bad_file_is_one_line_with_its_field(files, tmp_path, change, message):
+def test_wrong_study_file_is_one_line_with_its_field(files, tmp_path, change, message):
     path = files / "bad.yaml"
     path.write_text(STUDY.replace(*change))
     with pytest.raises(DrakeTeleopError) as error:
@@ -625,9 +623,7 @@ repeats: 200
     ("factors", "runs"),
     [(2, "1,000,000,000,000 runs"), (5, "10^21.0 runs"), (110, "10^336.0 runs")],
 )
-def test_a_study_that_is_too_large_is_refused_before_there_is_any_of_it(
-    files, tmp_path, monkeypatch, factors, runs
-):
+def test_too_large_study_is_refused_before_its_design(files, tmp_path, monkeypatch, factors, runs):
     monkeypatch.setattr(Study, "points", lambda self: pytest.fail("as large as that"))
     fields = [f"{{field: a.b{k}, low: 0, high: 1, levels: 1000}}" for k in range(factors)]
     path = files / "huge.yaml"
@@ -637,7 +633,7 @@ def test_a_study_that_is_too_large_is_refused_before_there_is_any_of_it(
     assert not (tmp_path / "out").exists()
 
 
-def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
+def test_many_runs_require_consent(files, tmp_path, monkeypatch):
     class Begun(Exception):
         pass
 
@@ -647,7 +643,10 @@ def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
     monkeypatch.setattr(studies, "run_study", begin)
     path, out, asked = files / "many.yaml", tmp_path / "out", []
     path.write_text(MANY.replace("LEVELS", "501"))
-    with pytest.raises(DrakeTeleopError, match=r"many\.yaml: 100,200 runs are many; --yes"):
+    with pytest.raises(
+        DrakeTeleopError,
+        match=r"many\.yaml: 100,200 runs need a confirmation; confirm them by --yes",
+    ):
         study_command(path, out)
     with pytest.raises(DrakeTeleopError, match="--yes"):
         study_command(path, out, yes=lambda question: asked.append(question))
@@ -660,7 +659,7 @@ def test_many_runs_have_to_be_meant(files, tmp_path, monkeypatch):
         study_command(path, out, yes=lambda question: pytest.fail("nobody need ask"))
 
 
-def test_no_file(tmp_path):
+def test_missing_study_file_is_an_error(tmp_path):
     with pytest.raises(DrakeTeleopError, match=r"none\.yaml'; give a YAML file or one of scaling_"):
         LoadStudy(tmp_path / "none.yaml")
 
@@ -669,7 +668,7 @@ def threads(values, seed):
     return {"hand_work_J": float(max(library["num_threads"] for library in threadpool_info()))}
 
 
-def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_process(tmp_path):
+def test_runs_use_one_blas_thread(tmp_path):
     study = Study(factors=[Factor("a.b", values=[0.0, 1.0])], measures=["hand_work_J"])
     with threadpool_limits(2):
         rows = run_study(study, tmp_path, threads, {}, jobs=1)
@@ -677,35 +676,34 @@ def test_a_run_has_one_thread_of_blas_so_that_its_bytes_are_the_same_in_any_proc
     assert rows["hand_work_J"].to_list() == [1.0, 1.0]
 
 
-def test_the_time_that_is_left_follows_from_the_last_runs():
-    """Runs take two seconds, four at once; the first two identify a load, too."""
+def test_remaining_time_follows_from_the_latest_runs():
+    """Runs take 2 s, four in parallel; the first two also identify a load."""
     shown = []
-    told = Told(100)
-    told.start(lambda fraction, words="": shown.append((fraction, words)), 4)
-    told.found(20)
+    counter = StudyProgress(100)
+    counter.start(lambda fraction, words="": shown.append((fraction, words)), 4)
+    counter.add_earlier_runs(20)
     assert shown == [(0.2, "20/100, the first runs begin")]
-    told.more([{"seconds": 9.0, ONCE: 7.0}] * 2)
+    counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}] * 2)
     assert shown[-1] == (0.22, "22/100, about 0:00:39 left")
     for _ in range(18):
-        told.more([{"seconds": 2.0}])
-    told.more([{"error": "the run has ended its process"}])
+        counter.add_finished_runs([{"seconds": 2.0}])
+    counter.add_finished_runs([{"error": "the run has ended its process"}])
     assert shown[-1] == (0.41, "41/100, about 0:00:30 left")
-    told.more([{"seconds": 2.0}] * 59)
+    counter.add_finished_runs([{"seconds": 2.0}] * 59)
     assert shown[-1] == (1.0, "100/100, about 0:00:00 left")
 
 
-def test_loads_that_every_run_identifies_are_counted_in_the_end():
+def test_repeated_identifications_count_in_the_remaining_time():
     shown = []
-    told = Told(100)
-    told.start(lambda fraction, words="": shown.append(words), 1)
+    counter = StudyProgress(100)
+    counter.start(lambda fraction, words="": shown.append(words), 1)
     for _ in range(40):
-        told.more([{"seconds": 9.0, ONCE: 7.0}])
+        counter.add_finished_runs([{"seconds": 9.0, ONE_TIME_COST: 7.0}])
     assert shown[0] == "1/100, about 0:03:18 left"
     assert shown[-1] == "40/100, about 0:09:00 left"
 
 
-def test_rows_of_a_large_study_come_one_by_one_at_first(tmp_path):
-    """A chunk of eight runs would be the first thing to be seen of it."""
+def test_first_rows_of_a_large_study_are_stored_one_by_one(tmp_path):
     factor = Factor("a.b", low=0.0, high=1.0, levels=1000)
     study = Study(factors=[factor], repeats=5, measures=["hand_work_J"])
     sizes = []

@@ -1,4 +1,4 @@
-"""What a study's rows say: intervals that hold what they promise, the front, the pictures."""
+"""Statistics of a study: coverage of intervals, Pareto front, pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STUDY = Study(
 
 
 def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
-    """Effort falls with sigma and time rises; gamma does nothing; each seed moves all points."""
+    """Effort falls with sigma and time rises; gamma has no effect; each seed shifts all points."""
     rows, noise = study.rows(study.points()), np.random.default_rng(0)
     for row in rows:
         sigma, seed = row.get("force_scaling.sigma", 0.0), row["seed"]
@@ -38,8 +38,8 @@ def table(study: Study = STUDY, failing: int = -1) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def test_intervals_hold_what_they_promise():
-    """Of 2000 studies of 5 seeds, 95 % have the true mean, and the true effect, in the interval."""
+def test_intervals_have_their_coverage():
+    """95 % of 2000 studies with 5 seeds contain true mean and true effect."""
     noise, levels = np.random.default_rng(1), np.tile([0, 1, 2], 5)
     seeds, truth = np.repeat(np.arange(5.0), 3), np.array([1.0, 2.0, 6.0])
     inside, effect_inside, widths = [], [], []
@@ -52,17 +52,17 @@ def test_intervals_hold_what_they_promise():
         widths.append(found.effect_half / found.half)
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
     assert np.mean(effect_inside) == pytest.approx(0.95, abs=0.01)
-    assert np.median(widths) < 0.3  # what a seed does to all levels cancels
+    assert np.median(widths) < 0.3  # common shifts of a seed cancel
 
 
-def test_what_is_not_a_number_does_not_count():
+def test_nan_values_are_ignored():
     values, levels, seeds = np.array([1.0, np.nan, 3.0, 5.0]), np.zeros(4, int), np.arange(4.0)
     assert estimated(values, levels, seeds, 1).mean[0] == 3.0
     nothing = estimated(np.full(4, np.nan), levels, seeds, 1)
     assert np.isnan(nothing.mean[0]) and np.isnan(nothing.half[0])
 
 
-def test_effects_are_those_that_were_put_in():
+def test_effects_equal_the_synthetic_ones():
     found = effects(STUDY, table())
     assert set(found["factor"]) == {"force_scaling.sigma", "force_scaling.gamma"}
     sigma = found.filter(measure="effort_Ns", factor="force_scaling.sigma")
@@ -74,7 +74,7 @@ def test_effects_are_those_that_were_put_in():
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.booleans()), max_size=30))
-def test_the_front_is_what_nothing_dominates(points):
+def test_front_contains_the_non_dominated_points(points):
     values = np.array([point[:2] for point in points], dtype=float).reshape(-1, 2)
     complete = np.array([point[2] for point in points], dtype=bool)
     expected = [
@@ -90,13 +90,13 @@ def test_points_with_failures_are_not_on_the_front():
     found = pareto(STUDY, table(failing=5))
     assert found["complete"].to_list() == [True] * 5 + [False]
     assert not found["front"][5]
-    assert found["front"].sum() >= 3  # each sigma has a point there
+    assert found["front"].sum() >= 3  # one point of each sigma
     assert pareto(Study(factors=STUDY.factors, measures=["success"]), table()) is None
 
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_pictures_are_those_that_mean_something(tmp_path):
+def test_only_applicable_pictures_are_written(tmp_path):
     (tmp_path / "old.png").touch()
     names = sorted(path.stem for path in write_pictures(STUDY, table(), tmp_path))
     assert names == sorted(["main_effects", "pareto", *(f"interactions_{m}" for m in MEASURES)])
@@ -108,7 +108,7 @@ def test_pictures_are_those_that_mean_something(tmp_path):
     assert write_pictures(alone, failed, tmp_path) == []
 
 
-def test_a_range_with_points_anywhere_is_cut_into_equal_parts():
+def test_range_of_a_sobol_design_is_cut_into_equal_parts():
     factor = Factor("force_scaling.gamma", low=1.0, high=2.0)
     study = Study(factors=[factor], design="sobol", samples=16, measures=["success"])
     found = effects(study, table(study))

@@ -1,1 +1,1 @@
-"""The design of excitation trajectories: an arm, its limits, a criterion, an optimiser, a check."""
+"""Design of excitation trajectories: robot, limits, criterion, optimiser, check."""

@@ -1,44 +1,40 @@
-"""The verdict on a trajectory: every limit again at 1 kHz, by Drake's rigid bodies and shapes.
+"""Independent check of a trajectory against every limit at 1 kHz.
 
-Nothing is shared with the optimiser but the trajectory's positions and the limits: speeds and
-accelerations are differences of positions, torques and accelerations of bodies are the plant's,
-distances are those of the shapes themselves.
+Derivatives are finite differences; Drake's plant gives torques, accelerations and distances.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import QueryObject
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialInertia
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.excitation.limits import LIMITS
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
-Array = NDArray[np.float64]
-
-#: Samples a second.
+#: Sample rate [Hz].
 RATE = 1000.0
-# Of the differences [s]: errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
-_STEP = 1e-4
-# Distances are looked up this far beyond the clearance [m].
-_NEAR = 0.01
+_SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
+# Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
+_STEP_S = 1e-4
+# Search distance beyond the clearance [m].
+_SEARCH_MARGIN_M = 0.01
 
 
 @dataclass(frozen=True)
 class Use:
-    """How much of a limit a trajectory uses.
+    """Largest use of one limit.
 
     Attributes:
-        limit: its name.
         share: largest |value| over the limit; above 1 violates it.
-        time: when [s].
-        what: which joint, axis or pair of shapes.
+        time: of the largest value [s].
+        what: joint, axis or pair of shapes.
     """
 
     limit: str
@@ -56,16 +52,10 @@ def check(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Use of every limit, the largest first.
-
-    Args:
-        robot: the arm in its surroundings.
-        trajectory: one period of it is looked at, both ends included.
-        progress: called with the share done.
-    """
+    """Return the use of every limit by one period, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
-    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP, 0.0, _STEP))
-    qd, qdd = (after - before) / (2 * _STEP), (after - 2 * q + before) / _STEP**2
+    before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
+    qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
     return check_motion(robot, t, q, qd, qdd, progress)
 
 
@@ -77,44 +67,45 @@ def check_motion(
     qdd: Array,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Use of every limit by a motion that was sampled, or executed, the largest first.
+    """Return the use of every limit by a sampled motion, largest first.
 
     Args:
-        robot: the arm in its surroundings.
         t: (T,) [s].
         q, qd, qdd: (T, n) [rad, s].
-        progress: called with the share done.
     """
     names, limits = robot.arm.joint_names, robot.limits
-    motion = _bodies(robot, q, qd, qdd, progress)
+    motion = _evaluate_bodies(robot, q, qd, qdd, progress)
     uses = [
-        _use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
-        _use("velocity", np.abs(qd) / limits.velocity, t, names),
-        _use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
-        _use("torque", np.abs(motion.torque) / limits.effort, t, names),
-        _use("sensor", motion.sensor / limits.sensor, t, _SENSOR),
-        _use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
-        _use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
+        _largest_use("position", np.abs(q - limits.q_middle) / limits.q_half, t, names),
+        _largest_use("velocity", np.abs(qd) / limits.velocity, t, names),
+        _largest_use("acceleration", np.abs(qdd) / limits.acceleration, t, names),
+        _largest_use("torque", np.abs(motion.torque) / limits.effort, t, names),
+        _largest_use("sensor", motion.sensor / limits.sensor, t, _SENSOR_NORMS),
+        _largest_use("workspace", motion.workspace, t, ("x", "y", "z") * len(limits.points_S)),
+        _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
-    nearest = motion.nearest[int(np.argmax(motion.clearance))]
-    uses[-1] = Use("clearance", uses[-1].share, uses[-1].time, nearest)
+    uses[-1] = replace(uses[-1], what=motion.nearest[int(np.argmax(motion.clearance))])
     if np.isinf(limits.box_half).all():
         del uses[LIMITS.index("workspace")]
     return sorted(uses, key=lambda use: -use.share)
 
 
-_SENSOR = ("force", "torque", "specific force", "angular acceleration")
-
-
-def _use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
+def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:
     when, which = np.unravel_index(np.argmax(shares), shares.shape)
     return Use(limit, float(shares[when, which]), float(t[when]), names[which])
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """Of (T,) samples: joint torques (T, n), norms at the sensor (T, 4), use of the box (T, 3 P),
-    clearance over distance (T,), and the shapes that it is between."""
+    """Values of (T,) samples of a motion.
+
+    Attributes:
+        torque: (T, n) of the joints.
+        sensor: (T, 4) norms at the sensor.
+        workspace: (T, 3 P) use of the box.
+        clearance: (T,) clearance over distance.
+        nearest: names of the nearest shapes.
+    """
 
     torque: Array
     sensor: Array
@@ -123,17 +114,17 @@ class _Motion:
     nearest: list[str]
 
 
-def _bodies(
+def _evaluate_bodies(
     robot: Robot, q: Array, qd: Array, qdd: Array, progress: Callable[[float], None]
 ) -> _Motion:
     plant, limits, frame_S, arm = robot.plant, robot.limits, robot.sensor_frame, robot.arm
     root = robot.diagram.CreateDefaultContext()
     context = plant.GetMyMutableContextFromRoot(root)
-    of_scene = robot.scene_graph.GetMyContextFromRoot(root)
+    scene_context = robot.scene_graph.GetMyContextFromRoot(root)
     gravity = plant.gravity_field().gravity_vector()
     position, velocity = plant.GetPositions(context), np.zeros(plant.num_velocities())
     acceleration = velocity.copy()
-    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard(plant, frame_S))
+    M_S = plant.CalcSpatialInertia(context, frame_S, _outboard_bodies(plant, frame_S))
     body, X_BS = frame_S.body(), frame_S.GetFixedPoseInBodyFrame()
     torque, kinematics = np.empty(q.shape), np.empty((len(q), 3, 3))
     workspace = np.empty((len(q), limits.points_S.size))
@@ -155,8 +146,8 @@ def _bodies(
         kinematics[k] = kinematics[k] @ X_WS.rotation().matrix()
         p = X_WS.multiply(limits.points_S.T).T
         workspace[k] = (np.abs(p - limits.box_middle) / limits.box_half).ravel()
-        query = robot.scene_graph.get_query_output_port().Eval(of_scene)
-        distance, words = _nearest(robot, query, limits.clearance + _NEAR)
+        query = robot.scene_graph.get_query_output_port().Eval(scene_context)
+        distance, words = _nearest(robot, query, limits.clearance + _SEARCH_MARGIN_M)
         clearance[k] = limits.clearance / distance if distance > 0 else np.inf
         nearest.append(words)
         if k % 200 == 0:
@@ -167,7 +158,7 @@ def _bodies(
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
-    """(T, 4) norms of force, torque, s and alpha, from (T, 3) in S: Newton and Euler."""
+    """Return (T, 4) norms of force, torque, s, alpha in S (Newton-Euler)."""
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))
@@ -175,8 +166,7 @@ def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> 
     return np.linalg.norm([force, torque, s, alpha], axis=2).T
 
 
-def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
-    """The load: all bodies that hang on the one that carries S."""
+def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     found = [frame_S.body().index()]
     for body in found:
@@ -185,10 +175,10 @@ def _outboard(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
 
 
 def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
-    """Smallest distance [m] up to `reach` of any two shapes, and their bodies' names."""
+    """Return the smallest distance [m], at most `reach`, and body names."""
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
-        return reach, "all farther"
+        return reach, "all shapes are farther"
     pair = min(found, key=lambda pair: pair.distance)
     inspector = robot.scene_graph.model_inspector()
     frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))

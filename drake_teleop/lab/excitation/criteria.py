@@ -1,20 +1,14 @@
-"""What an excitation is judged by: condition numbers, and A- and D-optimality of the information.
+"""Criteria of an excitation: condition numbers, A- and D-optimality of the information (T45).
 
 =========== ====================================================================================
-kappa_w10   ten columns, no offsets; force rows over sigma_f, torque rows over sigma_tau, columns
-            times diag(1, L, L, L, L^2 ...). The default.
-kappa10     ten columns of plain V in SI units, no offsets, the literature's number; at least
-            sqrt(8/3) = 1.633 for every motion, and not better for stronger excitation.
-kappa16     sixteen columns of plain [1 V] in SI units, with offsets; at least 9.81 for every motion
-            from rest to rest, and best where hardly anything moves.
-A16         rms of the ten predicted standard deviations, each over what would do (1 % of the mass,
-            1 mm, 10 % of the mean moment of inertia), offsets estimated too.
-D16         geometric mean of the sixteen semi-axes of the predicted standard ellipsoid, in the same
-            proportions; 0.1 N and 0.005 N m would do for the offsets.
+kappa_w10   10 columns, rows / sigma, columns times diag(1, L, L, L, L^2 ...). The default.
+kappa10     10 columns of V in SI units; at least sqrt(8/3).
+kappa16     16 columns of [1 V] in SI units; at least 9.81 from rest to rest.
+A16         rms of the 10 predicted errors of phi over acceptable errors.
+D16         geometric mean of the 16 semi-axes of the standard ellipsoid over acceptable errors.
 =========== ====================================================================================
 
-A16 and D16 are of one period at 1 kHz in white noise of the wrench, the motion known exactly; what
-a sensor lets one expect says `prediction.py`.
+A16 and D16 assume one period at 1 kHz, white wrench noise and exact motion.
 """
 
 from __future__ import annotations
@@ -22,33 +16,31 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import regressor
 
-Array = NDArray[np.float64]
-
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")
 
-#: Samples a second for which A16 and D16 are stated.
+#: Sample rate of A16 and D16 [Hz].
 RATE = 1000.0
 
-# What would do: of the mass, of the centre of mass [m], of the mean moment of inertia; of the
-# offsets [N], [N m].
-_MASS, _COM, _INERTIA = 0.01, 1e-3, 0.1
-_OFFSETS = (0.1, 0.005)
-# Relative to the largest eigenvalue: below it a parameter counts as not excited.
-_TINY = 1e-13
+# Acceptable errors: relative mass, centre of mass [m], relative mean moment of inertia, offsets
+# [N], [N m].
+_MASS_ERROR, _COM_ERROR_M, _INERTIA_ERROR = 0.01, 1e-3, 0.1
+_OFFSET_ERRORS = (0.1, 0.005)
+# Smallest eigenvalue of an excited parameter, over the largest.
+_MIN_EIGENVALUE_RATIO = 1e-13
 
 
 class Scales(NamedTuple):
-    """What the criteria divide by.
+    """Scales of the criteria.
 
     Attributes:
         noise: (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
-        length: L [m] of kappa_w10; `characteristic_length` knows a good one.
+        length: L [m] of kappa_w10.
         phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
@@ -58,20 +50,16 @@ class Scales(NamedTuple):
 
 
 def characteristic_length(phi: Array) -> float:
-    """L of kappa_w10 [m]: 0.1, and never above the radius of gyration about the origin of S."""
+    """Return L [m]: 0.1 or the radius of gyration about So, if smaller."""
     trace = phi[4] + phi[7] + phi[9]
     return float(min(0.1, np.sqrt(trace / (2 * phi[0]))))
 
 
 class Criterion:
-    """One of `CRITERIA`, as a smooth function of the motion with its gradient.
-
-    Args:
-        name: which.
-        scales: what it divides by.
+    """One of `CRITERIA` as a smooth function of the motion.
 
     Raises:
-        DrakeTeleopError: if there is no such criterion.
+        DrakeTeleopError: for an unknown name.
     """
 
     def __init__(self, name: str, scales: Scales) -> None:
@@ -90,11 +78,11 @@ class Criterion:
         if name == "kappa_w10":
             columns = np.array([1.0] + 3 * [scales.length] + 6 * [scales.length**2])
         elif whitened:
-            columns = _acceptable(scales.phi)
+            columns = _acceptable_errors(scales.phi)
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Scaled rows (6 T, c) of the regression, and their mean product (c, c)."""
+        """Return scaled regression rows (6 T, c) and their mean product (c, c)."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -102,33 +90,26 @@ class Criterion:
         return rows, rows.T @ rows / len(V)
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
-        """The criterion, of (T, 3) samples of a period of `duration` [s]; inf if singular."""
+        """Return the criterion of (T, 3) samples over `duration` [s]; inf if singular."""
         _, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        if eigenvalues[0] <= _TINY * eigenvalues[-1]:
+        if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
             return float("inf")
         if self.name.startswith("kappa"):
             return float(np.sqrt(eigenvalues[-1] / eigenvalues[0]))
-        log_value, _ = self._of_spectrum(eigenvalues, vectors, 0.0)
+        log_value, _ = self._log_and_gradient(eigenvalues, vectors, 0.0)
         return float(np.exp(log_value) / np.sqrt(RATE * duration))
 
     def smooth(self, s: Array, omega: Array, alpha: Array, sharpness: float) -> tuple[float, Array]:
-        """Its logarithm, and the gradient with respect to V.
+        """Return the logarithm of the criterion and its gradient by V (T, 6, 10).
 
-        At an optimal condition number the smallest eigenvalue is multiple and its gradient not
-        unique, so maximum and minimum are log-sum-exps over all eigenvalues.
-
-        Args:
-            s, omega, alpha: (T, 3).
-            sharpness: of the log-sum-exp; at 1 all eigenvalues guide, at 12 the extreme ones do.
-
-        Returns:
-            The logarithm (of a mean sample's A16 and D16), and (T, 6, 10).
+        Log-sum-exps replace extreme eigenvalues: at an optimum the smallest one is multiple and its
+        gradient is not unique. A16 and D16 are those of a mean sample.
         """
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
-        eigenvalues = np.maximum(eigenvalues, _TINY * eigenvalues[-1])
-        value, weights = self._of_spectrum(eigenvalues, vectors, sharpness)
+        eigenvalues = np.maximum(eigenvalues, _MIN_EIGENVALUE_RATIO * eigenvalues[-1])
+        value, weights = self._log_and_gradient(eigenvalues, vectors, sharpness)
         g_gram = (vectors * weights) @ vectors.T
         if self.name == "A16":
             g_gram = weights
@@ -136,10 +117,10 @@ class Criterion:
         g_V = g_rows * self._rows[:, np.newaxis] * self._columns
         return value, np.ascontiguousarray(g_V[:, :, -10:])
 
-    def _of_spectrum(
+    def _log_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Log of the criterion, and its gradient: of each eigenvalue, or for A16 of the Gram."""
+        """Return the logarithm and its gradient by eigenvalues (A16: by the Gram matrix)."""
         if self.name == "D16":
             n = len(eigenvalues)
             return float(-0.5 * np.log(eigenvalues).mean()), -0.5 / (n * eigenvalues)
@@ -149,21 +130,21 @@ class Criterion:
             trace = float(np.trace(block[6:]))
             return 0.5 * np.log(trace / 10), -(block @ block.T) / (2 * trace)
         logs = 0.5 * np.log(eigenvalues)
-        top, of_top = _smooth_max(logs, sharpness)
-        bottom, of_bottom = _smooth_max(-logs, sharpness)
-        return top + bottom, 0.5 * (of_top - of_bottom) / eigenvalues
+        top, top_weights = _smooth_max(logs, sharpness)
+        bottom, bottom_weights = _smooth_max(-logs, sharpness)
+        return top + bottom, 0.5 * (top_weights - bottom_weights) / eigenvalues
 
 
 @njit(cache=True)
 def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
-    """From dJ/dV (6, 10) to dJ/ds, dJ/domega, dJ/dalpha, (3,) each; V is `regressor_into`'s."""
+    """Fill dJ/ds, dJ/domega, dJ/dalpha (3,) from dJ/dV (6, 10)."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]
     g_alpha[0] = -g_V[1, 3] + g_V[2, 2] + g_V[3, 4] + g_V[4, 5] + g_V[5, 6]
     g_alpha[1] = g_V[0, 3] - g_V[2, 1] + g_V[3, 5] + g_V[4, 7] + g_V[5, 8]
     g_alpha[2] = -g_V[0, 2] + g_V[1, 1] + g_V[3, 6] + g_V[4, 8] + g_V[5, 9]
-    # Of the products omega_i omega_j.
+    # Derivatives by the products omega_i omega_j.
     xx = -g_V[1, 2] - g_V[2, 3] - g_V[4, 6] + g_V[5, 5]
     yy = -g_V[0, 1] - g_V[2, 3] + g_V[3, 8] - g_V[5, 5]
     zz = -g_V[0, 1] - g_V[1, 2] - g_V[3, 8] + g_V[4, 6]
@@ -176,15 +157,13 @@ def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
     g_omega[2] = 2 * z * zz + x * xz + y * yz
 
 
-def _acceptable(phi: Array) -> Array:
-    """(16,) errors of offsets and phi that would do."""
-    inertia = _INERTIA * (phi[4] + phi[7] + phi[9]) / 3
-    offsets = np.repeat(_OFFSETS, 3)
-    return np.array([*offsets, _MASS * phi[0], *3 * [_COM * phi[0]], *6 * [inertia]])
+def _acceptable_errors(phi: Array) -> Array:
+    inertia = _INERTIA_ERROR * (phi[4] + phi[7] + phi[9]) / 3
+    offsets = np.repeat(_OFFSET_ERRORS, 3)
+    return np.array([*offsets, _MASS_ERROR * phi[0], *3 * [_COM_ERROR_M * phi[0]], *6 * [inertia]])
 
 
 def _smooth_max(values: Array, sharpness: float) -> tuple[float, Array]:
-    """Log-sum-exp and its gradient."""
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()

@@ -1,4 +1,4 @@
-"""The limits of arm, sensor and room, and how much of each a motion uses, with gradients."""
+"""Limits of arm, sensor and workspace; their use by a motion, with gradients (T47)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.lab.excitation.criteria import regressor_gradient
-from drake_teleop.lab.excitation.recursion import (
+from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,
     pull_back,
     seed_joint_torque,
@@ -22,36 +23,32 @@ from drake_teleop.lab.excitation.recursion import (
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.slave.arm import MOTION_SIZE, inverse_dynamics, link_motions
 
-Array = NDArray[np.float64]
-
 LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
-#: The use of the clearance is 1 at the clearance, 0 this much farther away [m].
+#: Distance beyond the clearance at which its use is 0 [m].
 CLEARANCE_SCALE = 0.1
-# Of a smooth maximum: what counts less than this in it is left out of its gradient.
-_NEGLIGIBLE = 1e-7
-# Stands for every distance that is larger than the clearance by its scale [m].
-_FAR = 1.0
+# Smallest weight in the gradient of a smooth maximum.
+_MIN_WEIGHT = 1e-7
+# Value of all distances beyond clearance plus scale [m].
+_FAR_DISTANCE_M = 1.0
 
 
 class Limits(NamedTuple):
-    """What an excitation must respect. A use of 1 is all of a limit; more violates it.
+    """Limits of an excitation; a use of 1 is all of a limit.
 
     Attributes:
-        q_middle, q_half: (n,) middle and half width of the joints' ranges [rad].
-        velocity, acceleration, effort: (n,) of the joints [rad/s], [rad/s^2], [N m]; may be inf.
-        phi: (10,) the heaviest load to expect, about the origin of S.
-        sensor: (4,) largest norms at S under that load: force [N], torque [N m], specific force
-            [m/s^2], angular acceleration [rad/s^2].
-        points_S: (P, 3) points fixed to S that stay in the box [m].
-        box_middle, box_half: (3,) of the box, in W [m]; half may be inf.
-        capsule_row: (C,) link of each capsule, as a row of `link_motions`; -1 is the world.
-        capsule_ends: (C, 2, 3) ends of its axis in the link's frame [m].
+        q_middle, q_half: (n,) of the joint ranges [rad].
+        velocity, acceleration, effort: (n,) [rad/s], [rad/s^2], [N m]; may be inf.
+        phi: (10,) heaviest expected load about the origin of S.
+        sensor: (4,) norms of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
+        points_S: (P, 3) points that remain in the box [m].
+        box_middle, box_half: (3,) in W [m]; half may be inf.
+        capsule_row: (C,) link, a row of `link_motions`; -1 is the world.
+        capsule_ends: (C, 2, 3) in the link's frame [m].
         capsule_radius: (C,) [m].
-        pairs: (K, 2) capsules that keep a distance from each other.
-        distances: (K,) which [m]; below the clearance, even below zero, where capsules are much
-            larger than their shapes.
-        clearance: of the shapes, for the check [m].
+        pairs: (K, 2) capsules with a minimum distance.
+        distances: (K,) [m]; negative where capsules are much larger than shapes.
+        clearance: minimum distance of the true shapes [m].
     """
 
     q_middle: Array
@@ -74,14 +71,14 @@ class Limits(NamedTuple):
 
 @njit(cache=True)
 def motions_of(table, q, qd, qdd, motions):
-    """`link_motions` of (T, n) samples into (T, n+1, 21)."""
+    """Fill (T, n+1, 21) with `link_motions` of (T, n) samples."""
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
 
 
 @njit(cache=True)
 def sensor_vectors(motions, out):
-    """s, omega, alpha of S in S, (3, T, 3), from (T, n+1, 21)."""
+    """Fill (3, T, 3) with s, omega, alpha of S in S."""
     for t in range(len(motions)):
         motion = motions[t, -1]
         for k in range(3):
@@ -91,7 +88,7 @@ def sensor_vectors(motions, out):
 
 @njit(cache=True)
 def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
-    """From dJ/dV (T, 6, 10) to dJ/d(q, qd, qdd), (3, T, n), which is added to."""
+    """Add dJ/d(q, qd, qdd) to `gradient` (3, T, n), from dJ/dV (T, 6, 10)."""
     rows = motions.shape[1]
     seeds = np.zeros((rows, SEED_SIZE))
     c, virtual = np.zeros(rows - 1), np.zeros((rows, 6))
@@ -111,18 +108,13 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 
 @njit(cache=True)
 def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
-    """Largest use of each of `LIMITS` over all samples: smooth (7,), exact (7,), and gradients.
-
-    The smooth maximum (Kreisselmeier and Steinhauser 1979) is never below the exact one.
+    """Calculate the largest use of each of `LIMITS` over all samples, with gradients (T47).
 
     Args:
-        table: `ArmModel.table`, with the heaviest load.
         q, qd, qdd: (T, n).
-        motions: (T, n+1, 21), `motions_of` them.
-        limits: `Limits`.
-        sharpness: of the smooth maximum.
-        smooth, largest: (7,), filled.
-        gradient: (7, 3, T, n), of the smooth uses with respect to q, qd, qdd; filled.
+        motions: (T, n+1, 21) from `motions_of`.
+        smooth, largest: (7,) outputs: smooth and exact maximum.
+        gradient: (7, 3, T, n) output: of the smooth uses by q, qd, qdd.
     """
     gradient[:] = 0.0
     T, n = q.shape
@@ -134,7 +126,7 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
             for j in range(n):
                 x = values[t, j] - limits.q_middle[j] if k == 0 else values[t, j]
                 use[t, j], sign[t, j] = abs(x) / scale[j], np.sign(x) / scale[j]
-        largest[k], smooth[k] = _soften(use, sharpness)
+        largest[k], smooth[k] = _smooth_maximum(use, sharpness)
         for t in range(T):
             for j in range(n):
                 gradient[k, k, t, j] = use[t, j] * sign[t, j]
@@ -148,8 +140,8 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
 
 
 @njit(cache=True)
-def _soften(use, sharpness):
-    """The maximum of `use` (T, m) and a smooth one; `use` becomes its gradient."""
+def _smooth_maximum(use, sharpness):
+    """Return exact and smooth maximum of `use` (T, m), which becomes the gradient."""
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):
@@ -173,22 +165,22 @@ def _torque(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, grad
         inverse_dynamics(table, q[t], qd[t], qdd[t], tau[t])
         for j in range(n):
             use[t, j] = abs(tau[t, j]) / limits.effort[j]
-    largest[3], smooth[3] = _soften(use, sharpness)
+    largest[3], smooth[3] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for j in range(n):
             c[j] = use[t, j] * np.sign(tau[t, j]) / limits.effort[j]
-            # The rotor's inertia and the joint's damping, table columns 22 and 23.
+            # Table columns 22 and 23: rotor inertia and joint damping.
             gradient[2, t, j] += c[j] * table[j, 22]
             gradient[1, t, j] += c[j] * table[j, 23]
         seed_joint_torque(table, motions[t], c, virtual, seeds)
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
-def _pull(table, motions, qd, qdd, t, gradient, work):
+def _pull_back_sample(table, motions, qd, qdd, t, gradient, work):
     seeds, c, virtual = work
     pull_back(
         table, motions[t], qd[t], qdd[t], c, virtual, seeds,
@@ -213,10 +205,10 @@ def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradien
             a, b, c = x[t, 3 * k], x[t, 3 * k + 1], x[t, 3 * k + 2]
             size[t, k] = np.sqrt(a * a + b * b + c * c)
             use[t, k] = size[t, k] / limits.sensor[k]
-    largest[4], smooth[4] = _soften(use, sharpness)
+    largest[4], smooth[4] = _smooth_maximum(use, sharpness)
     g = np.empty((4, 3))
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(4):
@@ -228,7 +220,7 @@ def _sensor(table, qd, qdd, motions, limits, sharpness, smooth, largest, gradien
         seed_wrench(motion, limits.phi, force, torque, seeds[-1])
         seed_vector(motion, 0, (g[2, 0], g[2, 1], g[2, 2]), seeds[-1])
         seed_vector(motion, 6, (g[3, 0], g[3, 1], g[3, 2]), seeds[-1])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -244,9 +236,9 @@ def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 x = motion[9 + i] + p[i] - limits.box_middle[i]
                 use[t, 3 * k + i] = abs(x) / limits.box_half[i]
                 sign[t, 3 * k + i] = np.sign(x) / limits.box_half[i]
-    largest[5], smooth[5] = _soften(use, sharpness)
+    largest[5], smooth[5] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(P):
@@ -257,7 +249,7 @@ def _workspace(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 use[t, i + 2] * sign[t, i + 2],
             )
             seed_point(motions[t, -1], limits.points_S[k], g, seeds[-1])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
@@ -270,24 +262,24 @@ def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
     use, nearest = np.empty((T, K)), np.empty(5)
     ends = np.empty((T, *limits.capsule_ends.shape))
     for t in range(T):
-        _place(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
+        _transform_capsules(motions[t], limits.capsule_row, limits.capsule_ends, ends[t])
         for k in range(K):
             a, b = limits.pairs[k]
             reach = limits.capsule_radius[a] + limits.capsule_radius[b]
-            distance = _FAR
+            distance = _FAR_DISTANCE_M
             if not _is_far(ends[t, a], ends[t, b], reach + CLEARANCE_SCALE):
-                distance = _between(ends[t, a], ends[t, b], nearest) - reach
+                distance = _segment_distance(ends[t, a], ends[t, b], nearest) - reach
             use[t, k] = 1.0 - (distance - limits.distances[k]) / CLEARANCE_SCALE
-    largest[6], smooth[6] = _soften(use, sharpness)
+    largest[6], smooth[6] = _smooth_maximum(use, sharpness)
     for t in range(T):
-        if use[t].max() < _NEGLIGIBLE:
+        if use[t].max() < _MIN_WEIGHT:
             continue
         seeds[:] = 0.0
         for k in range(K):
-            if use[t, k] < _NEGLIGIBLE:
+            if use[t, k] < _MIN_WEIGHT:
                 continue
             a, b = limits.pairs[k]
-            _between(ends[t, a], ends[t, b], nearest)
+            _segment_distance(ends[t, a], ends[t, b], nearest)
             for side in range(2):
                 capsule = limits.pairs[k, side]
                 row = limits.capsule_row[capsule]
@@ -300,25 +292,24 @@ def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
                 )
                 g = (factor * nearest[2], factor * nearest[3], factor * nearest[4])
                 seed_point(motions[t, row], point, g, seeds[row])
-        _pull(table, motions, qd, qdd, t, gradient, work)
+        _pull_back_sample(table, motions, qd, qdd, t, gradient, work)
 
 
 @njit(cache=True)
 def capsule_distances(motions, rows, ends, radii, pairs):
-    """(T, K) distances of pairs of capsules [m], see `Limits`; at (T, n+1, 21) motions."""
+    """Return (T, K) distances of capsule pairs [m]."""
     distances = np.empty((len(motions), len(pairs)))
     placed, nearest = np.empty(ends.shape), np.empty(5)
     for t in range(len(motions)):
-        _place(motions[t], rows, ends, placed)
+        _transform_capsules(motions[t], rows, ends, placed)
         for k in range(len(pairs)):
             a, b = pairs[k]
-            distances[t, k] = _between(placed[a], placed[b], nearest) - radii[a] - radii[b]
+            distances[t, k] = _segment_distance(placed[a], placed[b], nearest) - radii[a] - radii[b]
     return distances
 
 
 @njit(cache=True)
-def _place(motions, rows, ends, placed):
-    """Ends of all capsules in W."""
+def _transform_capsules(motions, rows, ends, placed):
     for k in range(len(rows)):
         row = rows[k]
         for e in range(2):
@@ -332,7 +323,7 @@ def _place(motions, rows, ends, placed):
 
 @njit(cache=True)
 def _is_far(first, second, enough):
-    """Whether two segments (2, 3) are certainly farther apart than `enough` [m]."""
+    """Return True only if segments (2, 3) are farther apart than `enough` [m]."""
     between = length_a = length_b = 0.0
     for i in range(3):
         d = 0.5 * (first[0, i] + first[1, i] - second[0, i] - second[1, i])
@@ -343,11 +334,10 @@ def _is_far(first, second, enough):
 
 
 @njit(cache=True)
-def _between(first, second, nearest):
-    """Distance of two segments (2, 3) [m].
+def _segment_distance(first, second, nearest):
+    """Return the distance of two segments (2, 3) [m] (Ericson, Real-Time Collision Detection).
 
-    `nearest` (5,) is filled: where along each segment, 0 to 1, and the direction from the second
-    to the first. After Ericson, Real-Time Collision Detection, 2005, 5.1.9.
+    Output `nearest` (5,): positions along the segments (0 to 1), unit vector from second to first.
     """
     dd = ee = de = dr = er = 0.0
     for i in range(3):
@@ -380,5 +370,5 @@ def _between(first, second, nearest):
 
 
 def empty_motions(samples: int, joints: int) -> Array:
-    """Room for `motions_of`."""
+    """Allocate the output of `motions_of`."""
     return np.empty((samples, joints + 1, MOTION_SIZE))

@@ -1,4 +1,4 @@
-"""The film of an excitation: the arm as it will move, to be watched before a robot runs it."""
+"""3D replay of an excitation."""
 
 from __future__ import annotations
 
@@ -19,20 +19,15 @@ from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.film import Film, Reading, Show, add_shapes, frame_times, plain_room, rgba
 
-_TABLE, _BONE = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
-_THICKNESS = 0.03  # of the table that is drawn [m]
-_BONE_SHARE = 0.04  # radius of a bone, from joint to joint, as a share of its length
-# Where the camera is, seen from the middle of the motion, in sizes of the arm.
-_VIEW = np.array([0.55, -0.75, 0.3])
+_TABLE_COLOUR, _BONE_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
+_TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
+_BONE_RADIUS_RATIO = 0.04  # radius of a bone over its length
+# Camera position from the middle of the motion, in sizes of the arm.
+_CAMERA_POSITION = np.array([0.55, -0.75, 0.3])
 
 
 def write_motion_film(path: Path, found: Excitation) -> None:
-    """Writes the film of one period, in real time.
-
-    Args:
-        path: of the HTML file.
-        found: from `excite`.
-    """
+    """Write an HTML file with the 3D replay of one period."""
     robot, trajectory = found.robot, found.trajectory
     times, slow_motion = frame_times(0.0, trajectory.period, 1.0)
     q = trajectory.evaluate(times)[0]
@@ -44,22 +39,24 @@ def write_motion_film(path: Path, found: Excitation) -> None:
     force = np.linalg.norm(
         non_contact_wrench(*sensor_motion(robot, trajectory), robot.limits.phi)[:, :3], axis=1
     )
-    at = np.minimum(np.rint(times * RATE).astype(int), len(force) - 1)
+    samples = np.minimum(np.rint(times * RATE).astype(int), len(force) - 1)
     film = Film(
         f"Excitation of {robot.name}",
         times,
         slow_motion,
         readings=[
-            Reading("Force of the heaviest load", "N", force[at], BLUE),
+            Reading("Force of the heaviest load", "N", force[samples], BLUE),
             Reading("Speed of the sensor", "m/s", speed),
         ],
-        notes=("Line: the sensor's way, from rest to rest.",),
+        notes=("Line: path of the sensor, from rest to rest.",),
         clock="of the motion",
         curves="force at the sensor, 0 to {top} N",
     )
 
     def make_scene(meshcat: Meshcat) -> Show:
-        _furnish(meshcat, path_S, np.array([X_WB.translation() for X_WB in poses[0][0].values()]))
+        _add_surroundings(
+            meshcat, path_S, np.array([X_WB.translation() for X_WB in poses[0][0].values()])
+        )
         _AddLinks(meshcat, robot, context)
 
         def show(film_time: float, frame: int) -> None:
@@ -74,7 +71,6 @@ def write_motion_film(path: Path, found: Excitation) -> None:
 def _poses(
     robot: Robot, context: Context, posture: Array
 ) -> tuple[dict[BodyIndex, RigidTransform], RigidTransform]:
-    """X_WB of every body, and X_WS."""
     plant = robot.plant
     q = plant.GetPositions(context)
     q[robot.arm.position_index] = posture
@@ -85,22 +81,19 @@ def _poses(
 
 
 def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
-    """The shapes of every body. One that is not to be seen is shown as what it collides with.
-
-    That may be little or nothing: it has bones, too, to the joints that it carries.
-    """
+    """Add visual shapes; for bodies without them collision shapes and bones."""
     plant, inspector = robot.plant, robot.scene_graph.model_inspector()
     for k in range(1, plant.num_bodies()):
         body = plant.get_body(BodyIndex(k))
-        seen = plant.GetVisualGeometriesForBody(body)
-        shapes = seen or plant.GetCollisionGeometriesForBody(body)
-        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _BONE)
-        for number, p_BJ in enumerate(() if seen else _carried(robot, context, body)):
+        visuals = plant.GetVisualGeometriesForBody(body)
+        shapes = visuals or plant.GetCollisionGeometriesForBody(body)
+        add_shapes(meshcat, f"/arm/{k}", inspector, shapes, _BONE_COLOUR)
+        for number, p_BJ in enumerate(() if visuals else _joint_positions(robot, context, body)):
             _add_bone(meshcat, f"/arm/{k}/bone_{number}", p_BJ)
 
 
-def _carried(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
-    """(3,) p_BJ of every joint that a body carries [m], and of S, but for those at its origin."""
+def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
+    """Yield (3,) p_BJ of joints on a body and of S [m]."""
     plant = robot.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]
@@ -114,18 +107,17 @@ def _carried(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]
 
 def _add_bone(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
     length = float(np.linalg.norm(p_BJ))
-    meshcat.SetObject(name, Cylinder(_BONE_SHARE * length, length), _BONE)
+    meshcat.SetObject(name, Cylinder(_BONE_RADIUS_RATIO * length, length), _BONE_COLOUR)
     along = RotationMatrix.MakeFromOneVector(p_BJ, 2)
     meshcat.SetTransform(name, RigidTransform(along, p_BJ / 2))
 
 
-def _furnish(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
-    """Table, the sensor's way, light, and a camera that has all of it in sight."""
+def _add_surroundings(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
     plain_room(meshcat)
-    seen = np.vstack([path_S, bodies, np.zeros((1, 3))])
-    low, high = seen.min(axis=0), seen.max(axis=0)
+    visuals = np.vstack([path_S, bodies, np.zeros((1, 3))])
+    low, high = visuals.min(axis=0), visuals.max(axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))
-    meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _THICKNESS), _TABLE)
-    meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_THICKNESS / 2]))
+    meshcat.SetObject("/room/table", Box(2 * size, 2 * size, _TABLE_THICKNESS_M), _TABLE_COLOUR)
+    meshcat.SetTransform("/room/table", RigidTransform([0.0, 0.0, -_TABLE_THICKNESS_M / 2]))
     meshcat.SetLine("/way", path_S.T, 3.0, rgba(BLUE))
-    meshcat.SetCameraPose(middle + size * _VIEW, middle)
+    meshcat.SetCameraPose(middle + size * _CAMERA_POSITION, middle)

@@ -1,15 +1,7 @@
-"""What an excitation lets one know: standard deviations of offsets and load, from the sensor alone.
+"""Predicted standard deviations of offsets and load after an excitation (T46).
 
-Weighted least squares makes of the errors e of the equation F = [E V] theta + e an error of theta
-that is linear in e, theta_error = sum of L(t) e(t) over the samples. In e is the noise of the
-wrench, and the noise of the motion times the load, -M n, M being the load's spatial inertia about
-So. White noise and random walks pass L, those of the accelerometer also the filters by which
-`motion_estimation` corrects it (backwards, since L stands after them).
-
-What is assumed: all samples at the sensor's rate are used, the motion is slow against the sensor's
-low-pass, the load is known well enough for M, quantisation is noise. What is left out: errors that
-are no noise (gain, delay, thermal drift), the encoders' rounding, and products of noises, which
-make inertias too small rather than uncertain.
+Assumptions: every sensor sample is used, the motion is slow, the load is known, quantisation is
+noise. Not included: gain errors, delay, thermal drift, rounding of encoders, products of noises.
 """
 
 from __future__ import annotations
@@ -17,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor
@@ -29,19 +21,17 @@ from drake_teleop.station.sensor.motion_estimation import (
 )
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-Array = NDArray[np.float64]
-
 
 class SensorNoise(NamedTuple):
-    """Noise of the 12 channels [f, tau, s, alpha], and what becomes of the last six.
+    """Noise of the 12 channels [f, tau, s, alpha] and its filters.
 
     Attributes:
-        weights: (6,) standard deviations that the estimator divides the wrench by [N, N m].
-        white: (12,) spectral densities, two-sided [unit^2 s].
-        walk: (12,) random walks: variance that a second adds [unit^2 / s].
+        weights: (6,) standard deviations by which the estimator divides the wrench [N, N m].
+        white: (12,) two-sided spectral densities [unit^2 s].
+        walk: (12,) random walks: variance per second [unit^2 / s].
         place: (3,) p_SoAo_S of the accelerometer [m].
-        filters: numerators and denominators in s of what reaches s and alpha of the channels'
-            noise; none if the motion does not come from the accelerometer.
+        filters: numerators and denominators in s from the channels' noise to s and alpha; None
+            without accelerometer.
     """
 
     weights: Array
@@ -54,14 +44,7 @@ class SensorNoise(NamedTuple):
 def sensor_noise(
     sensor: WristSensorConfig, estimation: MotionEstimationConfig, num_joints: int, period: float
 ) -> SensorNoise:
-    """What is known of the noise before anything is measured.
-
-    Args:
-        sensor: the sensor.
-        estimation: from what the motion is estimated.
-        num_joints: n, of the arm.
-        period: of the sensor [s].
-    """
+    """Return the specified noise of a sensor."""
     std = np.concatenate([sensor.wrench_std(), sensor.motion_std()[[0, 1, 2, 6, 7, 8]]])
     walk = np.zeros(12) if sensor.ideal else sensor.random_walk()
     filters = None
@@ -69,7 +52,7 @@ def sensor_noise(
         filters = (np.ones(1), np.ones(1)), (np.ones(1), np.ones(1))
     elif estimation.source == "fused":
         angular, linear = motion_gains(estimation, sensor, num_joints, period)
-        filters = _correction(linear, period), _correction(angular, period)
+        filters = _error_filter(linear, period), _error_filter(angular, period)
     place = sensor.accelerometer()[0]
     return SensorNoise(sensor.wrench_std(), std**2 * period, walk**2, place, filters)
 
@@ -77,25 +60,24 @@ def sensor_noise(
 def predicted_deviations(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """(16,) standard deviations of offsets and phi after the motion; as `predicted_covariance`."""
+    """Return (16,) standard deviations, see `predicted_covariance`."""
     return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
 
 
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """(16, 16) covariance of offsets and phi after the motion.
+    """Return (16, 16) covariance of offsets and phi after the motion.
 
     Args:
         s, omega, alpha: (T, 3) samples of the motion, in S.
-        step: between them [s].
-        noise: of the sensor.
+        step: sample period [s].
         phi: (10,) the load.
     """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.weights[:, np.newaxis] ** 2
     gram = np.einsum("tci,tcj->ij", rows, weighted)
-    # Balanced before it is inverted: the columns have different units.
+    # Balance before inversion: the columns have different units.
     size = np.sqrt(np.diag(gram))
     inverse = np.linalg.inv(gram / np.outer(size, size)) / np.outer(size, size)
     influence = np.zeros((len(s), 12, 16))
@@ -104,32 +86,30 @@ def predicted_covariance(
         of_s, of_alpha = noise.filters
         of_motion = -spatial_inertia(phi) @ influence[:, :6]
         through_s = _backwards(of_s, of_motion[:, :3], step)
-        # s of So is s of Ao plus p_SoAo x alpha.
+        # s of So = s of Ao + p_SoAo x alpha.
         through_alpha = of_motion[:, 3:] + cross_matrix(noise.place).T @ through_s
         influence[:, 6:9] = through_s
         influence[:, 9:] = _backwards(of_alpha, through_alpha, step)
-    # An increment of a walk is in all that comes after it.
+    # A step of a random walk affects all later samples.
     later = np.cumsum(influence[::-1], axis=0)
     of_white = _products(influence, noise.white) / step
     return of_white + _products(later, noise.walk) * step
 
 
 def _products(influence: Array, variances: Array) -> Array:
-    """(16, 16) sum over samples and channels of influence influence^T times the variance."""
     rows = (influence * np.sqrt(variances)[:, np.newaxis]).reshape(-1, influence.shape[2])
     return rows.T @ rows
 
 
-def _correction(filter_: SteadyState, period: float) -> tuple[Array, Array]:
-    """From the noise of an acceleration to what the filter leaves of it."""
+def _error_filter(filter_: SteadyState, period: float) -> tuple[Array, Array]:
+    """Return the transfer function from acceleration noise to filtered error."""
     denominator = np.array([1.0, *(filter_.gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
 
 
 def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) -> Array:
-    """The filter in reversed time, along the first axis."""
-    # Takes longer to import than the station.
+    # Imported late: slower than the station's import.
     from scipy.signal import bilinear, lfilter
 
     b, a = bilinear(*polynomials, fs=1 / step)
@@ -137,6 +117,6 @@ def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) ->
 
 
 def spatial_inertia(phi: Array) -> Array:
-    """(6, 6) from [s, alpha] of S to the wrench of phi."""
+    """Return (6, 6) matrix from [s, alpha] of S to the wrench of phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])

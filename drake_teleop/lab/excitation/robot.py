@@ -1,8 +1,4 @@
-"""The arm that is to be excited, its surroundings, and its limits.
-
-Of the station's slave, or of any model that Drake can read (URDF, SDF, MJCF, model directives).
-What a model lacks is assumed, and every assumption is named.
-"""
+"""Arm with surroundings and limits for the design."""
 
 from __future__ import annotations
 
@@ -19,10 +15,10 @@ from pydrake.systems.framework import Diagram
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
 from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
-from drake_teleop.lab.excitation.scene import CLEARANCE, Parse, Scene
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
@@ -35,41 +31,34 @@ from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
-_POSTURES = 1000  # random ones, in which distances of shapes are looked at
-# Of the joints' ranges, speeds and torques; the rest is for tracking errors and feedback.
+_NUM_POSTURES = 1000  # random postures for distances of shapes
+# Usable share of joint limits; the rest is for tracking errors and feedback.
 _JOINT_SHARE = 0.8
-# Of the weakest axis of the sensor; a grasped object lies farther out than the tool.
+# Usable share of the sensor's weakest axis; a grasped object is farther out than the tool.
 _FORCE_SHARE, _TORQUE_SHARE = 0.9, 10.0 / 12.0
-# The heaviest load to expect is this much heavier than the known one (a grasped object of 0.8 kg).
+# Heaviest expected load over the modelled one (a grasped object of 0.8 kg).
 _LOAD_FACTOR = 1.3
-# What a payload of unknown shape looks like: centre of mass along z_S, radius of gyration [m].
-_PAYLOAD_COM, _PAYLOAD_GYRATION = 0.08, 0.05
-_PAYLOAD = 2.0
-_LEAST_PAYLOAD, _MOST_PAYLOAD = 1e-3, 1e4
+# Payload of unknown shape: centre of mass along z_S, radius of gyration [m].
+_PAYLOAD_COM_M, _PAYLOAD_GYRATION_M = 0.08, 0.05
+_DEFAULT_PAYLOAD_KG = 2.0
+_MIN_PAYLOAD_KG, _MAX_PAYLOAD_KG = 1e-3, 1e4
 
-# The station's wrist centre and ball tip, and where both may be: in front of the arm, above the
-# table.
+# The station's wrist centre and ball tip, and their box in front of the arm and above the table.
 _POINTS_S = ((0.0, 0.0, -0.085), (0.0, 0.0, 0.2))
 _BOX_W = ((0.25, -0.7, 0.1), (1.05, 0.7, 1.3))
+_UNLIMITED = np.zeros(3), np.full(3, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """An arm with its surroundings, ready for a design and for a check.
+    """Arm with its surroundings.
 
     Attributes:
-        name: of the scenario or the model.
-        diagram: of plant and scene graph.
-        plant: with the heaviest load on the arm.
-        scene_graph: with everything that may collide.
+        plant: with the heaviest load.
         sensor_frame: S.
-        arm: the same as arrays.
-        limits: what an excitation must respect.
-        scales: what criteria divide by; with the heaviest load.
-        noise: of the sensor, for predictions.
-        home: (n,) a posture to begin from [rad].
-        assumptions: what was not in the model.
-        folders: with converted meshes, which live as long as this.
+        home: (n,) start posture of the search [rad].
+        assumptions: assumed values that the model lacks.
+        folders: temporary folders with converted meshes.
     """
 
     name: str
@@ -87,7 +76,7 @@ class Robot:
 
 
 def RobotFromScenario(scenario: Scenario) -> Robot:
-    """The station's slave with its tool, what it has to touch, and a table at z = 0.
+    """Return the station's slave with tool, environment, and a table at z = 0.
 
     Raises:
         DrakeTeleopError: if the arm cannot reach the scenario's start.
@@ -106,18 +95,15 @@ def RobotFromScenario(scenario: Scenario) -> Robot:
     scene = Scene(parse, (_LOAD_FACTOR - 1) * slave.arm.phi_load, visuals_count=not own)
     scene.arm, _ = with_all_limits(scene.arm, str(scenario.slave.path))
     lower, upper = np.array(_BOX_W)
-    box = (upper + lower) / 2, (upper - lower) / 2
-    endless = np.zeros(3), np.full(3, np.inf)
-    return _robot(
+    return _make_robot(
         scene,
         "the station's slave",
         scenario.wrist_sensor,
         scenario.motion_estimation,
         scenario.rates.sensor_hz,
-        home=slave.start,
-        stands_there=True,
+        start=slave.start,
         points_S=np.array([np.zeros(3), slave.tip] if own else _POINTS_S),
-        box=endless if own else box,
+        box=_UNLIMITED if own else ((upper + lower) / 2, (upper - lower) / 2),
         assumptions=["a table at z = 0", *slave.assumptions],
         folders=folders,
     )
@@ -134,106 +120,99 @@ def RobotFromModel(
     acceleration: tuple[float, ...] = (),
     payload: float | None = None,
 ) -> Robot:
-    """Any serial arm of revolute and prismatic joints.
-
-    A base that hangs on nothing is welded to the world, joints beyond the sensor are held.
+    """Return a serial arm from a model; free bases are welded, joints beyond the sensor locked.
 
     Args:
-        path: of the model.
-        sensor_frame: name of the frame or link at which the sensor measures.
-        sensor: what it can measure.
-        estimation: from what the motion will be known; by default as in the station.
-        sensor_hz: rate of the sensor [Hz].
-        package_paths: folders in which `package://` addresses are looked up.
-        acceleration: limits [rad/s^2], one for all joints or one for each, if the model has none.
-        payload: mass of the heaviest load [kg], if it is not in the model.
+        sensor_frame: frame or link at which the sensor measures.
+        package_paths: folders for `package://` addresses.
+        acceleration: limits [rad/s^2] if the model has none, one value or one for each joint.
+        payload: mass of the heaviest load [kg], if the model lacks it.
 
     Raises:
-        DrakeTeleopError: if the model cannot be read or is no such arm.
+        DrakeTeleopError: if the model is unreadable or not such an arm.
     """
-    lacking: list[str] = []
+    missing: list[str] = []
     folders: list[TemporaryDirectory[str]] = []
 
     def parse(plant: MultibodyPlant) -> tuple[ModelInstanceIndex, Frame]:
         model = ParseModel(plant, path, sensor_frame, package_paths)
-        lacking[:] = model.assumptions
+        missing[:] = model.assumptions
         folders.append(model.folder)
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
     with drakes_errors_said(path):
-        arm = _arm_of(parse)
+        arm = _read_arm(parse)
     check_size(arm, str(path))
     load = arm.phi_load
     if payload is None and load[0] > 0:
         reserve = (_LOAD_FACTOR - 1) * load
     else:
-        mass = _PAYLOAD if payload is None else payload
-        if not _LEAST_PAYLOAD <= mass <= _MOST_PAYLOAD:
+        mass = _DEFAULT_PAYLOAD_KG if payload is None else payload
+        if not _MIN_PAYLOAD_KG <= mass <= _MAX_PAYLOAD_KG:
             raise DrakeTeleopError(
-                f"{mass:g} kg is outside {_LEAST_PAYLOAD:g} to {_MOST_PAYLOAD:g} kg",
+                f"{mass:g} kg is outside {_MIN_PAYLOAD_KG:g} to {_MAX_PAYLOAD_KG:g} kg",
                 where="--payload",
             )
         if payload is None:
             assumptions.append(f"a load of {mass:g} kg (--payload)")
         if mass <= load[0]:
             raise DrakeTeleopError(
-                f"the model holds {load[0]:.3g} kg beyond the sensor already",
+                f"the model already contains {load[0]:.3g} kg beyond the sensor",
                 where="--payload",
-                remedy="give the mass of all that may hang there",
+                remedy="give the total mass beyond the sensor",
             )
-        reserve = _payload(mass - load[0])
+        reserve = _compact_load(mass - load[0])
     with drakes_errors_said(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
-    assumptions += lacking
+    assumptions += missing
     scene.arm, completed = with_all_limits(
         scene.arm, str(path), acceleration, hint=" (--acceleration)"
     )
-    return _robot(
+    return _make_robot(
         scene,
         path.name,
         sensor,
         estimation or MotionEstimationConfig(),
         sensor_hz,
-        home=(scene.arm.lower + scene.arm.upper) / 2,
-        stands_there=False,
+        start=None,
         points_S=np.zeros((1, 3)),
-        box=(np.zeros(3), np.full(3, np.inf)),
+        box=_UNLIMITED,
         assumptions=assumptions + completed,
         folders=folders,
     )
 
 
-def _robot(
+def _make_robot(
     scene: Scene,
     name: str,
     sensor: WristSensorConfig,
     estimation: MotionEstimationConfig,
     sensor_hz: float,
     *,
-    home: Array,
-    stands_there: bool,
+    start: Array | None,
     points_S: Array,
     box: tuple[Array, Array],
     assumptions: list[str],
-    folders: Sequence[TemporaryDirectory[str]] = (),
+    folders: Sequence[TemporaryDirectory[str]],
 ) -> Robot:
-    """Limits and all else, see `Robot`; `box` is its middle and half size in W [m].
+    """Return the robot with its limits; `box` is middle and half size in W [m].
 
-    Where the arm is known to stand at home, what touches there may touch.
+    Shapes that touch in the `start` posture (n,), if known, may touch.
     """
     arm = scene.arm
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
-    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_POSTURES, len(half)))
-    bodies = scene.rows()
-    start = home if stands_there else None
-    candidates, touching = scene.without_neighbours(bodies, postures, start)
+    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
+    candidates, touching = scene.without_neighbours(postures, start)
     if touching:
         assumptions.append(
-            f"as they touch where the arm starts, not kept apart: {', '.join(touching)}"
+            f"no clearance required, as they touch in the start posture: {', '.join(touching)}"
         )
-    rows, capsules, pairs, distances = scene.capsules(bodies, candidates, postures)
-    phi = arm.phi_load
+    rows, ends, radii, pairs, distances = scene.capsules(candidates, postures)
+    phi, std = arm.phi_load, sensor.wrench_std()
+    force = _FORCE_SHARE * min(sensor.force_range)
+    torque = _TORQUE_SHARE * min(sensor.torque_range)
+    alpha = sensor.angular_acceleration_range
     limits = Limits(
         q_middle=middle,
         q_half=_JOINT_SHARE * half,
@@ -241,25 +220,17 @@ def _robot(
         acceleration=arm.acceleration_limit,
         effort=_JOINT_SHARE * arm.effort_limit,
         phi=phi,
-        sensor=np.array(
-            [
-                _FORCE_SHARE * min(sensor.force_range),
-                _TORQUE_SHARE * min(sensor.torque_range),
-                sensor.acceleration_range,
-                sensor.angular_acceleration_range,
-            ]
-        ),
+        sensor=np.array([force, torque, sensor.acceleration_range, alpha]),
         points_S=points_S,
         box_middle=box[0],
         box_half=box[1],
         capsule_row=rows,
-        capsule_ends=np.array([capsule.ends for capsule in capsules]).reshape(-1, 2, 3),
-        capsule_radius=np.array([capsule.radius for capsule in capsules]),
+        capsule_ends=ends,
+        capsule_radius=radii,
         pairs=pairs,
         distances=distances,
         clearance=CLEARANCE,
     )
-    std = sensor.wrench_std()
     return Robot(
         name=name,
         diagram=scene.diagram,
@@ -270,20 +241,19 @@ def _robot(
         limits=limits,
         scales=Scales((float(std[0]), float(std[3])), characteristic_length(phi), phi),
         noise=sensor_noise(sensor, estimation, arm.num_joints, 1 / sensor_hz),
-        home=home,
+        home=middle if start is None else start,
         assumptions=tuple(assumptions),
         folders=tuple(folders),
     )
 
 
-def _arm_of(parse: Parse) -> ArmModel:
+def _read_arm(parse: Parse) -> ArmModel:
     plant = MultibodyPlant(0.0)
     instance, frame = parse(plant)
     finalize(plant)
     return ArmModelFromPlant(plant, instance, frame.name())
 
 
-def _payload(mass: float) -> Array:
-    """(10,) phi of a compact load."""
-    com = np.array([0.0, 0.0, _PAYLOAD_COM])
-    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION**2 * np.eye(3) * 2 / 3)
+def _compact_load(mass: float) -> Array:
+    com = np.array([0.0, 0.0, _PAYLOAD_COM_M])
+    return phi_from_mass_com_inertia(mass, com, mass * _PAYLOAD_GYRATION_M**2 * np.eye(3) * 2 / 3)

@@ -1,25 +1,18 @@
-"""The shortest motion after which a load is known as well as is asked: `excite --until`.
+"""Shortest motion that identifies a load within tolerances: `excite --until`.
 
-The unknowns are those of `problem.py` and log T, the period's: with the coefficients, q(t / T)
-stays, qd falls with T and qdd with T^2. log T is minimised, and what is asked is one more limit,
+log T of the period is one more unknown and is minimised; the tolerance is one more limit,
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with the standard deviations d_k of the asked numbers (`load.tolerance`) of all of one period's
-samples, offsets estimated too, and z such that all numbers are within their tolerances at once in
-`RELIABLE` of the records (Sidak's inequality). The optimiser sees the white noise of wrench and
-motion; what else `prediction.py` knows of (random walks, filters) is a factor for each number, from
-the motion that was found before, and the search is repeated with it, from there.
-
-There are many minima. Of fifty descents from random motions 40 % ended within 10 % of the best; so
-the first round makes `starts` of them.
+with standard deviations d_k after one period; z holds all tolerances together in `RELIABLE` of the
+records (Sidak). The optimiser models white noise. A factor for each number from `prediction.py`
+adds random walks and filters, and the search repeats with it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import accumulate
 
 import numpy as np
 from scipy.special import ndtri
@@ -27,10 +20,14 @@ from scipy.special import ndtri
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross_matrix
-from drake_teleop.lab.excitation.check import RATE, Use
+from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.criteria import Criterion
-from drake_teleop.lab.excitation.design import Iterate, design
-from drake_teleop.lab.excitation.excite import Excitation, best_checked, criteria_of, sensor_motion
+from drake_teleop.lab.excitation.excite import (
+    Excitation,
+    best_checked,
+    checked_excitation,
+    sensor_motion,
+)
 from drake_teleop.lab.excitation.limits import (
     LIMITS,
     criterion_gradient,
@@ -38,49 +35,43 @@ from drake_teleop.lab.excitation.limits import (
     motions_of,
     sensor_vectors,
 )
+from drake_teleop.lab.excitation.optimizer import Bounds, Evaluation, Problem, Task, design
 from drake_teleop.lab.excitation.prediction import (
     SensorNoise,
     predicted_covariance,
     spatial_inertia,
 )
-from drake_teleop.lab.excitation.problem import Bounds, Evaluation, Problem, Task
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
 from drake_teleop.load.trajectory import FourierTrajectory
 
 RELIABLE = 0.95
-"""Share of the records in which all asked numbers are to be within their tolerances at once."""
-# The longest period [s]; the highest harmonic of the shortest [Hz]: half of what the low-pass of
-# `identify` lets through, and more than most joint control follows.
-_LONGEST, _FASTEST = 20.0, 15.0
-# Of log T, in one descent: SLSQP, which sees straight lines, would go to nothing, and not return.
-_STEP = 0.15
-# Rounds of the search at most; how many that reach what is asked may come without one that is
-# shorter by this share; and by how much more than needed is asked when one fell short.
-_ROUNDS, _IN_VAIN, _SHORTER, _MORE = 20, 1, 0.99, 1.005
-# Rounds that find nothing, after which there is nothing.
-_LOST = 3
-# What misses by more is no place to begin from; else later rounds have so many starts around it.
-_NEAR, _STARTS_AROUND = 1.5, 4
-# Between the seeds of rounds: each has candidates of its own.
-_OTHER = 2**33
-# Later rounds look around what was found: share of the coefficients, and of the period.
-_AROUND, _PERIODS = 0.2, 1.3
-# The maximum over the asked numbers is sharper than that over eigenvalues: they are ten.
-_SHARPER = 4.0
-# Of the balanced information, so that it can be inverted before anything moves.
-_REGULAR = 1e-11
+"""Share of the records in which all numbers are within their tolerances together."""
+# Longest period [s]; highest frequency of the shortest period [Hz], half the cutoff of `identify`.
+_MAX_PERIOD_S, _MAX_FREQUENCY_HZ = 20.0, 15.0
+# Largest step of log T in one descent: SLSQP's linear model would go to T = 0 and not return.
+_MAX_LOG_STEP = 0.15
+# Largest number of rounds; number of successful rounds without progress; required progress factor;
+# additional margin after a round that missed the tolerance.
+_MAX_ROUNDS, _MAX_VAIN_ROUNDS, _PROGRESS_RATIO, _FACTOR_MARGIN = 20, 1, 0.99, 1.005
+# Number of rounds without any motion before the search fails.
+_MAX_EMPTY_ROUNDS = 3
+# Largest misfit of a motion that later rounds vary, and number of such starts.
+_MAX_START_MISFIT, _NUM_LATER_STARTS = 1.5, 4
+# Difference between the seeds of rounds.
+_SEED_STEP = 2**33
+# Variation in later rounds: share of the coefficients, factor of the period.
+_COEFFICIENT_SPREAD, _PERIOD_SPREAD = 0.2, 1.3
+# Sharpness of the maximum over tolerances, relative to that over eigenvalues.
+_SHARPNESS_RATIO = 4.0
+# Regularisation of the balanced information; it is singular without motion.
+_REGULARISATION = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """A motion that was found.
-
-    Attributes:
-        excitation: the motion, checked; its criterion is the period.
-        reached: (k,) z d_k over the tolerances, none above 1.
-    """
+    """Checked motion, and (k,) z d_k over the tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
@@ -95,38 +86,31 @@ def shortest(
     starts: int = 24,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> Shortest:
-    """Designs and checks the shortest motion that reaches a tolerance.
+    """Design and check the shortest motion that reaches a tolerance.
 
     Args:
-        robot: the arm.
-        tolerance: of its heaviest load.
         harmonics: N of Eq. (9).
         seed, progress: see `design`.
-        starts: descents from anywhere, before those around what was found.
+        starts: random starts of the first round.
 
     Raises:
-        DrakeTeleopError: if nothing within the limits reaches it in `_LONGEST` seconds.
+        DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches it.
     """
     errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
     task = Task(
-        robot.arm.table,
-        robot.limits,
-        Criterion("A16", robot.scales),
-        robot.home,
-        1.0,
-        harmonics,
+        robot.arm.table, robot.limits, Criterion("A16", robot.scales), robot.home, 1.0, harmonics
     )
     worst, around = np.inf, None
     best: Shortest | None = None
-    in_vain, lost = 0, 0
-    for k in range(_ROUNDS):
+    vain_rounds, empty_rounds = 0, 0
+    for k in range(_MAX_ROUNDS):
         problem = ShortestProblem(task, errors * factor[:, np.newaxis], robot, around)
-        many = starts if around is None else min(starts, _STARTS_AROUND)
-        found = design(problem, seed=seed + _OTHER * k, starts=many, progress=progress)
-        found = [each for each in found if each.value <= _LONGEST]
+        num_starts = starts if around is None else min(starts, _NUM_LATER_STARTS)
+        found = design(problem, seed=seed + _SEED_STEP * k, starts=num_starts, progress=progress)
+        found = [each for each in found if each.value <= _MAX_PERIOD_S]
         if not found:
-            if (lost := lost + 1) == _LOST:
+            if (empty_rounds := empty_rounds + 1) == _MAX_EMPTY_ROUNDS:
                 break
             around = None
             continue
@@ -135,65 +119,48 @@ def shortest(
         covariance = predicted_covariance(*motion, 1 / RATE, robot.noise, robot.limits.phi)
         reached = deviations_of(errors, covariance)
         worst = float(reached.max())
-        around = problem.best if worst < _NEAR else None
+        around = problem.best if worst < _MAX_START_MISFIT else None
         if worst <= 1.0:
-            least = np.inf if best is None else best.excitation.trajectory.period
-            in_vain = 0 if trajectory.period < _SHORTER * least else in_vain + 1
-            if trajectory.period < least:
-                best = Shortest(_excitation(robot, trajectory, covariance, uses, found), reached)
-            if in_vain == _IN_VAIN:
+            shortest_period = np.inf if best is None else best.excitation.trajectory.period
+            vain_rounds = (
+                0 if trajectory.period < _PROGRESS_RATIO * shortest_period else vain_rounds + 1
+            )
+            if trajectory.period < shortest_period:
+                excitation = checked_excitation(robot, "period", found, trajectory, uses)
+                best = Shortest(excitation, reached)
+            if vain_rounds == _MAX_VAIN_ROUNDS:
                 break
-        seen = problem.deviations(motion, trajectory.period)
-        now = factor * (reached / seen)
-        # Not less than before, where a round fell short: else it might go to and fro.
-        factor = _MORE * np.maximum(now, factor) if worst > 1.0 and k > 0 else now
+        modelled = problem.deviations(motion, trajectory.period)
+        new_factor = factor * (reached / modelled)
+        # No decrease after a round that missed the tolerance, to avoid oscillation.
+        factor = (
+            _FACTOR_MARGIN * np.maximum(new_factor, factor) if worst > 1.0 and k > 0 else new_factor
+        )
     if best is not None:
         return best
     raise DrakeTeleopError(
-        "no motion within the limits was found that reaches it"
-        + (f": the best misses it by {worst:.3g} times" if np.isfinite(worst) else ""),
+        "no motion within the limits reaches the tolerance"
+        + (f": the best one exceeds it by a factor of {worst:.3g}" if np.isfinite(worst) else ""),
         where=f"{robot.name}: {tolerance}",
-        remedy="ask for less, or repeat the motion of `excite`",
-    )
-
-
-def _excitation(
-    robot: Robot,
-    trajectory: FourierTrajectory,
-    covariance: Array,
-    uses: list[Use],
-    found: list[Iterate],
-) -> Excitation:
-    periods = accumulate((each.value for each in found), min)
-    history = [(each.evaluations, value) for each, value in zip(found, periods, strict=True)]
-    return Excitation(
-        robot,
-        trajectory,
-        "period",
-        criteria_of(robot, trajectory),
-        np.sqrt(np.diag(covariance)),
-        uses,
-        np.array(history),
-        found[-1].seconds,
+        remedy="give larger tolerances, or repeat the motion of `excite`",
     )
 
 
 def reliable_factor(count: int) -> float:
-    """z: half-widths in standard deviations that hold `count` numbers at once in `RELIABLE`."""
+    """Return z for `count` numbers in `RELIABLE` of the records."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
 class ShortestProblem(Problem):
-    """The unknowns are x = [q0, sine, cosine, log T], see `Problem`.
+    """Problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        task: its period is 1 s, its criterion is not looked at.
-        errors: (k, 16) what has to be 1 or less in standard deviations.
-        robot: whose sensor measures.
-        around: unknowns to begin from, if there are some.
+        task: with a period of 1 s; its criterion is not used.
+        errors: (k, 16) rows with required deviations of 1.
+        around: unknowns of an earlier motion, if any.
 
     Attributes:
-        best: the unknowns with the least period of those whose `value` was asked for.
+        best: unknowns of the shortest period passed to `value`.
     """
 
     def __init__(self, task: Task, errors: Array, robot: Robot, around: Array | None) -> None:
@@ -205,37 +172,40 @@ class ShortestProblem(Problem):
         self._roots = np.sqrt(robot.noise.white[:6])
         samples, n = self._vectors.shape[1], len(task.home)
         self._gradients = np.empty((2 + len(LIMITS), 3, samples, n))
-        self._period, self._shortest = 1.0, task.harmonics / _FASTEST
+        self._period, self._shortest = 1.0, task.harmonics / _MAX_FREQUENCY_HZ
 
     def trajectory(self, x: Array) -> FourierTrajectory:
-        """The trajectory that x stands for."""
+        """Return the trajectory with the unknowns x."""
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """A random motion of moderate size for a random period; or like one that was found."""
+        """Return a random motion and period, or a variation of `around`."""
         if self._around is not None and near_home:
-            other = _AROUND * rng.uniform() * np.abs(self._around[:-1]).mean()
+            other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
-            x[-1] += np.log(_PERIODS) * rng.uniform(-1.0, 1.0)
+            x[-1] += np.log(_PERIOD_SPREAD) * rng.uniform(-1.0, 1.0)
             return x
-        period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _LONGEST))))
+        period = float(np.exp(rng.uniform(np.log(2 * self._shortest), np.log(0.5 * _MAX_PERIOD_S))))
         task = self.task
-        self.task = replace(task, period=period)  # how large it may be depends on it
+        self.task = replace(task, period=period)  # the size of motions depends on the period
         x = super().candidate(rng, near_home=near_home)
         self.task = task
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Of log T."""
-        least, largest = np.log(self._shortest), np.log(2.0 * _LONGEST)
-        around = (np.clip(x[-1] + step, least, largest) for step in (-_STEP, _STEP))
+        """Return bounds of log T near x."""
+        shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
+        around = (
+            np.clip(x[-1] + step, shortest_period, largest)
+            for step in (-_MAX_LOG_STEP, _MAX_LOG_STEP)
+        )
         low, high = (float(each) for each in around)
         return [(None, None)] * (len(x) - 1) + [(low, high)]
 
-    def evaluate(self, x: Array, of_criterion: float, of_maxima: float) -> Evaluation:
-        """log T, and eight limits: those of the arm, and what is asked."""
+    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
+        """Evaluate log T and eight limits: the tolerance, then those of the arm."""
         task, n, self._at = self.task, len(self.task.home), x.copy()
-        log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _LONGEST)))
+        log_period = float(np.clip(x[-1], np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)))
         self._period = T = float(np.exp(log_period))
         coefficients = x[n:-1].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
         q, qd, qdd = self._basis @ coefficients
@@ -244,61 +214,69 @@ class ShortestProblem(Problem):
         sensor_vectors(self._motions, self._vectors)
         g = self._gradients
         g[:2] = 0.0
-        use, worst, g_V = self._asked(_SHARPER * of_criterion)
+        use, worst, g_V = self._tolerance_use(_SHARPNESS_RATIO * criterion_sharpness)
         criterion_gradient(task.table, self._motions, qd, qdd, g_V, g[1])
         smooth, largest = np.empty((2, len(LIMITS)))
         limit_uses(
-            task.table, q, qd, qdd, self._motions, task.limits, of_maxima, smooth, largest, g[2:]
+            task.table,
+            q,
+            qd,
+            qdd,
+            self._motions,
+            task.limits,
+            limit_sharpness,
+            smooth,
+            largest,
+            g[2:],
         )
-        of_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
-        # More samples, and log T itself.
-        of_period[1] -= 0.25
-        of_period[0] = 1.0
+        by_log_period = -(g[:, 1] * qd + 2.0 * g[:, 2] * qdd).sum(axis=(1, 2))
+        # Longer periods have more samples; the objective is log T.
+        by_log_period[1] -= 0.25
+        by_log_period[0] = 1.0
         g[:, 1] /= T
         g[:, 2] /= T**2
-        gradients = np.hstack([self._of_unknowns(), of_period[:, np.newaxis]])
+        gradients = np.hstack([self._gradients_by_unknowns(), by_log_period[:, np.newaxis]])
         return Evaluation(
             float(x[-1]), np.append(use, smooth), gradients, max(worst, float(largest.max()))
         )
 
     def value(self) -> float:
-        """The period at the point that was evaluated last [s]."""
+        """Return the period of the last evaluated point [s]."""
         if self._period < self._least:
             self._least, self.best = self._period, self._at
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """(k,) standard deviations of what is asked in the noise that the search knows of."""
+        """Return (k,) standard deviations in white noise."""
         return np.sqrt(self._variances(self._rows(*motion), period)[0])
 
     def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
-        """(T, 6, 16) of the regression, over the roots of the densities of the wrench's noise."""
+        """Return (T, 6, 16) regression rows over root densities of the wrench noise."""
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
-        """(k,) variances d_k^2 = v_k^T B v_k of what is asked; v_k = G^-1 e_k, u_k = G^-1 B v_k.
+        """Return (k,) variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        G = sum of R^T R T / samples is the information that weighted least squares reckons with,
-        B = sum of R^T S R T / samples what there is, with the noise's densities S over those that
-        it weighs by (the sandwich of White, Econometrica 1980).
+        G = sum of R^T R period / samples is the information of weighted least squares;
+        B = sum of R^T S R period / samples contains the noise densities S (sandwich, White,
+        Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
         B = share * (flat.T @ (self._noise @ rows).reshape(flat.shape))
         size = 1.0 / np.sqrt(np.diag(G))
-        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULAR * np.eye(16))
+        inverse = np.linalg.inv(G * np.outer(size, size) + _REGULARISATION * np.eye(16))
         inverse *= np.outer(size, size)
         v = self._errors @ inverse
         Bv = v @ B
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
-    def _asked(self, sharpness: float) -> tuple[float, float, Array]:
-        """Use of what is asked, smooth and exact, and the gradient of the smooth one by V.
+    def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
+        """Return smooth and exact use of the tolerance, and the gradient of the smooth one by V.
 
-        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), and half of it is the
-        use's.
+        With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
         """
         rows = self._rows(*self._vectors)
         variances, v, u = self._variances(rows, self._period)
@@ -313,10 +291,9 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """(6, 6) densities of the wrench's noise and of the motion's times the load.
+    """Return (6, 6) white noise densities of wrench and of motion times load.
 
-    Over the roots of the wrench's own. It is that of `predicted_covariance` without random walks,
-    and as if no filter corrected the accelerometer.
+    They are relative to the wrench's own densities, and do not include filters.
     """
     density = np.diag(noise.white[:6])
     if noise.filters is not None:

@@ -1,1 +1,1 @@
-"""The paper's experiments."""
+"""Reproduction of the paper's Figs. 6 to 8, with a report."""

@@ -1,4 +1,4 @@
-"""The paper's figures, from plain arrays: the same layout, the same scale in all subplots."""
+"""Figures of the paper from plain arrays, with its layout and equal scales in all subplots."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.style import (
     BLUE,
     GREEN,
@@ -29,15 +30,12 @@ def scaling_figure(
     unit: str,
     downscaling: float,
 ) -> Figure:
-    """Figs. 6 and 7: one component at the slave for each sigma, one below the other.
-
-    The right-hand axes show what the master gets. Every subplot's note states its peak.
+    """Draw Figs. 6 and 7: one component at the slave for each sigma; right axes at the master.
 
     Args:
         t: (N,) [s].
-        values: per sigma, (N,) the scaled component at the slave, in `unit`.
-        sigmas: the scale of the non-contact wrench in each subplot.
-        symbol: of the component, as matplotlib text ("$f_z$").
+        values: for each sigma (N,) the scaled component at the slave, in `unit`.
+        symbol: matplotlib text of the component.
         unit: "N" or "N m".
         downscaling: slave over master, 17.5 in the paper.
     """
@@ -74,19 +72,16 @@ def contact_figure(
     threshold: float,
     turning_s: float | None = None,
 ) -> Figure:
-    """Fig. 8: the measured force above, the calculated contact force below.
-
-    Both subplots have the same scale and are shaded where there is contact; the lower one shows
-    the threshold and the instant of detection.
+    """Draw Fig. 8: measured force and calculated contact force, with shaded contact.
 
     Args:
         t: (N,) [s].
         measured, contact_force: (N,) [N], at the slave.
-        symbol: of the component, as matplotlib text ("$f_z$").
-        contact: (N,) booleans, from the simulation's truth.
-        detected_s: when the contact force crosses the threshold [s].
+        symbol: matplotlib text of the component.
+        contact: (N,) true contact.
+        detected_s: time of the detection [s].
         threshold: of the detection [N].
-        turning_s: a reversal of the motion without contact, to be marked [s].
+        turning_s: marked reversal without contact [s].
     """
     time, time_unit = _time(t)
     per_second = 1e3 if time_unit == "ms" else 1.0
@@ -119,13 +114,12 @@ def contact_figure(
     return figure
 
 
-def _time(t: ArrayLike) -> tuple[NDArray[np.float64], str]:
-    """Times in milliseconds, as the paper has them, up to two seconds; then in seconds."""
+def _time(t: ArrayLike) -> tuple[Array, str]:
     seconds = np.asarray(t, float)
     return (seconds * 1e3, "ms") if seconds[-1] - seconds[0] <= 2 else (seconds, "s")
 
 
-def _common_range(traces: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+def _common_range(traces: Sequence[Array]) -> tuple[float, float]:
     low = min(0.0, *(float(trace.min()) for trace in traces))
     high = max(0.0, *(float(trace.max()) for trace in traces))
     margin = 0.1 * (high - low) or 1.0
@@ -138,7 +132,6 @@ def _sigma_title(sigma: float) -> str:
 
 
 def _number(value: float) -> str:
-    """Three significant digits, never as a power of ten."""
     rounded = float(f"{value:.3g}")
     decimals = max(0, 2 - int(np.floor(np.log10(abs(rounded))))) if rounded else 0
     return f"{rounded:.{decimals}f}"
@@ -158,7 +151,6 @@ def _master_axis(axes: Axes, downscaling: float, label: str) -> None:
 
 
 def _mark(axes: Axes, time: float, text: str, colour: str) -> None:
-    """A vertical line with its name at the foot of the axes."""
     axes.axvline(time, color=colour, linewidth=0.9, linestyle="--")
     axes.annotate(
         text,

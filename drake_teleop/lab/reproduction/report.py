@@ -1,4 +1,4 @@
-"""The report of `drake-teleop reproduce`: one self-contained HTML page, and its tables."""
+"""Report of `drake-teleop reproduce`: one self-contained HTML page with tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.writing import write_text
 
-# Eq. (7): symbol, index, unit as printed, and how many of it an SI unit has.
+# Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
@@ -27,7 +27,7 @@ _PARAMETERS = (
 
 
 _NOT_REPORTED = "not reported"
-# What a verdict is called if the figure is as accepted, and if it is not.
+# Verdicts for accepted and not accepted values.
 _AS_SET = ("as set", "not as set")
 _WITHIN_BOUND = ("within our bound", "beyond our bound")
 _AGREES = ("agrees", "differs")
@@ -35,16 +35,12 @@ _AGREES = ("agrees", "differs")
 
 @dataclass(frozen=True)
 class Comparison:
-    """One line of the paper-against-ours table.
+    """Row of the table of paper and reproduction.
 
     Args:
-        what: the quantity.
-        paper: what the paper says about it.
-        ours: our figure, with its unit.
-        origin: "set", if the movement, the place of the leaf or the scales were chosen such that
-            the figure is the paper's; "found", if it could have come out otherwise.
-        accepted: what we accept; empty if nothing can be compared.
-        holds: whether our figure is as accepted; None if nothing can be compared.
+        origin: "set" if the scenario was chosen to match the paper; else "found".
+        accepted: accepted range; empty if not comparable.
+        holds: True if accepted; None if not comparable.
     """
 
     what: str
@@ -56,11 +52,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """ "agrees" or "differs" only for what was found here and is reported in the paper.
-
-        What was set is "as set" or "not as set", what the paper does not report "within our bound"
-        or "beyond our bound"; "for the record" if nothing can be compared.
-        """
+        """Verdict; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
         words = _AS_SET if self.origin == "set" else _AGREES
@@ -70,7 +62,7 @@ class Comparison:
 
     @property
     def pill(self) -> str:
-        """How the page shows the verdict: "differs" is what cries, "" neutral."""
+        """CSS class of the verdict: "differs" is highlighted, "" is neutral."""
         if self.holds is False:
             return "differs"
         return "agrees" if self.verdict == "agrees" else ""
@@ -78,7 +70,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A figure with its title and the sentences below it."""
+    """Figure with title and caption."""
 
     title: str
     png: Path
@@ -87,7 +79,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One identified parameter next to its true value, all in `unit`, as printed."""
+    """Identified parameter beside its true value, all in `unit`."""
 
     symbol: str
     index: str
@@ -99,56 +91,52 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """The paper's figures next to ours.
+    """Return the table of paper and reproduction.
 
     Args:
-        summary: the figures of `reproduce` by full name ("free_force.peak_raw_N").
+        summary: values by full name ("free_force.peak_raw_N").
     """
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     share = s["contact.peak_contact_N"] / s["contact.peak_inertial_N"]
     return [
-        _between("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
-                 s["free_force.peak_raw_N"], "N", 90, 115),
-        _between("set", "Fig. 6: the same at the master", "about 5.7 N",
-                 s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
-        _between("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
-                 s["free_force.half_ratio"], "", 0.48, 0.52),
-        _between("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
-                 s["free_force.residual_max_N"], "N", 0, 5),
-        _between("found", "Fig. 6: the same, ideal sensor and true φ", _NOT_REPORTED,
-                 s["free_force.residual_ideal_max_N"], "N", 0, 1e-9),
-        _record("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
-                s["free_torque.peak_raw_Nm"], "N m"),
-        _between("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
-                 s["free_torque.half_ratio"], "", 0.48, 0.52),
-        _record("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
-                s["free_torque.residual_max_Nm"], "N m"),
-        _between("found", "Fig. 7: the same, ideal sensor and true φ", _NOT_REPORTED,
-                 s["free_torque.residual_ideal_max_Nm"], "N m", 0, 1e-9),
-        _between("set", "Fig. 8: contact is made at", "about 220 ms",
-                 1e3 * s["contact.true_s"], "ms", 205, 235),
-        _between("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
-                 delay_ms, "ms", 0, 10),
-        _answer("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
-                s["contact.raw_detectable"], False),
-        _answer("Fig. 8: false alarm at about 600 ms", "no contact there",
-                s["contact.false_alarm_0_6_s"], False),
-        _between("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
-                 share, "", 0, 0.7),
-        _between("found", "Mass, error of the estimate", _NOT_REPORTED,
-                 s["identification.mass_error_percent"], "%", 0, 0.2),
-        _between("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
-                 s["identification.com_error_mm"], "mm", 0, 0.5),
+        _range_row("set", "Fig. 6: peak force at the slave, σ = 1", "about 100 N",
+                   s["free_force.peak_raw_N"], "N", 90, 115),
+        _range_row("set", "Fig. 6: the same at the master", "about 5.7 N",
+                   s["free_force.peak_raw_master_N"], "N", 90 / 17.5, 115 / 17.5),
+        _range_row("set", "Fig. 6: σ = 0.5 over σ = 1, rms", "half",
+                   s["free_force.half_ratio"], "", 0.48, 0.52),
+        _range_row("found", "Fig. 6: largest force left, σ = 0", "never above 5 N",
+                   s["free_force.residual_max_N"], "N", 0, 5),
+        _range_row("found", "Fig. 6: the same, ideal sensor and true φ", _NOT_REPORTED,
+                   s["free_force.residual_ideal_max_N"], "N", 0, 1e-9),
+        _unrated_row("set", "Fig. 7: peak torque at the slave, σ = 1", "in the figure only",
+                     s["free_torque.peak_raw_Nm"], "N m"),
+        _range_row("set", "Fig. 7: σ = 0.5 over σ = 1, rms", "half",
+                   s["free_torque.half_ratio"], "", 0.48, 0.52),
+        _unrated_row("found", "Fig. 7: largest torque left, σ = 0", "“very low”",
+                     s["free_torque.residual_max_Nm"], "N m"),
+        _range_row("found", "Fig. 7: the same, ideal sensor and true φ", _NOT_REPORTED,
+                   s["free_torque.residual_ideal_max_Nm"], "N m", 0, 1e-9),
+        _range_row("set", "Fig. 8: contact is made at", "about 220 ms",
+                   1e3 * s["contact.true_s"], "ms", 205, 235),
+        _range_row("found", "Fig. 8: found in the contact force after", "“clearly spotted”",
+                   delay_ms, "ms", 0, 10),
+        _answer_row("Fig. 8: a threshold on the raw force finds it", "“less obvious”",
+                    s["contact.raw_detectable"], False),
+        _answer_row("Fig. 8: false alarm at about 600 ms", "no contact there",
+                    s["contact.false_alarm_0_6_s"], False),
+        _range_row("found", "Fig. 8: contact peak over inertial peak", "“significantly lower”",
+                   share, "", 0, 0.7),
+        _range_row("found", "Mass, error of the estimate", _NOT_REPORTED,
+                   s["identification.mass_error_percent"], "%", 0, 0.2),
+        _range_row("found", "Centre of mass, error of the estimate", _NOT_REPORTED,
+                   s["identification.com_error_mm"], "mm", 0, 0.5),
     ]  # fmt: skip
 
 
 def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The lines of the table that are not as accepted, in words; none in a good run.
-
-    Args:
-        summary: what `reproduce_command` returned.
-    """
+    """Return the table rows that are not accepted, for the summary of `reproduce_command`."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(flat(summary))
@@ -157,7 +145,7 @@ def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
+    """Return the values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value
         for part, figures in summary.items()
@@ -166,19 +154,19 @@ def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def captions(summary: Mapping[str, Any]) -> dict[str, str]:
-    """What one sees in each of the paper's figures, with this run's numbers: fig6, fig7, fig8."""
+    """Return the captions of fig6, fig7 and fig8 with the values of this run."""
     s = summary
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
-    tells = "a threshold on it tells" if s["contact.raw_detectable"] else "no threshold on it tells"
+    threshold = "a threshold" if s["contact.raw_detectable"] else "no threshold"
     alarm = "also crosses it" if s["contact.false_alarm_0_6_s"] else "stays below it"
     return {
         "fig6": (
-            f"A fast vertical movement of the stylus in free space. Top: the load alone puts up to "
+            f"A fast vertical movement of the stylus in free space. Top: the load causes up to "
             f"{s['free_force.peak_raw_N']:.1f} N on the wrist sensor, "
             f"{s['free_force.peak_raw_master_N']:.2f} N after scaling to the master. Middle: half "
-            f"of the non-contact force is taken away and {s['free_force.half_ratio']:.1%} is left "
-            f"(rms). Bottom: all of it is taken away; never more than "
-            f"{s['free_force.residual_max_N']:.2f} N remain, noise of the sensor included."
+            f"of the non-contact force is eliminated and {s['free_force.half_ratio']:.1%} remains "
+            f"(rms). Bottom: all of it is eliminated; at most "
+            f"{s['free_force.residual_max_N']:.2f} N remain, including sensor noise."
         ),
         "fig7": (
             f"The same for the torque, in a horizontal movement: "
@@ -189,10 +177,10 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
         "fig8": (
             f"A repetitive vertical movement that touches the sheet spring once, at "
             f"{1e3 * s['contact.true_s']:.0f} ms (shaded). The measured force is dominated by "
-            f"inertia, {s['contact.peak_inertial_N']:.0f} N at its peak, and {tells} "
-            f"contact from free motion. The calculated contact force rises to "
+            f"inertia, {s['contact.peak_inertial_N']:.0f} N at its peak, and {threshold} on it "
+            f"separates contact from free motion. The calculated contact force rises to "
             f"{s['contact.peak_contact_N']:.0f} N and crosses the threshold {lag:.1f} ms after "
-            f"the touch; at the turn without contact, at about 600 ms, it {alarm}."
+            f"the touch; at the reversal without contact, at about 600 ms, it {alarm}."
         ),
     }
 
@@ -200,7 +188,7 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """The identification table.
+    """Return the identification table.
 
     Args:
         true, estimate, deviation: (16,) each, offsets then phi as in Eq. (7), SI units.
@@ -209,7 +197,7 @@ def parameter_rows(
     rows = []
     for (symbol, index, unit, scale), values in zip(_PARAMETERS, columns, strict=True):
         truth, found, sigma = scale * values
-        # Two digits of the uncertainty say how many digits of the value mean something.
+        # Two digits of the uncertainty determine the decimals of the value.
         decimals = 3 if sigma <= 0 else int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
         true_text, found_text, sigma_text = (f"{x:.{decimals}f}" for x in (truth, found, sigma))
         error = f"{found - truth:+.{decimals}f}"
@@ -218,7 +206,7 @@ def parameter_rows(
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the figures depend on, by distribution."""
+    """Return the versions of Python and of the numerical libraries."""
     names = ("drake_teleop", "drake", "numpy", "scipy", "numba")
     return {"Python": platform.python_version()} | {name: metadata.version(name) for name in names}
 
@@ -232,16 +220,12 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Writes the page; figures are inside it, so that it can be moved and mailed.
+    """Write the HTML page with embedded figures. Without a date, equal runs give equal pages.
 
     Args:
-        path: of the HTML file.
-        setup: what was run, as name -> text; versions are added. No date: the same run gives the
-            same page.
-        summary: the figures of `reproduce` by full name.
-        figures: in the order of the page.
-        parameters: the identification table.
-        replay: file name of the Meshcat replay next to the page, if there is one.
+        setup: description of the run, name to text.
+        summary: values by full name.
+        replay: file name of the 3D replay beside the page, if any.
     """
     page = render(
         "drake_teleop.lab.reproduction",
@@ -259,7 +243,6 @@ def write_report(
 
 
 def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(number, unit, what it is) of what a reader wants to know first."""
     lag = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
     return [
         (f"{s['free_force.peak_raw_N']:.0f}", "N", "on the sensor from moving the tool alone"),
@@ -273,23 +256,23 @@ def _tiles(s: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _between(
+def _range_row(
     origin: str, what: str, paper: str, value: float, unit: str, low: float, high: float
 ) -> Comparison:
     bounds = f"at most {high:.3g} {unit}" if low == 0 else f"{low:.3g} to {high:.3g} {unit}"
     holds = bool(low <= value <= high)
-    return Comparison(what, paper, _text(value, unit), origin, bounds.strip(), holds)
+    return Comparison(what, paper, _format_value(value, unit), origin, bounds.strip(), holds)
 
 
-def _answer(what: str, paper: str, value: bool, expected: bool) -> Comparison:
+def _answer_row(what: str, paper: str, value: bool, expected: bool) -> Comparison:
     words, holds = {True: "yes", False: "no"}, bool(value) == expected
     return Comparison(what, paper, words[bool(value)], "found", words[expected], holds)
 
 
-def _record(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
-    return Comparison(what, paper, _text(value, unit), origin, "", None)
+def _unrated_row(origin: str, what: str, paper: str, value: float, unit: str) -> Comparison:
+    return Comparison(what, paper, _format_value(value, unit), origin, "", None)
 
 
-def _text(value: float, unit: str) -> str:
+def _format_value(value: float, unit: str) -> str:
     number = f"{value:.1e}" if 0 < abs(value) < 1e-3 else f"{value:#.3g}".rstrip(".")
     return f"{number} {unit}".strip()

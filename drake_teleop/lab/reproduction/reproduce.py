@@ -1,39 +1,19 @@
-"""`drake-teleop reproduce`, Figs. 6, 7 and 8 (long: the paper's experiments in their order).
+"""`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order.
 
-1. Identification (section IV): the slave runs an excitation trajectory; load and offsets come from
-   the wrist sensor's samples alone, by the recursive estimator in the loop.
-2. Figs. 6 and 7: one free movement each with that estimate, sigma = 0 in the loop ("the forces in
-   the bottom plots serve as inputs for the haptic device"). The curves for sigma = 1, 0.5 and 0 are
-   computed from the recorded samples of that run with the kernel of the loop; sigma = 1 is F - F_o.
-3. The same movements with an ideal sensor and the true load, eliminated from the reaction force
-   that the plant itself has in the wrist (`reaction.py`): what is left is rounding.
-4. Fig. 8: the contact, and the same movement without the sheet spring, for the threshold.
-
-What is measured, all of it at the rate at which the hand is served:
-
-- A component (f_z in Fig. 6, tau_x in Fig. 7) is the one that the figure shows; `residual_norm` is
-  the length of the whole vector. Values at the slave unless the name says master.
-- The threshold of the contact's detection is 1.5 times the largest contact force that was
-  calculated in the free movement, which therefore never crosses it. Detected is the first
-  crossing; a false alarm is a crossing after the touch, with the movement's second turn at 0.6 s.
-- The raw force would be enough to detect the contact if any component of it, or its length, left
-  the range that it has in the free movement while the touch lasts (and 10 ms after it, for the
-  filter). Each threshold on the raw force, upper or lower, is in one of these ranges or never met.
-- `identification`: against the model's true load, which nothing else uses (but 3).
+1. Identification (section IV) by the recursive estimator in the loop.
+2. Figs. 6 and 7: free movements with sigma = 0; curves of all sigmas from the recorded samples.
+3. The same movements with the plant's own reaction force.
+4. Fig. 8: contact, and the same movement without the sheet spring.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from drake_teleop.common.progress import Progress, Stage, show_progress
+from drake_teleop.common.progress import Progress, show_progress
 from drake_teleop.common.style import PAGE_DPI
 from drake_teleop.common.writing import (
     make_folder,
@@ -47,11 +27,23 @@ from drake_teleop.lab.identification import (
     LoadIdentification,
     identification_scenario,
     identify_load,
-    sensor_samples,
-    slave_arm,
+)
+from drake_teleop.lab.reproduction.experiments import (
+    SIGMAS,
+    ContactMotion,
+    FreeMotion,
+    Values,
+    contact_motion,
+    contact_values,
+    eliminated_reaction,
+    free_motion,
+    free_values,
+    identification_values,
+    reversal_without_contact,
+    true_parameters,
+    without_sheet,
 )
 from drake_teleop.lab.reproduction.figures import contact_figure, scaling_figure
-from drake_teleop.lab.reproduction.reaction import eliminated_reaction
 from drake_teleop.lab.reproduction.report import (
     Comparison,
     ReportFigure,
@@ -62,84 +54,29 @@ from drake_teleop.lab.reproduction.report import (
     write_report,
 )
 from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation, cpu_seconds
-from drake_teleop.lab.run_summary import FILTER_TAIL, in_contact
-from drake_teleop.load.compensation import scaled_wrench
 from drake_teleop.station.replay import write_replay
-from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
-from drake_teleop.station.simulation import simulate
-from drake_teleop.station.station import MakeTeleopStation
 
-Array = NDArray[np.float64]
-Figures = dict[str, Any]
-
-SIGMAS = (1.0, 0.5, 0.0)
-_THRESHOLD_OVER_FREE = 1.5
-# The film of the contact, which lasts 40 ms, is this much slower.
+# Slow motion of the replay; the contact lasts 40 ms.
 _SLOW_MOTION = 8.0
 _FORCE_Z, _TORQUE_X = 2, 3
-_AXES = ("f_x", "f_y", "f_z", "|f|")
-
-
-@dataclass(frozen=True, eq=False)
-class FreeMotion:
-    """One of the free movements: the recorded run and its wrench for each sigma (N, 6)."""
-
-    scenario: Scenario
-    result: SimulationResult
-    scaled: dict[float, Array]
-
-
-@dataclass(frozen=True, eq=False)
-class ContactMotion:
-    """The contact transition, and the same movement without the sheet spring.
-
-    Attributes:
-        scenario: with the sheet spring.
-        touched, free: the two runs.
-        raw, calculated: (N, 6) F - F_o and the contact wrench of the first; raw_free,
-            calculated_free of the second.
-        contact: (N,) whether there was contact, by the simulation's truth.
-        threshold: of the detection [N].
-    """
-
-    scenario: Scenario
-    touched: SimulationResult
-    free: SimulationResult
-    raw: Array
-    calculated: Array
-    raw_free: Array
-    calculated_free: Array
-    contact: NDArray[np.bool_]
-    threshold: float
 
 
 def reproduce_command(
     out: Path, *, seed: int | None = None, quiet: bool = False, progress: bool = True
-) -> Figures:
-    """Repeats the paper's experiments and writes what they show into `out`.
-
-    summary.json, table.md (the paper against this run), fig6.png, fig7.png, fig8.png, replay.html,
-    report.html, identification.json, and in logs/ the records, each with its scenario; all of them
-    the same bytes every time. What is not, the speed, is in session.json.
-
-    Args:
-        out: the folder.
-        seed: of all noise; 0 if left out.
-        quiet: no progress bars and no table.
-        progress: False for no progress bars alone.
+) -> Values:
+    """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Returns:
-        An object of figures for free_force, free_torque, contact, identification and speed; all
-        but the last are the summary.
+        The summary, and the speed (not reproducible).
     """
     seed = seed or 0
-    make_folder(out)  # before the work: a bad path costs no time
+    make_folder(out)  # fail early for a bad path
     with show_progress(progress and not quiet) as stage:
-        # Each run has noise of its own.
+        # Each run has another seed.
         force, torque, contact = (
-            _at_the_hands_rate(LoadScenario(name), seed + k)
+            _log_at_hand_rate(LoadScenario(name), seed + k)
             for k, name in enumerate(
                 ("free_motion_force", "free_motion_torque", "contact_transition"), 1
             )
@@ -153,10 +90,10 @@ def reproduce_command(
         ]
         contact_run = contact_motion(contact, load.estimate, stage)
         summary = {
-            "free_force": free_figures(force_run, ideal[0], _FORCE_Z, "N"),
-            "free_torque": free_figures(torque_run, ideal[1], _TORQUE_X, "Nm"),
-            "contact": contact_figures(contact_run),
-            "identification": identification_figures(load, force),
+            "free_force": free_values(force_run, ideal[0], _FORCE_Z, "N"),
+            "free_torque": free_values(torque_run, ideal[1], _TORQUE_X, "Nm"),
+            "contact": contact_values(contact_run),
+            "identification": identification_values(load, force),
         }
         session = {"speed": _speed(stage("Measure the speed"))}
         pictures = draw(force_run, torque_run, contact_run, summary)
@@ -171,115 +108,10 @@ def reproduce_command(
     return summary | session
 
 
-def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Runs a free movement with a load estimate (16,) and computes its wrench for each sigma."""
-    result = _simulate(scenario, estimate, progress)
-    return FreeMotion(
-        scenario, result, {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
-    )
-
-
-def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Runs the contact transition with a load estimate (16,), with and without the sheet."""
-    touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
-    without = _without_sheet(scenario)
-    free = _simulate(without, estimate, stage("Fig. 8: the same without contact"))
-    calculated_free = _scaled(free, estimate, 0.0)
-    return ContactMotion(
-        scenario=scenario,
-        touched=touched,
-        free=free,
-        raw=_scaled(touched, estimate, 1.0),
-        calculated=_scaled(touched, estimate, 0.0),
-        raw_free=_scaled(free, estimate, 1.0),
-        calculated_free=calculated_free,
-        contact=in_contact(touched),
-        threshold=_THRESHOLD_OVER_FREE * float(_force(calculated_free).max()),
-    )
-
-
-def free_figures(run: FreeMotion, ideal: Array, component: int, unit: str) -> Figures:
-    """The figures of Figs. 6 and 7; `component` of the wrench, names end in `unit`.
-
-    `ideal` (N, 6) is what `eliminated_reaction` left.
-    """
-    raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
-    vector = slice(0, 3) if component < 3 else slice(3, 6)
-    scale = run.scenario.force_scaling.force_scale
-    peak = float(np.abs(raw).max())
-    return {
-        f"peak_raw_{unit}": peak,
-        f"peak_raw_master_{unit}": scale * peak,
-        "half_ratio": _rms(half) / _rms(raw),
-        f"residual_max_{unit}": float(np.abs(rest).max()),
-        f"residual_rms_{unit}": _rms(rest),
-        f"residual_norm_max_{unit}": _largest(run.scaled[0.0][:, vector]),
-        f"residual_ideal_max_{unit}": _largest(ideal[:, vector]),
-    }
-
-
-def contact_figures(run: ContactMotion) -> Figures:
-    """The figures of Fig. 8; a time is null if it did not happen."""
-    t, size = run.touched.t, _force(run.calculated)
-    over = size > run.threshold
-    touch = _touch(run)
-    after = t > t[touch][-1] if touch.any() else np.zeros(len(t), dtype=bool)
-    return {
-        "true_s": _first(t, run.contact),
-        "detected_s": _first(t, over),
-        "threshold_N": run.threshold,
-        "raw_detectable": bool(raw_excess(run).max() > 0),
-        "false_alarm_0_6_s": bool(over[after].any()),
-        "peak_contact_N": float(size.max()),
-        "peak_true_contact_N": _largest(run.touched["true_contact_wrench_W"][:, :3]),
-        "peak_inertial_N": _largest((run.raw - run.calculated)[:, :3]),
-        "duration_s": float(np.count_nonzero(run.contact) * (t[1] - t[0])),
-        "largest_deflection_mm": 1e3 * float(np.abs(run.touched["sheet_state"][:, 0]).max()),
-        "free_residual_norm_max_N": float(_force(run.calculated_free).max()),
-        "free_residual_norm_max_Nm": _largest(run.calculated_free[:, 3:]),
-    }
-
-
-def raw_excess(run: ContactMotion) -> Array:
-    """(4,) by how much f_x, f_y, f_z and |f| leave, in the touch, their range of the free run [N].
-
-    Negative where they stay inside: then no threshold on them separates contact from free motion.
-    """
-    touched, free = (
-        np.column_stack([raw[:, :3], _force(raw)]) for raw in (run.raw[_touch(run)], run.raw_free)
-    )
-    if not len(touched):
-        return np.full(len(_AXES), -np.inf)
-    return np.maximum(
-        touched.max(axis=0) - free.max(axis=0), free.min(axis=0) - touched.min(axis=0)
-    )
-
-
-def identification_figures(load: LoadIdentification, scenario: Scenario) -> Figures:
-    """How far the estimate is from the truth, and how well it could be known."""
-    error = load.estimate - _truth(scenario)
-    mass, moment = load.estimate[6], load.estimate[7:10]
-    true_mass, true_moment = _truth(scenario)[6], _truth(scenario)[7:10]
-    deviations = load.batch.standard_deviations
-    return {
-        "mass_kg": float(mass),
-        "mass_error_percent": 100 * abs(float(error[6] / true_mass)),
-        "com_error_mm": 1e3 * float(np.linalg.norm(moment / mass - true_moment / true_mass)),
-        "inertia_error_max_g_m2": 1e3 * float(np.abs(error[10:]).max()),
-        "offset_error_N": float(np.linalg.norm(error[:3])),
-        "offset_error_Nm": float(np.linalg.norm(error[3:6])),
-        "mass_std_percent": 100 * float(deviations[6] / mass),
-        "recursive_against_batch_std": load.recursive_against_batch,
-        "kappa_w10": load.kappa_w10,
-        "duration_s": load.trajectory.period,
-        "samples": load.batch.samples,
-    }
-
-
 def draw(
-    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Figures
+    force: FreeMotion, torque: FreeMotion, contact: ContactMotion, summary: Values
 ) -> dict[str, Figure]:
-    """Figs. 6, 7 and 8."""
+    """Draw Figs. 6, 7 and 8."""
     pictures = {
         name: scaling_figure(
             run.result.t,
@@ -303,45 +135,16 @@ def draw(
         contact=contact.contact,
         detected_s=math.nan if detected is None else detected,
         threshold=contact.threshold,
-        turning_s=_turn_without_contact(contact),
+        turning_s=reversal_without_contact(contact),
     )
     return pictures
 
 
-def _at_the_hands_rate(scenario: Scenario, seed: int) -> Scenario:
+def _log_at_hand_rate(scenario: Scenario, seed: int) -> Scenario:
     return replace(scenario, rates__log_hz=scenario.rates.hand_hz, simulation__seed=seed)
 
 
-def _without_sheet(scenario: Scenario) -> Scenario:
-    return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
-
-
-def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
-    station = MakeTeleopStation(scenario, load_estimate=estimate)
-    return simulate(station, scenario.simulation, progress=progress)
-
-
-def _truth(scenario: Scenario) -> Array:
-    return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
-
-
-def _scaled(result: SimulationResult, estimate: Array, sigma: float) -> Array:
-    wrench, s, omega, alpha = sensor_samples(result)
-    return scaled_wrench(
-        wrench,
-        estimate[:6],
-        s,
-        omega,
-        alpha,
-        estimate[6:],
-        np.zeros(10),
-        sigma_gripper=sigma,
-        sigma_object=sigma,
-        gamma=1.0,
-    )
-
-
-def _speed(progress: Progress) -> Figures:
+def _speed(progress: Progress) -> Values:
     scenario = LoadScenario("free_motion_force")
     cost = cpu_seconds(
         {"bare": MakeBarePlant(scenario), "station": MakeMovingStation(scenario)}, progress=progress
@@ -352,45 +155,10 @@ def _speed(progress: Progress) -> Figures:
     }
 
 
-def _touch(run: ContactMotion) -> NDArray[np.bool_]:
-    """(N,) from the first instant of contact to FILTER_TAIL after the last."""
-    t = run.touched.t
-    if not run.contact.any():
-        return run.contact
-    times = t[run.contact]
-    return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL)
-
-
-def _turn_without_contact(run: ContactMotion) -> float | None:
-    """When the raw force is largest after the touch: the movement turns there."""
-    t, size = run.touched.t, _force(run.raw)
-    touch = _touch(run)
-    if not touch.any():
-        return None
-    size[t <= t[touch][-1]] = 0.0
-    return float(t[np.argmax(size)])
-
-
-def _force(wrench: Array) -> Array:
-    return np.linalg.norm(wrench[:, :3], axis=1)
-
-
-def _largest(vectors: Array) -> float:
-    return float(np.linalg.norm(vectors, axis=1).max())
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _first(t: Array, happened: NDArray[np.bool_]) -> float | None:
-    return float(t[np.argmax(happened)]) if happened.any() else None
-
-
 def _write(
     out: Path,
     seed: int,
-    summary: Figures,
+    summary: Values,
     load: LoadIdentification,
     runs: tuple[FreeMotion, FreeMotion, ContactMotion],
     pictures: dict[str, Figure],
@@ -402,7 +170,7 @@ def _write(
         ("free_motion_force", force.result, force.scenario),
         ("free_motion_torque", torque.result, torque.scenario),
         ("contact_transition", contact.touched, contact.scenario),
-        ("contact_transition_without_sheet", contact.free, _without_sheet(contact.scenario)),
+        ("contact_transition_without_sheet", contact.free, without_sheet(contact.scenario)),
     ):
         result.write_parquet(out / "logs" / f"{name}.parquet")
         write_scenario(out / "logs" / f"{name}.yaml", scenario)
@@ -415,17 +183,17 @@ def _write(
     write_text(out / "table.md", _markdown(compare_with_paper(figures)))
     write_report(
         out / "report.html",
-        setup=_setup(seed, force.scenario, load),
+        setup=_describe_setup(seed, force.scenario, load),
         summary=figures,
-        figures=_captioned(out, figures),
+        figures=_captioned_figures(out, figures),
         parameters=parameter_rows(
-            _truth(force.scenario), load.estimate, load.batch.standard_deviations
+            true_parameters(force.scenario), load.estimate, load.batch.standard_deviations
         ),
         replay="replay.html",
     )
 
 
-def _captioned(out: Path, figures: Figures) -> list[ReportFigure]:
+def _captioned_figures(out: Path, figures: Values) -> list[ReportFigure]:
     titles = {
         "fig6": "Fig. 6: scaling and elimination of non-contact forces",
         "fig7": "Fig. 7: scaling and elimination of non-contact torques",
@@ -435,7 +203,7 @@ def _captioned(out: Path, figures: Figures) -> list[ReportFigure]:
     return [ReportFigure(title, out / f"{name}.png", words[name]) for name, title in titles.items()]
 
 
-def _setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
+def _describe_setup(seed: int, scenario: Scenario, load: LoadIdentification) -> dict[str, str]:
     rates, scale = scenario.rates, scenario.force_scaling.force_scale
     return {
         "Seed": str(seed),

@@ -1,9 +1,4 @@
-"""What a station costs over its bare plant, and how fast it runs.
-
-Bare plant: arm and tool under a constant torque, nothing around it, in steps of the sensor's period
-by the second-order Runge-Kutta method. All run interleaved in one process, and the times are thread
-CPU time: a busy machine matters little.
-"""
+"""CPU time of a station and of its bare plant (arm and tool under constant torque)."""
 
 from __future__ import annotations
 
@@ -20,16 +15,11 @@ from drake_teleop.station.simulation import MakeSimulator, advance
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.station import MakeTeleopStation
 
-_SPAN = 0.1  # simulated seconds a turn
+_RUN_S = 0.1  # simulated time of one measurement [s]
 
 
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
-    """Arm and tool under the torque that holds them, see the module.
-
-    Args:
-        scenario: of the station.
-        touching: whether its surroundings are there too.
-    """
+    """Return arm and tool under holding torque; `touching` adds surroundings."""
     builder = DiagramBuilder()
     surroundings = scenario.surroundings if touching else None
     slave = AddSlavePlant(builder, scenario.slave, surroundings)
@@ -46,8 +36,8 @@ def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
 
 
 def MakeMovingStation(scenario: Scenario) -> Simulator:
-    """The station of a scenario, past its settling time."""
-    # What the estimate says costs nothing, so it is the truth.
+    """Return a station after its settling time."""
+    # The value of the estimate does not change the cost.
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()
@@ -56,17 +46,20 @@ def MakeMovingStation(scenario: Scenario) -> Simulator:
 
 
 def cpu_seconds(
-    simulators: Mapping[str, Simulator], *, turns: int = 11, progress: Progress = lambda done: None
+    simulators: Mapping[str, Simulator],
+    *,
+    repetitions: int = 11,
+    progress: Progress = lambda done: None,
 ) -> dict[str, float]:
-    """CPU seconds a simulated second of each, the least over interleaved turns of 0.1 s.
+    """Return thread CPU seconds for each simulated second, by interleaved runs.
 
-    What else the machine does can only add to a turn (the advice of Python's timeit).
+    Other load of the machine can only add time, so the minimum counts (as in `timeit`).
     """
-    spent: dict[str, list[float]] = {name: [] for name in simulators}
-    for turn in range(turns):
+    times_s: dict[str, list[float]] = {name: [] for name in simulators}
+    for k in range(repetitions):
         for name, simulator in simulators.items():
             start = time.thread_time()
-            advance(simulator, simulator.get_context().get_time() + _SPAN)
-            spent[name].append((time.thread_time() - start) / _SPAN)
-        progress((turn + 1) / turns)
-    return {name: min(times) for name, times in spent.items()}
+            advance(simulator, simulator.get_context().get_time() + _RUN_S)
+            times_s[name].append((time.thread_time() - start) / _RUN_S)
+        progress((k + 1) / repetitions)
+    return {name: min(times) for name, times in times_s.items()}

@@ -1,1 +1,1 @@
-"""Sweeps over scenarios."""
+"""Studies: designs over scenario fields, their runs, store and statistics."""

@@ -1,37 +1,31 @@
-"""Where a study looks next: expected improvement under a Gaussian process (Jones et al. 1998).
+"""Next points of an adaptive design: expected improvement (Jones 1998).
 
-A batch is chosen one by one, each as if the ones before had come out as the process expects
-("kriging believer", Ginsbourger et al. 2010). The same rows give the same choice, so that a study
-that was killed goes on as if it had not been.
+A batch uses predicted values ("kriging believer", Ginsbourger 2010).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import minimize
 from scipy.special import ndtr
 from scipy.stats import norm
 
-Array = NDArray[np.float64]
+from drake_teleop.common.arrays import Array
 
-# Logarithms, in units of the design's span and of the spread of the objective: the range of a
-# length, and of the variance of the noise that is left in a mean over repeats.
-_LENGTH, _NOISE = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
+# Bounds of log length scale, in units of the design's span, and of log noise variance, in units of
+# the objective's variance.
+_LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e-6), np.log(1.0))
 
 
 def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
-    """The candidates that promise the most.
+    """Return indices of `count` candidates with the largest expected improvement.
 
     Args:
-        places: (n, d) of the points that were tried, from 0 to 1.
-        objective: (n,) at each, to be made small; nan where it failed: as bad as the worst.
+        places: (n, d) evaluated points, from 0 to 1.
+        objective: (n,) to minimise; nan counts as the worst value.
         candidates: (m, d), m >= count.
-        count: how many are wanted.
-
-    Returns:
-        The indices of different candidates.
     """
     y = np.array(objective, dtype=float)
     if not np.isfinite(y).any():
@@ -43,7 +37,7 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
     chosen: list[int] = []
     for _ in range(count):
         mean, deviation = _predict(places, y, candidates, noise)
-        # What is better than the best that the process believes in, not than the luckiest one.
+        # Improvement over the best predicted mean, not over the best noisy value.
         best = _predict(places, y, places, noise)[0].min()
         u = (best - mean) / deviation
         improvement = deviation * (u * ndtr(u) + norm.pdf(u))
@@ -55,7 +49,7 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
 
 
 def _fit(places: Array, y: Array) -> tuple[Array, float]:
-    """The lengths (d,) and the noise's variance that are most likely."""
+    """Return length scales (d,) and noise variance (maximum likelihood)."""
 
     def misfit(x: Array) -> float:
         K = _kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
@@ -64,26 +58,26 @@ def _fit(places: Array, y: Array) -> tuple[Array, float]:
         logarithm = np.log(np.diag(factor[0])).sum()
         return float(0.5 * y @ cho_solve(factor, y) + logarithm)
 
-    bounds = [_LENGTH] * places.shape[1] + [_NOISE]
+    bounds = [_LOG_LENGTH_BOUNDS] * places.shape[1] + [_LOG_NOISE_BOUNDS]
     starts = (np.log([length] * places.shape[1] + [0.1]) for length in (0.3, 1.5))
     found = [minimize(misfit, start, method="L-BFGS-B", bounds=bounds) for start in starts]
     x = min(found, key=lambda result: result.fun).x
     return np.exp(x[:-1]), float(np.exp(x[-1]))
 
 
-def _predict(places: Array, y: Array, wanted: Array, noise: float) -> tuple[Array, Array]:
-    """Mean and standard deviation of the process at `wanted`; places in units of the lengths."""
+def _predict(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
+    """Return mean and standard deviation at `queries`."""
     K = _kernel(places, places)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)
-    cross = _kernel(places, wanted)
+    cross = _kernel(places, queries)
     mean = cross.T @ cho_solve((lower, True), y)
     explained = np.sum(solve_triangular(lower, cross, lower=True) ** 2, axis=0)
     return mean, np.sqrt(np.maximum(1.0 - explained, 1e-12))
 
 
 def _kernel(a: Array, b: Array) -> Array:
-    """Matern 5/2."""
+    """Return the Matern 5/2 kernel."""
     r = np.sqrt(5.0 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
     kernel: Array = (1.0 + r + r * r / 3.0) * np.exp(-r)
     return kernel

@@ -1,53 +1,147 @@
-"""What a study's rows say about its factors: means with confidence intervals; the Pareto front.
+"""Effects of factors with confidence intervals, and the Pareto front.
 
-All points of a design have the same seeds, and the seeds are what the runs are a sample of. In a
-factorial design every level of a factor meets the same combinations of the others. So each mean
-is one over runs, calculated for each seed alone, and its interval is Student's for the mean over
-seeds. Differences between levels are taken within each seed: what a seed does to all points
-cancels. One repeat says nothing about other seeds, and has no intervals (nan).
-
-The points of any other design are a sample, too, and its levels differ by chance in what else is
-varied. There the effects are those of a regression, and the intervals hold for the design and the
-seeds together; see `level_model.py`. With one repeat the intervals of effects are those of the
-design alone.
-
-If points fail with every seed, levels are compared over those combinations of the other factors at
-which all of them have a successful run, in any design; see `cells.py`.
+Factorial designs have plain means with Student's intervals over seeds, differences within each
+seed; other designs a regression. Without interval the half width is nan.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
-from drake_teleop.lab.studies.cells import TOO_FEW, Flags, reasons
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.studies.design import Factor, Study
-from drake_teleop.lab.studies.factorial import Factorial, filled, interval
-from drake_teleop.lab.studies.level_model import LevelModel, level_model, levels_of
+from drake_teleop.lab.studies.level_model import (
+    CONFIDENCE,
+    TOO_FEW,
+    Flags,
+    LevelModel,
+    comparable,
+    level_model,
+    levels_of,
+    reasons,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 
-#: What a designer of the loop gives and takes: the hand's effort against what it gets for it.
+@dataclass(frozen=True, eq=False)
+class Factorial:
+    """Points of a factorial design that have a measure.
+
+    Attributes:
+        levels: (n,) of each factor.
+        counts: number of levels of each factor.
+        seen: (n, seeds) True for measured values.
+    """
+
+    levels: list[NDArray[np.int64]]
+    counts: list[int]
+    seen: Flags
+
+    def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
+        """Return the comparable levels of a factor, or cells of two factors.
+
+        Returns:
+            (rows,) levels or cells; (columns,) combinations of others; (kept rows, n) matrix from
+            values to means.
+        """
+        others = [factor for factor in range(len(self.counts)) if factor not in shown]
+        (row, rows), (column, columns) = (
+            self._combination_indices(shown),
+            self._combination_indices(others),
+        )
+        point = np.full((rows, columns), -1)
+        point[row, column] = np.arange(len(row))
+        is_compared, combinations = comparable(point >= 0)
+        weights = np.zeros((int(is_compared.sum()), len(row)))
+        points = point[is_compared][:, combinations]
+        np.put_along_axis(weights, points, 1.0 / combinations.sum(), axis=1)
+        return is_compared, combinations, weights
+
+    def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
+        """Return (kept levels,) effects and half widths of each factor."""
+        means = [self.compared(factor)[2] for factor in range(len(self.counts))]
+        found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
+        return [effect for effect, _ in found], [half for _, half in found]
+
+    def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
+        """Return (k,) sums with (k, n) weights, and half widths."""
+        mean, half = interval(weights @ table)
+        return mean, np.hypot(half, self._missing_seed_widths(table, weights))
+
+    def _combination_indices(self, factors: Sequence[int]) -> tuple[NDArray[np.int64], int]:
+        place, count = np.zeros(len(self.seen), dtype=np.int64), 1
+        for factor in factors:
+            place = place * self.counts[factor] + self.levels[factor]
+            count *= self.counts[factor]
+        return place, count
+
+    def _missing_seed_widths(self, table: Array, weights: Array) -> Array:
+        """Return (k,) half widths due to missing seeds."""
+        points, seeds = table.shape
+        runs = self.seen.sum(axis=1)
+        freedom = runs.sum() - points - seeds + 1
+        if (runs == seeds).all():
+            return np.zeros(len(weights))
+        # Least squares for points and zero-sum seeds; points are eliminated (Schur complement).
+        zero_sum = np.vstack([np.eye(seeds - 1), -np.ones((1, seeds - 1))])
+        seen = self.seen @ zero_sum
+        left = (zero_sum.T * self.seen.sum(axis=0)) @ zero_sum - (seen.T / runs) @ seen
+        if freedom < 1 or np.linalg.matrix_rank(left) < seeds - 1:
+            return np.where((weights[:, runs < seeds] != 0).any(axis=1), np.nan, 0.0)
+        moved = (weights / runs) @ seen
+        spread = weights**2 @ (1 / runs) + np.sum(moved @ np.linalg.inv(left) * moved, axis=1)
+        # Subtract the variance that the intervals of the filled table already contain.
+        spread -= weights**2 @ ((runs - 1) / (seeds * (seeds - 1)))
+        residuals = table - table.mean(axis=1, keepdims=True) - table.mean(axis=0) + table.mean()
+        variance = np.sum(residuals**2) / freedom
+        quantile = stdtrit(freedom, 0.5 + CONFIDENCE / 2)
+        return quantile * np.sqrt(variance * np.maximum(spread, 0.0))
+
+
+def filled(values: Array) -> Array:
+    """Replace nan in (n, seeds) by least squares sums."""
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    of_seed = np.zeros(values.shape[1])
+    for _ in range(100):  # alternating least squares
+        of_point = np.mean(values - of_seed, axis=1, where=known)
+        of_seed = np.mean(values - of_point[:, None], axis=0, where=known)
+    return np.where(known, values, of_point[:, None] + of_seed)
+
+
+def interval(table: Array) -> tuple[Array, Array]:
+    """Return (n,) means of (n, seeds) without nan, and half widths."""
+    count = np.isfinite(table).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nansum(table, axis=1) / count
+        spread = np.nansum((table - mean[:, None]) ** 2, axis=1) / (count - 1)
+        quantile = stdtrit(np.maximum(count - 1, 1), 0.5 + CONFIDENCE / 2)
+        half = quantile * np.sqrt(spread / count)
+    return mean, np.where(count > 1, half, np.nan)
+
+
+#: Measures of the Pareto front.
 PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Means with their intervals.
+    """Means over seeds with half widths of their intervals.
 
     Attributes:
-        mean: (n,) over the seeds.
-        half: (n,) half the width of the interval of the mean.
-        effect_half: (n,) half the width of the interval of the mean's difference from the mean of
-            all n, which is the narrower one if seeds differ in the same way at every level.
+        mean, half: (n,).
+        effect_half: (n,) for the difference from the mean of all n.
     """
 
     mean: Array
@@ -57,19 +151,16 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class MainEffect:
-    """What one factor does to a measure; nan at a level that cannot be compared.
+    """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: of its n levels, or of parts of its range.
-        runs: (n,) at each that have the measure.
-        mean: (n,) over the other factors and the seeds.
-        half: (n,) half the width of the interval of the mean.
-        effect: (n,) the difference of the mean from that over all levels.
-        effect_half: (n,) half the width of its interval.
-        why: (n,) why a level has no value; empty if it has.
-        compared: over so many combinations of the other factors' levels.
-        left_out: so many more there are.
-        fitted: whether a regression found it, see `level_model.py`.
+        names: of the n levels or parts of the range.
+        runs: (n,) number of runs with the measure.
+        mean, half: (n,) over other factors and seeds.
+        effect, effect_half: (n,) difference from the mean of all levels.
+        why: (n,) reason of a missing value.
+        compared, left_out: number of combinations of other levels.
+        fitted: True if a regression found it.
     """
 
     names: list[str]
@@ -86,16 +177,12 @@ class MainEffect:
 
 @dataclass(frozen=True, eq=False)
 class PairMeans:
-    """The means of a measure over two factors; nan in a cell that cannot be compared.
+    """Means of a measure over two factors of n and m levels.
 
     Attributes:
-        fields: of the two, n and m levels.
-        names: of the levels.
-        mean: (n, m) over the other factors and the seeds.
-        why: (n, m) why a cell has no value; empty if it has.
-        compared: over so many combinations of the other factors' levels.
-        left_out: so many more there are.
-        fitted: whether a regression found it, see `level_model.py`.
+        mean: (n, m) over other factors and seeds; nan if not comparable.
+        why: (n, m) reason of a missing value.
+        compared, left_out, fitted: see `MainEffect`.
     """
 
     fields: tuple[str, str]
@@ -110,13 +197,7 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """The mean of each of `count` levels, over seeds.
-
-    Args:
-        values: (N,) of the rows; nan does not count.
-        levels: (N,) indices of the level.
-        seeds: (N,).
-    """
+    """Return the mean of each of `count` levels of (N,) values; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -125,13 +206,13 @@ def estimated(
     with np.errstate(invalid="ignore"):
         table = sums / runs
     mean, half = interval(table)
-    # Differences only between what is there: a seed that lacks a level would shift all others.
+    # Seeds without some level are excluded: they would shift all other levels.
     _, effect_half = interval(table - table.mean(axis=0))
     return Estimate(mean, half, effect_half)
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """The main effects: a row for each measure, factor and level."""
+    """Return the main effects as a table."""
     import polars as pl
 
     table = [
@@ -156,41 +237,39 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """What each factor does to a measure, by field; nothing if no run has it."""
-    data = _Data(study, rows, measure)
+    """Return the effect of each factor on a measure."""
+    data = _MeasureData(study, rows, measure)
     return (
-        {} if data.nothing else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
+        {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
     )
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """The means of a measure over each pair of factors; none if there are too few points."""
-    data = _Data(study, rows, measure)
+    """Return the means of a measure over each pair of factors."""
+    data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
-    return [] if data.nothing else [found for pair in pairs if (found := data.pair(*pair))]
+    return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
 
 
-class _Data:
-    """One measure at the points of a design, and how its effects are found: see above."""
-
+class _MeasureData:
     def __init__(self, study: Study, rows: pl.DataFrame, measure: str) -> None:
         self.factors = varied(study)
-        points, values = _points_and_seeds(rows, measure)
+        points, values = _values_by_point_and_seed(rows, measure)
         seen = np.isfinite(values)
         self.runs = seen.sum(axis=1)
         known = self.runs > 0
-        self.nothing = not known.any()
-        if self.nothing:
+        self.is_empty = not known.any()
+        if self.is_empty:
             return
-        kept = np.ix_(known, seen.any(axis=0))
-        self.table = filled(values[kept])
+        used = np.ix_(known, seen.any(axis=0))
+        self.table = filled(values[used])
         columns = [points[factor.field].to_list() for factor in self.factors]
         self.levels = [levels_of(f, c) for f, c in zip(self.factors, columns, strict=True)]
         self.model: Factorial | LevelModel | None
         if study.design == "factorial":
             index = [levels.index[known] for levels in self.levels]
             counts = [len(levels.names) for levels in self.levels]
-            self.model = Factorial(index, counts, seen[kept])
+            self.model = Factorial(index, counts, seen[used])
         else:
             by_chance = study.design == "sobol"
             self.model = level_model(self.factors, columns, known, by_chance=by_chance)
@@ -202,13 +281,13 @@ class _Data:
         mean, half, effect, effect_half = figures = np.full((4, count), np.nan)
         why, compared = [TOO_FEW] * count, 0
         if self.model is not None:
-            kept, over, weights = self.model.compared(factor)
-            if kept.sum() > 1:
+            is_compared, combinations, weights = self.model.compared(factor)
+            if is_compared.sum() > 1:
                 effects, halves = self.model.effects(self.table)
                 found = [*self.model.means(self.table, weights), effects[factor], halves[factor]]
-                figures[:, kept] = found
-                compared = self._combinations(over, factor)
-            why = self._reasons(kept & (kept.sum() > 1), levels.index)
+                figures[:, is_compared] = found
+                compared = self._combinations(combinations, factor)
+            why = self._reasons(is_compared & (is_compared.sum() > 1), levels.index)
         runs = np.bincount(levels.index, self.runs, count).astype(np.int64)
         left_out = self._combinations(np.ones(1), factor) - compared
         return MainEffect(
@@ -221,15 +300,15 @@ class _Data:
             return None
         a, b = self.levels[first], self.levels[second]
         shape = len(a.names), len(b.names)
-        kept, over, weights = self.model.compared(first, second)
-        mean = np.full(len(kept), np.nan)
-        mean[kept] = self.model.means(self.table, weights)[0]
-        # A cell in which no point happens to lie is fitted, too, but nobody has been there.
+        is_compared, combinations, weights = self.model.compared(first, second)
+        mean = np.full(len(is_compared), np.nan)
+        mean[is_compared] = self.model.means(self.table, weights)[0]
+        # The model also predicts cells without points; they are not shown.
         cell = a.index * shape[1] + b.index
-        kept &= np.bincount(cell, self.runs, len(kept)) > 0
-        mean[~kept] = np.nan
-        why = np.array(self._reasons(kept, cell)).reshape(shape)
-        compared = self._combinations(over, first, second)
+        is_compared &= np.bincount(cell, self.runs, len(is_compared)) > 0
+        mean[~is_compared] = np.nan
+        why = np.array(self._reasons(is_compared, cell)).reshape(shape)
+        compared = self._combinations(combinations, first, second)
         left_out = self._combinations(np.ones(1), first, second) - compared
         fields = self.factors[first].field, self.factors[second].field
         names = a.names, b.names
@@ -239,19 +318,17 @@ class _Data:
     def fitted(self) -> bool:
         return not isinstance(self.model, Factorial)
 
-    def _combinations(self, over: NDArray[Any], *shown: int) -> int:
-        """How many of the levels of the other factors there are at this share of them."""
+    def _combinations(self, combinations: NDArray[Any], *shown: int) -> int:
         others = (len(f.names) for k, f in enumerate(self.levels) if k not in shown)
-        return round(np.mean(over) * math.prod(others))
+        return round(np.mean(combinations) * math.prod(others))
 
     def _reasons(self, compared: Flags, cell: NDArray[np.int64]) -> list[str]:
-        """Why cells have no value; (n,) `cell` is that of each point."""
         runs = np.bincount(cell, minlength=len(compared))
         return reasons(compared, runs, np.bincount(cell, self.runs, len(compared)))
 
 
-def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    """The points, and (n, seeds) the values of a measure; nan where there is none."""
+def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
+    """Return points, and (n, seeds) values; nan where missing."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
@@ -261,13 +338,9 @@ def _points_and_seeds(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, A
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Every point with the means of `PARETO`, their intervals, and whether it is on the front.
+    """Return every point with means of `PARETO`, or None without these measures.
 
-    On the front is a point to which no other is better or equal in everything. A point at which not
-    every run has all three is not compared: a mean over the runs that went well would flatter it.
-
-    Returns:
-        A row for each point, or None if the study does not measure all three.
+    Only points with all three measures at every run can be on the front.
     """
     import polars as pl
 
@@ -292,7 +365,7 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) which of the complete points no other complete one dominates; (n, k), small is good."""
+    """Return (n,) non-dominated complete points of (n, k) values; small is good."""
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -302,12 +375,12 @@ def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def varied(study: Study) -> list[Factor]:
-    """The factors that have more than one value."""
+    """Return the factors with more than one value."""
     return [factor for factor in study.factors if len(factor.listed()) > 1]
 
 
 def numbers(rows: pl.DataFrame, measure: str) -> Array:
-    """(N,) a measure, nan where a run has none."""
+    """Return (N,) a measure; nan where missing."""
     import polars as pl
 
     column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

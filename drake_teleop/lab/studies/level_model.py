@@ -1,23 +1,9 @@
-"""Effects of factors from a design that is not balanced: a regression with all factors at once.
+"""Effects from an unbalanced design: one regression with all factors (docs/studies.md).
 
-Cells of a Sobol or an adaptive design differ in the other factors too, so that plain means over
-them show effects that there are not. Here each measure is regressed on
-
-* one term for each level of each factor (a range is cut into equal parts), zero in sum;
-* of each range its place within the part, which is zero in the mean over a part;
-* the product of each pair of factors, zero in the mean over either, if there are points enough.
-
-The last two do not change what the first ones mean, a level's mean over everything else; they take
-out of the residuals what is known. What is left is how far the points of the design happen to be
-from that mean, and the noise: both are in the residuals, and so in the intervals. Added is what
-seeds do to the effects beyond that noise. The points have to be as good as drawn by chance, as
-scrambled Sobol points are (Owen 1997, "Scrambled net variance for integrals of smooth functions").
-
-Where runs fail a regression has nothing to hold on to, and would go on beyond. So nothing is
-averaged over those cells of two factors in which all points failed, or of which less than half as
-large a share came out well as of others at the same levels, because the edge runs through them; see
-`cells.py`. A cell in which no point lies by chance counts; in an adaptive design, whose points lie
-where they do for a reason, it does not.
+Terms with zero mean: each level (a range is cut into parts), position within a part, and products
+of pairs. Intervals contain residuals and seeds; points must be as good as random (Owen 1997).
+Failed cells are excluded: without success, or with less than half the share of success of other
+cells at the same levels. A randomly empty cell counts, except in adaptive designs.
 """
 
 from __future__ import annotations
@@ -26,35 +12,67 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from drake_teleop.lab.studies.cells import Flags, comparable
+from drake_teleop.common.arrays import Array
 from drake_teleop.lab.studies.design import Factor, Value
 
-Array = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+
+#: Reasons for a level or cell without value.
+NO_RUN, NO_SUCCESS = "no run", "no successful run"
+NOT_COMPARABLE = "not comparable with the others"
+TOO_FEW = "too few points"
+
+
+def comparable(there: Flags) -> tuple[Flags, Flags]:
+    """Return the largest complete block of a table with missing values.
+
+    Levels (or cells) are comparable only over combinations of the other factors at which all of
+    them have a successful run.
+
+    Args:
+        there: (rows, columns) True where level and combination have a value.
+
+    Returns:
+        (rows,) the largest pattern of rows, the most frequent if several; (columns,) all columns
+        with these rows.
+    """
+    counts = there.sum(axis=0)
+    patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
+    rows = patterns[:, np.argmax(times)]
+    columns: Flags = np.logical_and.reduce(there[rows], axis=0)
+    return rows, columns
+
+
+def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
+    """Return (n,) why levels or cells have no value; empty if `compared`."""
+    why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
+    return np.where(compared, "", why).tolist()
+
 
 CONFIDENCE = 0.95
-# Equal parts of a range and whether products of pairs are in the model: what leaves half of the
-# points for the residuals is taken, or else the last.
-_LADDER = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
-# Combinations of levels, of the factors that have something to do with failures: 40 MB.
-_COMBINATIONS = 50_000
+# Models by number of parts of a range and products of pairs. The first one that leaves half of the
+# points for the residuals is used, or else the last feasible one.
+_MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
+# Maximum number of combinations of levels of factors that are related to failures (40 MB).
+_MAX_COMBINATIONS = 50_000
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """A factor's levels at some points.
+    """Levels of a factor at some points.
 
     Attributes:
-        index: (n,) the level of each point.
-        names: of the levels that have a point.
-        within: (n,) the place in its part of a range, from -1/2 to 1/2; None of a list.
-        centred: (n, k) numbers by their size, or else a column for each word but one; zero in the
-            mean over range or list.
-        middles: (levels, k) the same in the middle of each level.
+        index: (n,) level of each point.
+        names: of the levels with a point.
+        within: (n,) position in its part of a range, -1/2 to 1/2; None for a list.
+        centred: (n, k) numbers, or indicators for all values but one; zero mean.
+        middles: (levels, k) the same at the middle of each level.
     """
 
     index: NDArray[np.int64]
@@ -65,13 +83,7 @@ class Levels:
 
 
 def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
-    """The levels of points; a range with values anywhere is cut into parts, named by their middles.
-
-    Args:
-        factor: with all that it varies over.
-        column: (n,) its values at the points.
-        parts: of a range.
-    """
+    """Return the levels of (n,) values; ranges are cut into `parts`."""
     listed = factor.listed()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
@@ -84,24 +96,23 @@ def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels
         return Levels(index, names, within, places - 0.5, middles - 0.5)
     present, index = np.unique([listed.index(v) for v in column], return_inverse=True)
     middles = np.array([factor.coordinates(value) for value in listed])
-    # Of words one column follows from the others.
+    # The last indicator column depends on the others.
     middles = middles[:, : max(middles.shape[1] - 1, 1)]
     middles = (middles - middles.mean(axis=0))[present]
-    names = [_name(listed[k]) for k in present]
+    names = [_format_value(listed[k]) for k in present]
     return Levels(index, names, None, middles[index], middles)
 
 
 @dataclass(frozen=True, eq=False)
 class LevelModel:
-    """A regression of measures at the points of a design.
+    """Regression of measures at the points of a design.
 
     Attributes:
-        factors: the levels of each, at all points.
-        codes: of each, (levels, k) its terms' columns; zero at a level without a value.
-        products: (i, j) of each pair of factors, its columns; empty if it has none.
-        failed: (i, j) of some pairs: (levels, levels) which cells to leave out; (i, i): levels.
-        X: (n, p) all columns, the mean first, at the points that have a value.
-        solve: (p, n) from values at these points to the columns' coefficients.
+        codes: for each factor (levels, k) its columns.
+        products: columns of each pair (i, j).
+        failed: (levels, levels) excluded cells of pairs; (i, i): levels.
+        X: (n, p) all columns, the mean first.
+        solve: (p, n) pseudo-inverse.
     """
 
     factors: list[Levels]
@@ -112,12 +123,11 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """What is comparable of the levels of a factor, or of the cells of two.
+        """Return the comparable levels of a factor, or cells of two factors.
 
         Returns:
-            (rows,) which levels or cells, (columns,) over which combinations of the levels of those
-            other factors that have something to do with failures, see `comparable`; (kept rows, p)
-            from the coefficients to the mean over these.
+            (rows,) levels or cells; (columns,) combinations of others that are related to failures;
+            (kept rows, p) matrix from coefficients to means.
         """
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
@@ -132,17 +142,14 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Of each factor, (kept levels,) the effects and half the widths of their intervals.
+        """Return (kept levels,) effects and half widths of each factor.
 
-        The intervals hold all effects of all factors together, with `CONFIDENCE` (Bonferroni).
-
-        Args:
-            table: (n, seeds) of values, none missing.
+        The intervals hold together with `CONFIDENCE` (Bonferroni).
         """
         means = [self.compared(factor)[2] for factor in range(len(self.factors))]
-        # Two levels have one effect, with two signs.
-        all_of_them = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
-        coefficients, design = self.solve @ table.mean(axis=1), self._design(table, all_of_them)
+        # Two levels have one effect with two signs.
+        num_effects = max(sum(1 if len(terms) == 2 else len(terms) for terms in means), 1)
+        coefficients, design = self.solve @ table.mean(axis=1), self._design(table, num_effects)
         effects, halves = [], []
         for terms in means:
             terms = terms - terms.sum(axis=0) / max(len(terms), 1)
@@ -151,7 +158,7 @@ class LevelModel:
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
-        """(kept levels,) the mean at each level, and half the width of its interval over seeds."""
+        """Return (kept levels,) means and half widths."""
         seeds = table.shape[1]
         each = terms @ self.solve @ table
         if seeds == 1:
@@ -160,11 +167,7 @@ class LevelModel:
         return each.mean(axis=1), np.hypot(self._design(table, 1) * self._spread(terms), over_seeds)
 
     def _terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
-        """(N, p) from the coefficients to the means in cells.
-
-        Args:
-            at: (N,) the levels of some factors; each mean is over all others.
-        """
+        """Return (N, p) from coefficients to means at (N,) levels."""
         count = len(next(iter(at.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
@@ -180,27 +183,25 @@ class LevelModel:
 
     @property
     def _freedom(self) -> int:
-        """Degrees of freedom of the residuals."""
         return self.X.shape[0] - self.X.shape[1]
 
     def _variance(self, table: Array, columns: int) -> float:
-        """Of the residuals of a table with so many independent columns."""
         residuals = table - self.X @ (self.solve @ table)
-        # What follows from the factors to the last digit is known to some digits less.
+        # Lower bound by rounding errors for exact fits.
         least = (1e-10 * np.abs(table).max()) ** 2
         return max(float(np.sum(residuals**2)) / (columns * self._freedom), least)
 
     def _spread(self, terms: Array) -> Array:
-        """(k,) the standard deviations of such terms, for residuals of variance 1."""
+        """Return (k,) standard deviations for unit residual variance."""
         return np.linalg.norm(terms @ self.solve, axis=1)
 
     def _design(self, table: Array, together: int) -> float:
-        """Half the width for the design, by spread, if so many intervals hold together."""
+        """Return the half width due to the design, for unit spread."""
         variance = self._variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
     def _seeds(self, table: Array, terms: Array) -> float:
-        """Half the width for what seeds do to a factor's effects, beyond the residuals' noise."""
+        """Return the half width due to seeds, beyond the residual noise."""
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0
@@ -218,16 +219,15 @@ def level_model(
     *,
     by_chance: bool = True,
 ) -> LevelModel | None:
-    """The richest model for these points, or None if they cannot tell the factors apart.
+    """Return the richest model that the points determine, or None.
 
     Args:
-        factors: those that are varied.
-        columns: of each, (n,) its values at the points.
-        known: (n,) which points have a value; all, if left out.
-        by_chance: whether cells without a point are so by chance.
+        columns: of each factor, (n,) values.
+        known: (n,) points with a value; None: all.
+        by_chance: True if empty cells are random.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
-    for parts, products in _LADDER:
+    for parts, products in _MODELS:
         levels = [levels_of(f, c, parts) for f, c in zip(factors, columns, strict=True)]
         model = _model(levels, products, known, by_chance)
         if model is not None:
@@ -240,9 +240,8 @@ def level_model(
 def _model(
     factors: list[Levels], products: bool, known: Flags, by_chance: bool
 ) -> LevelModel | None:
-    """The model with these terms; None if its coefficients do not follow from the points."""
     points = int(known.sum())
-    failed = _failed(factors, known, by_chance)
+    failed = _failed_cells(factors, known, by_chance)
     codes = [_codes(len(levels.names), np.unique(levels.index[known])) for levels in factors]
     columns = [np.ones((points, 1))]
     columns += [code[f.index[known]] for f, code in zip(factors, codes, strict=True)]
@@ -255,7 +254,7 @@ def _model(
     X = np.hstack(columns)
     counts = sorted(len(levels.names) for levels in factors)
     involved = [len(factors[k].names) for k in set(itertools.chain(*failed))] + counts[-2:]
-    if X.shape[1] >= points or math.prod(involved) > _COMBINATIONS:
+    if X.shape[1] >= points or math.prod(involved) > _MAX_COMBINATIONS:
         return None
     u, size, v = np.linalg.svd(X, full_matrices=False)
     if size[-1] < 1e-6 * size[0]:
@@ -263,8 +262,10 @@ def _model(
     return LevelModel(factors, codes, places, failed, X, v.T / size @ u.T)
 
 
-def _failed(factors: list[Levels], known: Flags, by_chance: bool) -> dict[tuple[int, int], Flags]:
-    """Of pairs of factors, the cells to leave out, see above; of (i, i), the levels."""
+def _failed_cells(
+    factors: list[Levels], known: Flags, by_chance: bool
+) -> dict[tuple[int, int], Flags]:
+    """Return excluded cells of pairs of factors."""
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
@@ -282,21 +283,20 @@ def _failed(factors: list[Levels], known: Flags, by_chance: bool) -> dict[tuple[
 
 
 def _products(a: Array, b: Array) -> Array:
-    """(n, j k) of (n, j) and (n, k)."""
     return np.einsum("ni,nj->nij", a, b).reshape(len(a), -1)
 
 
 def _codes(count: int, present: NDArray[np.int64]) -> Array:
-    """(count, k - 1) a column for each of the k present levels but the last: minus their sum."""
+    """Return (count, k - 1) sum-to-zero codes of the k present levels."""
     codes = np.zeros((count, len(present) - 1))
     codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
     return codes
 
 
 def _quantile(together: int, freedom: int) -> float:
-    """Student's, if so many intervals hold together with `CONFIDENCE`."""
+    """Return Student's quantile for simultaneous intervals."""
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
 
 
-def _name(value: Value) -> str:
+def _format_value(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)

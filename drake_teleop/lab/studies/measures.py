@@ -1,4 +1,4 @@
-"""What a study measures in a run of the station."""
+"""Measures of a run of a study."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.result import SimulationResult
 
 if TYPE_CHECKING:
     from drake_teleop.station.scenario import Scenario
-
-Array = NDArray[np.float64]
 
 
 def _peak(forces: Array) -> float:
@@ -41,39 +39,38 @@ def _time_above(result: SimulationResult, threshold: float) -> float:
     return float(np.trapezoid(above.astype(float), result.t))
 
 
-#: Those of every run by name: of its signals and the study's `force_threshold` [N].
+#: Measures of every run, from its signals and the study's `force_threshold` [N].
 _OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
-    # Largest force that the device displays.
+    # Largest displayed force.
     "peak_force_to_master_N": lambda result, _: _peak(_force_to_master(result)),
-    # Root of the mean of its square.
     "rms_force_to_master_N": lambda result, _: float(
         np.sqrt(np.mean(np.sum(_force_to_master(result) ** 2, axis=1)))
     ),
-    # Largest force between tool and environment, the simulation's truth.
+    # Largest true force between tool and environment.
     "peak_contact_force_N": _peak_contact_force,
-    # Integral of F.v and tau.omega: what the hand puts into the stylus.
+    # Work of the hand on the stylus: integral of F.v + tau.omega.
     "hand_work_J": _hand_work,
-    # How long the displayed force is above the threshold.
+    # Time of a displayed force above the threshold.
     "time_above_force_s": _time_above,
 }
 
 
-#: All names; those of tasks are explained in `task_measures.py`.
+#: All names; for those of tasks see `task_measures.py`.
 MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
 
 
 def default_measures() -> list[str]:
-    """What a study measures that does not say: what every run has."""
+    """Return the default measures, which every run has."""
     return list(_OF_EVERY_RUN)
 
 
 def measured(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """The measures of one run, by name.
+    """Return the measures of one run by name.
 
     Raises:
-        DrakeTeleopError: if they are those of a task and there is none.
+        DrakeTeleopError: for a measure of a task in a scenario without task.
     """
     own = [name for name in names if name in _OF_EVERY_RUN]
     found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}

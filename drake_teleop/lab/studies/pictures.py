@@ -1,4 +1,4 @@
-"""The pictures of a study: main effects, interactions, and the Pareto front."""
+"""Pictures of a study."""
 
 from __future__ import annotations
 
@@ -15,26 +15,27 @@ from matplotlib.patches import Rectangle
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, house_style
 from drake_teleop.common.writing import write_picture
 from drake_teleop.lab.studies import effects
-from drake_teleop.lab.studies.cells import NO_RUN, NO_SUCCESS, NOT_COMPARABLE, TOO_FEW
 from drake_teleop.lab.studies.design import Study
 from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied
-from drake_teleop.lab.studies.level_model import CONFIDENCE
+from drake_teleop.lab.studies.level_model import (
+    CONFIDENCE,
+    NO_RUN,
+    NO_SUCCESS,
+    NOT_COMPARABLE,
+    TOO_FEW,
+)
 
 if TYPE_CHECKING:
     import polars as pl
 
-_LABELLED = 24  # points of the front that have room for their names
-_WIDTH = 24  # letters that have room below a picture
-# What has no value is hatched, by the reason.
+_MAX_LABELS = 24  # largest number of labelled points
+_MAX_LETTERS = 24  # letters that fit below a picture
+# Hatches of cells without value.
 _HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW: ""}
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
-    """Writes those pictures that mean something for this study into the folder.
-
-    Returns:
-        Their files; of an earlier study of this folder none remain.
-    """
+    """Write the applicable pictures; remove earlier ones."""
     for old in out.glob("*.png"):
         old.unlink()
     measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
@@ -53,11 +54,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """The mean of each measure at each level of each factor; dotted, that of all levels.
-
-    Bars are intervals of the level's difference from the mean of all, which is what a factor does.
-    A level that cannot be compared is hatched.
-    """
+    """Draw the mean of each measure at each level; bars are effect intervals."""
     factors, fitted, reasons = varied(study), False, set[str]()
     with house_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -66,7 +63,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
         for line, measure in zip(grid, measures, strict=True):
             found = effects.main_effects(study, rows, measure)
             for axes, factor in zip(line, factors, strict=True):
-                _levels(axes, found[factor.field])
+                _draw_levels(axes, found[factor.field])
                 fitted |= found[factor.field].fitted
                 reasons |= set(found[factor.field].why)
             words = textwrap.wrap(measure.replace("_", "_ "), 18)
@@ -78,11 +75,11 @@ def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figur
     return figure
 
 
-def _levels(axes: Axes, found: effects.MainEffect) -> None:
+def _draw_levels(axes: Axes, found: effects.MainEffect) -> None:
     place = np.arange(len(found.names))
     bars = np.nan_to_num(found.effect_half)
     axes.errorbar(place, found.mean, bars, color=BLUE, marker="o", ms=3.5, capsize=3)
-    _name(axes, found.names)
+    _label_levels(axes, found.names)
     axes.set_xlim(-0.5, len(place) - 0.5)
     for level in place[np.isnan(found.mean)]:
         bar = _hatched(found.why[level], (level - 0.5, 0.0))
@@ -93,30 +90,27 @@ def _levels(axes: Axes, found: effects.MainEffect) -> None:
         axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", fontsize=8)
         return
     axes.axhline(np.nanmax(found.mean - found.effect), color=GREY, lw=0.8, ls=":")
-    axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+    axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
 
 
-def _name(axes: Axes, levels: list[str]) -> None:
+def _label_levels(axes: Axes, levels: list[str]) -> None:
     axes.set_xticks(range(len(levels)), levels)
-    if len("".join(levels)) > _WIDTH:
+    if len("".join(levels)) > _MAX_LETTERS:
         for label in axes.get_xticklabels():
             label.set(rotation=20, ha="right", rotation_mode="anchor")
 
 
-def _combinations(found: effects.MainEffect | effects.PairMeans) -> str:
-    """What is left of the other factors, if something is left out."""
+def _describe_combinations(found: effects.MainEffect | effects.PairMeans) -> str:
     if not found.left_out:
         return ""
     return f"over {found.compared} of {found.compared + found.left_out} combinations of the rest"
 
 
 def _hatched(why: str, corner: tuple[float, float]) -> Rectangle:
-    """A hatched cell of width and height 1."""
     return Rectangle(corner, 1.0, 1.0, hatch=_HATCHES[why], fc="white", ec=GREY, lw=0)
 
 
 def _legend(figure: Figure, reasons: Iterable[str]) -> None:
-    """Of the reasons for hatched cells, if there are any."""
     names = [why for why in _HATCHES if why in reasons and why != TOO_FEW]
     if names:
         patches = [_hatched(why, (0.0, 0.0)) for why in names]
@@ -124,10 +118,7 @@ def _legend(figure: Figure, reasons: Iterable[str]) -> None:
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """The mean of a measure over each pair of factors; None if there are too few points for it.
-
-    A cell without a value is hatched.
-    """
+    """Draw the mean of a measure over pairs of factors, or return None."""
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -142,11 +133,11 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
             for row, column in np.argwhere(np.isnan(found.mean)):
                 axes.add_patch(_hatched(found.why[row, column], (column - 0.5, row - 0.5)))
             axes.grid(False)
-            _name(axes, found.names[1])
+            _label_levels(axes, found.names[1])
             axes.set_yticks(range(len(found.names[0])), found.names[0])
             axes.set_xlabel(found.fields[1])
             axes.set_ylabel(found.fields[0])
-            axes.set_title(_combinations(found), fontsize=7, color=GREY, loc="right")
+            axes.set_title(_describe_combinations(found), fontsize=7, color=GREY, loc="right")
         for axes in grid.ravel()[len(maps) :]:
             axes.set_visible(False)
         figure.colorbar(drawn, ax=grid, label=measure)
@@ -157,7 +148,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
 
 
 def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Effort against task time and overshoot of the contact force; None if not measured."""
+    """Draw effort over time and force overshoot, or return None."""
     points = pareto(study, rows)
     if points is None or not points["complete"].any():
         return None
@@ -168,10 +159,10 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):
             axes.plot(points[name], points[PARETO[0]], "o", ms=3, color=GREY, alpha=0.5)
-            _bars(axes, on_front, name)
+            _draw_bars(axes, on_front, name)
             axes.set_xlabel(name)
             axes.set_ylabel(PARETO[0])
-        if on_front.height <= _LABELLED:
+        if on_front.height <= _MAX_LABELS:
             for place, point in enumerate(on_front.iter_rows(named=True), 1):
                 for axes, name in zip(figure.axes, PARETO[1:], strict=True):
                     axes.annotate(str(place), (point[name], point[PARETO[0]]), (4, 4),
@@ -189,7 +180,7 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     return figure
 
 
-def _bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
+def _draw_bars(axes: Axes, points: pl.DataFrame, name: str) -> None:
     half = [np.nan_to_num(points[f"{which}_half"].to_numpy()) for which in (name, PARETO[0])]
     axes.errorbar(
         points[name], points[PARETO[0]], half[1], half[0],

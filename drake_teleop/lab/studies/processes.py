@@ -1,9 +1,7 @@
-"""Where the runs of a study are worked off: processes of this machine, or Dask's workers.
+"""Execution of a study's runs by processes of this machine or Dask workers.
 
-A run that ends its process (a crash in compiled code, memory that is short) is known by the mark of
-its chunk, which nobody has taken away. It is then run alone, and if that process ends too, it is a
-row with an error like any other failure. In the study's own process (one job) such a crash ends the
-study, and the same command goes on behind it.
+A run that ends its process leaves the mark of its chunk. Its rows are then run alone; a row that
+ends its process again gets an error. With one job it ends the study.
 """
 
 from __future__ import annotations
@@ -22,62 +20,54 @@ from drake_teleop.common.errors import DrakeTeleopError, install_extra
 from drake_teleop.lab.studies.store import Store
 
 Chunk: TypeAlias = list[dict[str, Any]]
-"""Rows that go to a process together and come back with their measures."""
+"""Rows that one process runs together."""
 Run: TypeAlias = Callable[[Chunk], Chunk]
 
 
 @dataclass(frozen=True)
 class Processes:
-    """Where chunks are run.
-
-    Attributes:
-        count: of the processes.
-        rows_of: gives the rows of chunks, in the order in which they are done.
-    """
+    """Executor; `rows_of` yields chunks in the order of completion."""
 
     count: int
     rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
 
 
-DIED = "the run has ended its process"
-_LOOK = 0.5  # how often a process looks whether the study's is still there [s]
+PROCESS_ENDED = "the run has ended its process"
+_PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 
 @contextmanager
 def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processes]:
-    """Processes, for as long as the context lasts.
+    """Start processes for the duration of the context.
 
     Args:
-        store: of the study, for the marks.
-        jobs: processes on this machine, as joblib has it; 1 is this process.
-        cluster: address of a Dask scheduler, or "local" for one here with `jobs` workers.
+        jobs: processes as in joblib; 1 is this process.
+        cluster: address of a Dask scheduler, or "local".
 
     Raises:
-        DrakeTeleopError: if Dask is not installed or no scheduler answers; from the function, if
-            processes end before they begin.
+        DrakeTeleopError: without Dask or scheduler, or if processes end before their first run.
     """
     if cluster is None:
         from joblib import effective_n_jobs
 
         yield Processes(
-            effective_n_jobs(jobs),
-            lambda run, chunks: _on_this_machine(run, chunks, store, jobs),
+            effective_n_jobs(jobs), lambda run, chunks: _run_locally(run, chunks, store, jobs)
         )
         return
     with _client(cluster, jobs) as client:
         workers = sum(client.nthreads().values())
-        yield Processes(workers, lambda run, chunks: _on_a_cluster(run, chunks, client))
+        yield Processes(workers, lambda run, chunks: _run_on_cluster(run, chunks, client))
 
 
-def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
+def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> Iterator[Chunk]:
     left = list(chunks)
-    # A mark of an earlier session may be that of a kill; two at one chunk are suspicious.
+    # One mark may come from a killed session; two marks of one chunk indicate a crash.
     suspicious = 2
     while left:
         marked = store.marked(suspicious)
         for chunk in left:
             if chunk[0]["run"] in marked:
-                yield _alone(run, chunk, store)
+                yield _run_alone(run, chunk, store)
         left = [chunk for chunk in left if chunk[0]["run"] not in marked]
         done: set[int] = set()
         try:
@@ -87,22 +77,24 @@ def _on_this_machine(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int)
         except BrokenExecutor as error:
             suspicious = 1
             if not store.marked(suspicious):
-                raise DrakeTeleopError(f"processes end before they begin ({error})") from error
+                raise DrakeTeleopError(
+                    f"processes ended before their first run ({error})"
+                ) from error
         left = [chunk for chunk in left if chunk[0]["run"] not in done]
 
 
 def _parallel(jobs: int) -> Any:
     from joblib import Parallel
 
-    # joblib replaces processes that have grown; a crash is an error, not this warning.
+    # joblib also warns when it replaces grown processes; a crash raises an error.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     return Parallel(
         n_jobs=jobs,
         backend="loky",
         return_as="generator_unordered",
-        # No batches of chunks: at the end one process would have work and the others none.
+        # Batches of chunks would leave processes idle at the end.
         batch_size=1,
-        initializer=_watch,
+        initializer=_end_with_parent,
         initargs=(os.getpid(),),
     )
 
@@ -110,24 +102,23 @@ def _parallel(jobs: int) -> Any:
 def _task(run: Run, chunk: Chunk, store: Store) -> Any:
     from joblib import delayed
 
-    return delayed(_marked)(run, chunk, store)
+    return delayed(_run_marked)(run, chunk, store)
 
 
-def _alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    """The rows one by one, each the only thing that other processes do."""
+def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
+    """Run the rows one by one while no other row runs."""
     found = []
     for row in chunk:
         try:
-            # Two processes, because one would be this one.
+            # With one job joblib would run it in this process.
             found += next(_parallel(2)([_task(run, [row], store)]))
         except BrokenExecutor:
-            found.append(row | {"error": DIED})
+            found.append(row | {"error": PROCESS_ENDED})
     store.unmark(chunk[0]["run"])
     return found
 
 
-def _marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    """The chunk's rows; what ends the process leaves its mark."""
+def _run_marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
     store.mark(chunk[0]["run"])
     try:
         return run(chunk)
@@ -135,12 +126,12 @@ def _marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
         store.unmark(chunk[0]["run"])
 
 
-def _watch(parent: int) -> None:
-    """Ends this process when the study's own is gone, of which nobody tells after a SIGKILL."""
+def _end_with_parent(parent: int) -> None:
+    """End this process after a SIGKILL of its parent."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(_LOOK)
+            time.sleep(_PARENT_CHECK_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -148,15 +139,13 @@ def _watch(parent: int) -> None:
 
 @contextmanager
 def _client(address: str, jobs: int) -> Iterator[Any]:
-    """Dask's client. Not by joblib, whose backend for it waits for ever when a worker dies."""
+    """Yield Dask's client; joblib's Dask backend hangs when a worker dies."""
     try:
         import dask
         from distributed import Client
     except ImportError:
         raise DrakeTeleopError(
-            "Dask is not installed",
-            where="--cluster",
-            remedy=install_extra("cluster"),
+            "Dask is not installed", where="--cluster", remedy=install_extra("cluster")
         ) from None
     local = {
         "n_workers": jobs if jobs > 0 else None,
@@ -165,7 +154,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         "dashboard_address": "127.0.0.1:0",
     }
     settings = {
-        # A worker that dies takes no chunk along that was only waiting there.
+        # A dead worker must not take waiting chunks along.
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.scheduler.allowed-failures": 1,
     }
@@ -180,7 +169,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
             yield client
 
 
-def _on_a_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
+def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Chunk]:
     from distributed import as_completed
 
     futures = client.map(run, chunks, pure=False)
@@ -190,14 +179,14 @@ def _on_a_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[Ch
 
 
 def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
-    """The rows of a future; those of a chunk that ends its workers one by one."""
+    """Return a future's rows; rerun those of a killed chunk one by one."""
     from distributed import KilledWorker
 
     try:
         found: Chunk = future.result()
     except KilledWorker:
         if len(chunk) == 1:
-            return [chunk[0] | {"error": DIED}]
+            return [chunk[0] | {"error": PROCESS_ENDED}]
         alone = [(client.submit(run, [row], pure=False), [row]) for row in chunk]
         found = [row for part, rows in alone for row in _rows_of(part, rows, run, client)]
     return found

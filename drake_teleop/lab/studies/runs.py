@@ -1,4 +1,4 @@
-"""The runs of a study: from the design through the processes into the store."""
+"""Runs of a study, from the design through the processes into the store."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.common.progress import Progress, show_progress
@@ -27,25 +27,20 @@ from drake_teleop.lab.studies.store import Store, open_store
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 Work: TypeAlias = Callable[[Values, int], dict[str, float]]
-"""The measures of one run, from its factors' values and its seed.
+"""Function from factor values and seed to measures, and optionally `ONE_TIME_COST`."""
 
-Beside them it may give `ONCE`.
-"""
-
-ONCE = "seconds_once"
-"""How long a run took for what most others need not repeat, such as an identification [s]."""
+ONE_TIME_COST = "seconds_once"
+"""Time of a run for work that most others do not repeat, such as an identification [s]."""
 _SECONDS = "seconds"
 
-# A part of the store: what a kill costs, and what is handed to a process at once. Small next to
-# the study, so that at its end no process waits long for another; the first ones are of one run,
-# so that soon there is something to see, and to judge by how long the study will take.
+# A chunk is one part of the store and the work of a process. Chunks are small, so that no process
+# waits at the end. The first chunks have one run, for early results and time estimates.
 _LARGEST_CHUNK = 8
-_CHUNKS = 512
-_SINGLE = 64
-# So many of the last runs say how long the others will take.
-_RECENT = 16
+_NUM_CHUNKS = 512
+_NUM_SINGLE_RUNS = 64
+# Number of latest runs for the estimate of the remaining time.
+_NUM_RECENT_RUNS = 16
 
 
 def run_study(
@@ -58,104 +53,95 @@ def run_study(
     cluster: str | None = None,
     progress: bool = True,
 ) -> pl.DataFrame:
-    """Runs what the folder does not hold yet of a study.
+    """Run all runs that the folder lacks; return all rows, sorted by run.
 
     Args:
-        study: that was checked.
-        out: the folder.
-        work: one run; it goes to other processes, so it can be pickled.
-        basis: what its results depend on beside the study, for JSON.
-        jobs, cluster, progress: as for `study_command`.
-
-    Returns:
-        All rows, sorted by run.
+        work: picklable function of one run.
+        basis: JSON data of all further inputs.
 
     Raises:
-        DrakeTeleopError: as `study_command`, or if no process begins.
-        KeyboardInterrupt: saying what is kept.
+        DrakeTeleopError: as `study_command`.
+        KeyboardInterrupt: with the number of stored runs.
     """
     points = study.points()
     first_rows = study.rows(points)
     digest = hashlib.sha256(json.dumps(first_rows).encode()).hexdigest()
     identity = dataclasses.asdict(study) | basis | {"design_sha256": digest, "version": __version__}
-    identity |= {"single_runs": _SINGLE}  # a chunk is known by its first run alone
+    identity |= {"single_runs": _NUM_SINGLE_RUNS}  # chunks are identified by their first run
     schema = _schema(study, first_rows[0])
     run = partial(_run_chunk, work, [factor.field for factor in study.factors])
     with open_store(out, identity) as store:
-        told = Told(study.size() * study.repeats)
+        counter = StudyProgress(study.size() * study.repeats)
         try:
             with show_progress(progress) as stage, processes(store, jobs, cluster) as workers:
-                told.start(stage("Study"), workers.count)
+                counter.start(stage("Study"), workers.count)
                 new = points
                 while new:
-                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, told)
+                    chunks = _chunks(study.rows(new, len(points) - len(new)), store, counter)
                     for found in workers.rows_of(run, chunks):
-                        _keep(store, found, schema)
-                        told.more(found)
+                        _store_rows(store, found, schema)
+                        counter.add_finished_runs(found)
                     new = study.next_points(points, _objective(study, store, len(points)))
                     points += new
         except (KeyboardInterrupt, CannotWrite) as error:
-            kept = f"{out} keeps {told.done} of {told.total} runs; the same command goes on"
+            remedy = (
+                f"{out} keeps {counter.done} of {counter.total} runs; the same command continues"
+            )
             if isinstance(error, CannotWrite):
-                raise DrakeTeleopError(str(error), remedy=kept) from error
-            raise KeyboardInterrupt(kept) from error
+                raise DrakeTeleopError(str(error), remedy=remedy) from error
+            raise KeyboardInterrupt(remedy) from error
         return store.read()
 
 
-def _chunks(rows: Chunk, store: Store, told: Told) -> list[Chunk]:
-    """The chunks of some runs that the store does not hold yet."""
-    size = min(max(len(rows) // _CHUNKS, 1), _LARGEST_CHUNK)
-    chunks = [[row] for row in rows[:_SINGLE]]
-    chunks += [rows[first : first + size] for first in range(_SINGLE, len(rows), size)]
+def _chunks(rows: Chunk, store: Store, counter: StudyProgress) -> list[Chunk]:
+    size = min(max(len(rows) // _NUM_CHUNKS, 1), _LARGEST_CHUNK)
+    chunks = [[row] for row in rows[:_NUM_SINGLE_RUNS]]
+    chunks += [rows[first : first + size] for first in range(_NUM_SINGLE_RUNS, len(rows), size)]
     finished = store.finished()
     left = [chunk for chunk in chunks if chunk[0]["run"] not in finished]
-    told.found(len(rows) - sum(map(len, left)))
+    counter.add_earlier_runs(len(rows) - sum(map(len, left)))
     return left
 
 
 def _objective(study: Study, store: Store, points: int) -> Array:
-    """(points,) the mean of the objective at each of the first points; nan where no run has one."""
+    """Return (points,) mean objective; nan where missing."""
     if not study.objective:
         return np.empty(0)
     import polars as pl
 
-    # What is not a number is no measure, but would be of all the mean.
+    # One NaN would make the whole mean NaN.
     value = pl.col(study.objective).fill_nan(None).mean()
     means = store.read().filter(pl.col("point") < points).group_by("point").agg(value).sort("point")
     return means[study.objective].cast(pl.Float64).fill_null(float("nan")).to_numpy()
 
 
-class Told:
-    """Tells the progress bar how many runs are done, and how long the others will take."""
+class StudyProgress:
+    """Number of finished runs and remaining time of a study."""
 
     def __init__(self, total: int) -> None:
-        self.total, self.done, self._told = total, 0, 0
-        self._recent: deque[float] = deque(maxlen=_RECENT)
+        self.total, self.done, self._num_timed = total, 0, 0
+        self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
     def start(self, progress: Progress, processes: int) -> None:
-        """Begins, with so many runs at once."""
+        """Set the progress bar and the number of processes."""
         self._progress, self._processes = progress, processes
 
-    def found(self, runs: int) -> None:
-        """Runs that were done before."""
+    def add_earlier_runs(self, runs: int) -> None:
+        """Count runs of an earlier session."""
         self.done += runs
-        self._tell()
+        self._report()
 
-    def more(self, rows: Chunk) -> None:
-        """Runs that were done now, with the time that each took.
-
-        The last ones count. Of the first ones that does not which is done once; if it is done
-        again and again, the later ones tell.
-        """
+    def add_finished_runs(self, rows: Chunk) -> None:
+        """Count finished runs; the first ones without their one-time work."""
         self.done += len(rows)
         for row in rows:
-            if _SECONDS in row:  # one that ended its process does not say
-                first = self._told < _RECENT
-                self._recent.append(row[_SECONDS] - (row.get(ONCE, 0.0) if first else 0.0))
-                self._told += 1
-        self._tell()
+            if _SECONDS in row:  # missing if the run ended its process
+                first = self._num_timed < _NUM_RECENT_RUNS
+                self._recent.append(row[_SECONDS] - (row.get(ONE_TIME_COST, 0.0) if first else 0.0))
+                self._num_timed += 1
+        self._report()
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         left, words = self.total - self.done, "the first runs begin"
         if self._recent:
             at_once = min(self._processes, left) or 1
@@ -171,7 +157,6 @@ def _duration(seconds: float) -> str:
 def _run_chunk(
     work: Work, names: Sequence[str], rows: Sequence[dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The rows with their measures, or with the reason why a run has none."""
     found = []
     with one_blas_thread():
         for row in rows:
@@ -181,14 +166,14 @@ def _run_chunk(
                 measures: dict[str, Any] = work(values, row["seed"])
             except DrakeTeleopError as error:
                 measures = {"error": str(error)}
-            except Exception as error:  # whatever it is, the other runs go on
+            except Exception as error:  # other runs must continue
                 measures = {"error": " ".join(f"{type(error).__name__}: {error}".split())}
-            # Not for the table: no two sessions would have the same bytes.
+            # Not stored in the table, which must be reproducible.
             found.append(row | measures | {_SECONDS: time.monotonic() - start})
     return found
 
 
-def _keep(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
+def _store_rows(store: Store, rows: list[dict[str, Any]], schema: dict[str, Any]) -> None:
     import polars as pl
 
     columns = {name: [row.get(name) for row in rows] for name in schema}

@@ -1,26 +1,7 @@
-"""`drake-teleop scaling-study`: how to scale forces, for the simulated operator.
+"""`drake-teleop scaling-study`: best force scales for the simulated operator.
 
-The paper ends with that question. Four tasks are studied over sigma and gamma (free reaching, to
-which gamma does nothing; a contact transition; pressing with a set force; a peg into a slot), and
-eta for a contact transition with an object in the gripper: the files `scaling_*.yaml`.
-
-What is best depends on what counts. Each criterion is the mean over the runs of a point, as a part
-of its value at the reference sigma = gamma = 1, where the hand feels everything as it is. The merit
-of a point is their mean over criteria and tasks: below 1 it is better than the reference. Seeds are
-drawn with replacement, the same for all points, to see how sure the choice is: the interval of the
-merit, and how often a point is the best one. A point at which more than one run in twenty fails is
-no choice.
-
-The folder holds the studies' folders, and
-
-=========== =====================================================================================
-answer.json for each way of counting: the best sigma and gamma, its merit with the 95 % interval,
-            how often it is the best, and all points that are the best in one draw of twenty; and
-            what eta does
-answer.csv  each point's merit by each way of counting, with intervals
-answer.png  the criteria over sigma and gamma
-choice.png  the merit, and how often each point is the best
-=========== =====================================================================================
+The merit of a point is its mean criterion relative to sigma = gamma = 1 over tasks. Bootstrap over
+seeds gives intervals and the share of draws in which a point is best (docs/scaling-study.md).
 """
 
 from __future__ import annotations
@@ -34,8 +15,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.style import COLOURS, Picture, house_style
 from drake_teleop.common.writing import (
     make_folder,
@@ -51,32 +32,27 @@ from drake_teleop.lab.studies.study import LoadStudy, study_command
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
 
-CRITERIA = {
-    "effort": "effort_Ns",
-    "time": "task_time_s",
-    "force": "contact_force_overshoot_N",
-}
-#: Ways of counting: the criteria that count, each as much as the others.
-WAYS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
+CRITERIA = {"effort": "effort_Ns", "time": "task_time_s", "force": "contact_force_overshoot_N"}
+#: Selections of equally weighted criteria.
+SELECTIONS = {"all": tuple(CRITERIA), **{name: (name,) for name in CRITERIA}}
 TASKS = {"reach": ("effort", "time")} | dict.fromkeys(("touch", "press", "insert"), tuple(CRITERIA))
-"""The criteria of each task: nothing is touched in free reaching."""
-_OBJECT = "scaling_object"
+"""Criteria of each task; free reaching has no contact."""
+_OBJECT_STUDY = "scaling_object"
 _SIGMA, _GAMMA, _ETA = (f"force_scaling.{name}" for name in ("sigma", "gamma", "eta"))
-_DRAWS, _SEED = 2000, 0
-_FAILURES, _SELDOM = 0.05, 0.05
+_NUM_DRAWS, _SEED = 2000, 0
+_MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the rows say for one way of counting.
+    """Result for one selection of criteria, (s, g) for each sigma and gamma.
 
     Attributes:
-        merit: (s, g) of each sigma and gamma, 1 at the reference; nan where too many runs fail.
-        low, high: (s, g) its 95 % interval.
-        best: (s, g) in what part of the draws a point is the best.
-        failures: (s, g) what part of the runs fails, in the task in which most do.
+        merit: nan with too many failures.
+        low, high: its 95 % interval.
+        best: share of draws in which the point is the best.
+        failures: share of failed runs in the worst task.
     """
 
     merit: Array
@@ -96,19 +72,10 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Runs the studies, or what is left of them, and answers.
-
-    Args:
-        out: the folder.
-        jobs, cluster, yes, quiet, progress: as for `study_command`.
-        repeats: of each point, instead of the studies' own.
-
-    Returns:
-        What answer.json holds.
-    """
+    """Run the remaining runs of all studies; write and return the answer."""
     make_folder(out)
     rows = {}
-    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT):
+    for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):
         study_command(
             name, out / name, jobs=jobs, cluster=cluster, repeats=repeats, quiet=quiet,
             progress=progress, yes=yes,
@@ -116,14 +83,16 @@ def scaling_study_command(
         rows[name] = Store(out / name / "runs.parquet").read()
     tables = {task: _tables(rows[f"scaling_{task}"], task) for task in TASKS}
     sigmas, gammas = _axes()
-    answers = {way: answer(tables, criteria) for way, criteria in WAYS.items()}
+    answers = {selection: answer(tables, criteria) for selection, criteria in SELECTIONS.items()}
     summary = {
         "runs": sum(table.height for table in rows.values()),
-        "choice": {way: _chosen(found, sigmas, gammas) for way, found in answers.items()},
-        "eta": _eta(rows[_OBJECT]),
+        "choice": {
+            selection: _choice(found, sigmas, gammas) for selection, found in answers.items()
+        },
+        "eta": _eta_effects(rows[_OBJECT_STUDY]),
     }
     with output_folder(out, "answer.json"):
-        write_table(out / "answer.csv", _merits(answers, sigmas, gammas))
+        write_table(out / "answer.csv", _merit_table(answers, sigmas, gammas))
         write_picture(out / "answer.png", criteria_picture(rows, sigmas, gammas))
         write_picture(out / "choice.png", choice_picture(answers, sigmas, gammas))
         write_json(out / "answer.json", summary)
@@ -133,27 +102,25 @@ def scaling_study_command(
 
 
 def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
-    """The merit of each point.
+    """Return merits, bootstrap intervals and failures.
 
     Args:
-        tables: of each task, each criterion and "success": (s, g, seeds), nan where a run failed;
-            the last sigma and the gamma named by `_reference` are the reference.
-        criteria: those that count.
+        tables: for each task and criterion, and "success": (s, g, seeds), nan where failed.
     """
-    # Of a task nothing may count.
+    # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
     count = next(iter(tables.values()))["success"].shape[-1]
-    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _DRAWS)
+    draws = np.random.default_rng(_SEED).multinomial(count, np.full(count, 1 / count), _NUM_DRAWS)
     weights = np.vstack([np.ones(count), draws]).astype(float)
     parts = [
-        np.mean([_relative(tables[task][name], weights) for name in names], axis=0)
+        np.mean([_relative_means(tables[task][name], weights) for name in names], axis=0)
         for task, names in counted.items()
         if names
     ]
     merits = np.mean(parts, axis=0)
     failures = np.max([1 - t["success"].mean(axis=-1) for t in tables.values()], axis=0)
-    usable = failures <= _FAILURES
-    # Seeds at which the reference failed say nothing alone.
+    usable = failures <= _MAX_FAILURE_SHARE
+    # Draws in which the reference has no successful run are undefined.
     known = np.isfinite(merits[:, usable]).all(axis=1)
     merits[:, ~usable] = np.nan
     drawn, best = merits[1:][known[1:]], np.zeros(usable.size)
@@ -166,8 +133,8 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
     return Answer(merits[0], low, high, best.reshape(usable.shape), failures)
 
 
-def _relative(table: Array, weights: Array) -> Array:
-    """(draws, s, g) weighted means over the seeds (s, g, seeds), as parts of the reference's."""
+def _relative_means(table: Array, weights: Array) -> Array:
+    """Return (draws, s, g) weighted means relative to the reference."""
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
@@ -185,7 +152,6 @@ def _reference() -> int:
 
 
 def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
-    """(s, g, seeds) of each criterion and of success; without gamma the same for each."""
     sigmas, gammas = _axes()
     seeds = rows["seed"].n_unique()
     count = len(gammas) if _GAMMA in rows.columns else 1
@@ -200,11 +166,11 @@ def _tables(rows: pl.DataFrame, task: str) -> dict[str, Array]:
     return tables
 
 
-def _chosen(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
+def _choice(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str, Any] | None:
     if not np.isfinite(found.merit).any():
         return None
     s, g = np.unravel_index(np.nanargmin(found.merit), found.merit.shape)
-    near = np.argwhere(found.best >= _SELDOM)
+    near = np.argwhere(found.best >= _MIN_BEST_SHARE)
     return {
         "sigma": sigmas[s],
         "gamma": gammas[g],
@@ -219,13 +185,15 @@ def _chosen(found: Answer, sigmas: list[float], gammas: list[float]) -> dict[str
     }
 
 
-def _merits(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> pl.DataFrame:
+def _merit_table(
+    answers: dict[str, Answer], sigmas: list[float], gammas: list[float]
+) -> pl.DataFrame:
     import polars as pl
 
     return pl.DataFrame(
         [
             {
-                "way": way,
+                "way": selection,
                 "sigma": sigma,
                 "gamma": gamma,
                 "merit": found.merit[i, j],
@@ -233,15 +201,14 @@ def _merits(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]
                 "high": found.high[i, j],
                 "best_in": found.best[i, j],
             }
-            for way, found in answers.items()
+            for selection, found in answers.items()
             for i, sigma in enumerate(sigmas)
             for j, gamma in enumerate(gammas)
         ]
     )
 
 
-def _eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
-    """Each criterion's mean at each eta, with its interval and that of the effect of eta."""
+def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
     etas = sorted(rows[_ETA].unique().to_list())
     levels = np.array([etas.index(value) for value in rows[_ETA]])
     seeds = rows["seed"].to_numpy()
@@ -258,7 +225,7 @@ def _eta(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def criteria_picture(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    """Each criterion over sigma, a line for each gamma; bars: intervals against the mean of all."""
+    """Draw each criterion over sigma, a line for each gamma."""
     tasks = [task for task in TASKS if "force" in TASKS[task]]
     with house_style():
         figure = Picture(figsize=(10.0, 7.6))
@@ -283,20 +250,17 @@ def criteria_picture(
 
 
 def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
-    """The merit over sigma and gamma for each way of counting, all in the same colours.
-
-    In the cells stand the merit and how often a point is the best, or how many runs fail.
-    """
+    """Draw the merit over sigma and gamma."""
     known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
     farthest = np.abs(np.log2(known)).max(initial=0.01)
-    # As far from 1 below as above, in ratios; the cell of a point that is no choice is grey.
+    # Symmetric about 1 in ratios; excluded points are grey.
     ends = 2.0**-farthest, 2.0**farthest
     scale = LogNorm(*ends)
     colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
     with house_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
-        for axes, (way, found) in zip(grid.ravel(), answers.items(), strict=True):
+        for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):
             drawn = axes.imshow(
                 found.merit, origin="lower", aspect="auto", cmap=colours, norm=scale
             )
@@ -305,11 +269,10 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
             axes.set_yticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
             axes.set_xlabel("$\\gamma$")
             axes.set_ylabel("$\\sigma$")
-            axes.set_title(f"counts: {way}")
+            axes.set_title(f"counts: {selection}")
             for i, j in np.ndindex(found.merit.shape):
-                # White on what is dark.
                 dark = abs(scale(found.merit[i, j]) - 0.5) > 0.3
-                axes.text(j, i, _cell(found, i, j), color="white" if dark else "black",
+                axes.text(j, i, _cell_text(found, i, j), color="white" if dark else "black",
                           ha="center", va="center", fontsize=7.5)  # fmt: skip
         bar = figure.colorbar(drawn, ax=grid, label="merit; below 1 is better than feeling all")
         ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if ends[0] <= tick <= ends[1]]
@@ -320,7 +283,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
     return figure
 
 
-def _cell(found: Answer, i: int, j: int) -> str:
+def _cell_text(found: Answer, i: int, j: int) -> str:
     if not np.isfinite(found.merit[i, j]):
         return f"{found.failures[i, j]:.0%} fail"
     best = f"\nbest: {found.best[i, j]:.0%}" if found.best[i, j] >= 0.005 else ""
@@ -332,11 +295,11 @@ def _print(summary: dict[str, Any], out: Path) -> None:
     from rich.table import Table
 
     table = Table("what counts", "sigma", "gamma", "merit", "95 %", "best in")
-    for way, found in summary["choice"].items():
+    for selection, found in summary["choice"].items():
         if found is not None:
             low, high = found["interval"]
             table.add_row(
-                way, f"{found['sigma']:g}", f"{found['gamma']:g}", f"{found['merit']:.3f}",
+                selection, f"{found['sigma']:g}", f"{found['gamma']:g}", f"{found['merit']:.3f}",
                 f"{low:.3f} to {high:.3f}", f"{found['best_in']:.0%}",
             )  # fmt: skip
     console = Console()

@@ -1,7 +1,6 @@
-"""The rows of a study on disk: complete or absent, whenever a process dies.
+"""Rows of a study on disk, complete or absent after a crash.
 
-A folder `runs.parquet` of parts is one table for polars, DuckDB and others. A part holds the rows
-of one chunk of runs and is named after the first: a chunk that is run again replaces itself.
+The folder `runs.parquet` is one table; each part is named after its first run.
 """
 
 from __future__ import annotations
@@ -27,24 +26,19 @@ _PART = "run_{:08d}.parquet"
 
 @dataclass(frozen=True)
 class Store:
-    """The rows of one study.
-
-    Args:
-        folder: of the parts.
-    """
+    """Rows of one study in a folder of parts."""
 
     folder: Path
 
     def finished(self) -> set[int]:
-        """The first runs of the chunks that are complete."""
+        """Return the first runs of the complete chunks."""
         return set(map(_first_run, self._parts()))
 
     def _parts(self) -> list[Path]:
-        """The parts in order; other files in the folder are ignored."""
         return sorted(self.folder.glob(_PART.format(0).replace("0", "[0-9]")))
 
     def remove_damaged_parts(self) -> None:
-        """Remove parts that cannot be read or are empty, so that their runs are repeated."""
+        """Remove unreadable or empty parts."""
         parts = self._parts()
         whole = _runs_in(parts)
         for part in parts:
@@ -52,11 +46,11 @@ class Store:
                 part.unlink()
 
     def write(self, rows: pl.DataFrame) -> None:
-        """Adds the rows of one chunk; column "run" of the first one gives the part's name."""
+        """Write the rows of one chunk."""
         write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
     def mark(self, run: int) -> None:
-        """Notes that the chunk with this first run is under way, once more."""
+        """Count one more start of a chunk."""
         path = self._marks / str(run)
         with naming(path):
             self._marks.mkdir(exist_ok=True)
@@ -64,11 +58,11 @@ class Store:
                 mark.write(b".")
 
     def unmark(self, run: int) -> None:
-        """Takes its marks away, if it has any."""
+        """Remove the mark of a chunk."""
         (self._marks / str(run)).unlink(missing_ok=True)
 
     def marked(self, times: int) -> set[int]:
-        """The first runs of the chunks that were so often under way when their process ended."""
+        """Return the unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
@@ -77,10 +71,10 @@ class Store:
         return self.folder.with_name("running")
 
     def read(self) -> pl.DataFrame:
-        """All rows, sorted by run."""
+        """Return all rows, sorted by run."""
         import polars as pl
 
-        remedy = "remove the part that is damaged; the same command makes it anew"
+        remedy = "remove the damaged part and repeat the command"
         parts = self._parts()
         for part in parts:
             with reading(part, remedy):
@@ -94,7 +88,7 @@ def _first_run(part: Path) -> int:
 
 
 def _runs_in(parts: list[Path]) -> set[int]:
-    """The runs that some parts hold; none if one of the parts cannot be read."""
+    """Return the runs of some parts; empty if one is unreadable."""
     import polars as pl
 
     if parts:
@@ -107,30 +101,29 @@ def _runs_in(parts: list[Path]) -> set[int]:
 
 @contextmanager
 def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
-    """The store in a folder, for this process alone, new or with the rows that it has.
+    """Open the store of a folder for this process alone.
 
     Args:
-        out: the folder; gets study.json and runs.parquet.
-        identity: all that the rows depend on, for JSON.
+        identity: JSON data of all inputs of the rows.
 
     Raises:
-        DrakeTeleopError: if the folder holds the rows of something else, or is in use.
+        DrakeTeleopError: if the folder contains other rows, or is in use.
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
     with claimed(out, identity):
         store.remove_damaged_parts()
         yield store
-        with suppress(OSError):  # not there, or with marks in it
+        with suppress(OSError):  # missing, or with marks
             store._marks.rmdir()
 
 
 @contextmanager
 def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Keeps a folder, which is there, for this process and for what `identity` says it holds.
+    """Lock an existing folder for this process and the content `identity`.
 
     Raises:
-        DrakeTeleopError: if the folder holds something else, or is in use.
+        DrakeTeleopError: if the folder contains something else, or is in use.
     """
     handle = os.open(out, os.O_RDONLY)
     try:
@@ -142,12 +135,11 @@ def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
 
 
 def _lock(handle: int, out: Path) -> None:
-    """The kernel takes the lock back from a process that dies, however it dies."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise DrakeTeleopError(
-            "another process runs a study there", where=str(out), remedy="wait for it, or stop it"
+            "is in use by another process", where=str(out), remedy="wait for it, or stop it"
         ) from None
 
 
@@ -158,7 +150,7 @@ def _check_identity(out: Path, identity: dict[str, Any]) -> None:
         write_text(path, text)
     elif path.read_bytes() != text.encode():
         raise DrakeTeleopError(
-            "holds the runs of another study, or of another version of this one",
+            "contains runs of another study, or of another version of this one",
             where=str(out),
             remedy="give another folder, or remove this one",
         )

@@ -1,41 +1,15 @@
-"""`drake-teleop study STUDY.yaml`: one scenario over a design of its fields, as a table of runs.
-
-A study file::
-
-    scenario: contact_transition         # shipped, or a file beside the study's
-    factors:
-      - {field: force_scaling.sigma, values: [0.0, 0.5, 1.0]}
-      - {field: force_scaling.gamma, low: 0.5, high: 2.0}
-      - {field: wrist_sensor.preset, words: [ideal, jr3_85m35a3]}
-    design: sobol
-    samples: 64
-    repeats: 3
-
-A factor of one value sets a field for all runs; beside numbers there are words, flags (true, false)
-and vectors. Every run follows the rule of `drake-teleop run`; runs with the same slave, sensor and
-seed share one identification of the load (`identified_load.py`). An adaptive design looks for the
-point whose `objective` is smallest, in batches that follow from the rows of those before.
-
-The folder holds
+"""`drake-teleop study STUDY.yaml`: runs of one scenario over a design of its fields.
 
 ============ =====================================================================================
-study.json   all that the rows depend on
-runs.parquet a folder of parts, one table: run (the key, its place in the design), point, repeat,
-             seed, a column for each factor and each measure, and error: why a run failed; its
-             measures are then null
-summary.json runs, failed, and of each measure mean, least and largest
-effects.csv  of each level of each factor: its successful runs, mean of each measure, effect (its
-             difference from the mean of all levels), and half the widths of their 95 % intervals:
-             over the seeds, and if the design is not factorial over the design; over how many
-             combinations of the other factors' levels, how many were left out, and why a level has
-             no value, see `effects.py`
-pictures     main_effects, interactions of two factors, and the front of effort against task time
-             and overshoot of the contact force, as far as the study has what they show
+study.json   all inputs of the rows
+runs.parquet folder of parts, one table: run, point, repeat, seed, a column for each factor and
+             measure, and error: reason of a failed run
+summary.json number of runs and failed runs; mean, least and largest of each measure
+effects.csv  mean and effect of each level, with half widths of 95 % intervals
+pictures     main effects, interactions of two factors, Pareto front
 ============ =====================================================================================
 
-A study that was stopped or killed goes on where it was when the same command is given again. The
-rows are the same bytes for any number of processes, here or on a cluster. A run that ends its
-process is a failed run; only if there is one process for all does it end the study, too.
+A stopped study continues with the same command.
 """
 
 from __future__ import annotations
@@ -48,8 +22,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
 from drake_teleop.common.errors import DrakeTeleopError, expect, meant
@@ -62,23 +34,20 @@ from drake_teleop.lab.studies.design import Factor, Study, Values
 from drake_teleop.lab.studies.effects import effects
 from drake_teleop.lab.studies.measures import measured
 from drake_teleop.lab.studies.pictures import write_pictures
-from drake_teleop.lab.studies.runs import ONCE, run_study
+from drake_teleop.lab.studies.runs import ONE_TIME_COST, run_study
 from drake_teleop.station.scenario import ReadScenario, Scenario, ScenarioFromData, ScenarioNames
 
 if TYPE_CHECKING:
     import polars as pl
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class StationWork:
-    """One run of the station: what `run_study` hands to the processes.
+    """One run of the station.
 
     Args:
-        data: of the base scenario's file.
-        where: the file's name for messages.
-        measures: by name.
+        data: content of the base scenario's file.
+        where: name of that file, for messages.
         threshold: force [N] of time_above_force_s.
     """
 
@@ -88,18 +57,18 @@ class StationWork:
     threshold: float
 
     def scenario(self, values: Values, seed: int) -> Scenario:
-        """The scenario of one run."""
+        """Return the scenario of one run."""
         changes = values | {"simulation.seed": seed}
-        return ScenarioFromData(_changed(self.data, changes), self.where)
+        return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """The measures of one run, and what another run with its load would not wait for [s]."""
+        """Return the measures of one run, and the time of one-time work [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
-        once = time.monotonic() - start - simulated / run.real_time_factor
+        one_time_s = time.monotonic() - start - simulated / run.real_time_factor
         found = measured(run.result, scenario, self.measures, self.threshold)
-        return found | {ONCE: max(once, 0.0)}
+        return found | {ONE_TIME_COST: max(one_time_s, 0.0)}
 
 
 def study_command(
@@ -113,30 +82,23 @@ def study_command(
     repeats: int | None = None,
     yes: bool | Callable[[str], bool] = False,
 ) -> dict[str, Any]:
-    """Runs a study, or what is left of it.
+    """Run the remaining runs of a study; write summary, effects and pictures.
 
     Args:
-        path: the study's file, or the name of one that is shipped.
-        out: the folder.
-        jobs: processes at once on this machine; -1: one for each core.
-        cluster: address of a Dask scheduler instead, or "local" for one of this machine's own.
-        quiet: no progress bar and no table.
-        progress: False for no progress bar alone.
-        repeats: instead of the file's.
-        yes: whether more than 1e5 runs are meant; or what answers that, if there are so many.
-
-    Returns:
-        The summary, see the top of this module.
+        path: study file, or the name of a shipped study.
+        jobs: number of processes; -1: one for each core.
+        cluster: address of a Dask scheduler, or "local".
+        repeats: replaces the value of the file.
+        yes: True permits more than 1e5 runs; or a function that answers.
 
     Raises:
-        DrakeTeleopError: for a bad file, too many runs, a folder of another study or that cannot
-            be written, or Dask that is not installed.
-        KeyboardInterrupt: saying what is kept.
+        DrakeTeleopError: for a wrong file, too many runs, another study's folder, or missing Dask.
+        KeyboardInterrupt: with the number of stored runs.
     """
     study, path = LoadStudy(path), study_file(path)
     study.repeats = repeats or study.repeats
     study.check_size(str(path), yes)
-    data, where = ReadScenario(_scenario_of(study, path))
+    data, where = ReadScenario(_scenario_path(study, path))
     ScenarioFromData(data, where)
     for index, factor in enumerate(study.factors):
         _check_values(factor, f"{path}:factors[{index}]")
@@ -154,10 +116,10 @@ def study_command(
 
 
 def study_file(name_or_path: str | Path) -> Path:
-    """The file of a study that is shipped, by its name, or the path as it is.
+    """Return the file of a shipped study, or the path itself.
 
     Raises:
-        DrakeTeleopError: if there is neither.
+        DrakeTeleopError: if neither exists.
     """
     expect((str, Path), name_or_path, "study")
     shipped = studies_dir() / f"{name_or_path}.yaml"
@@ -172,13 +134,10 @@ def study_file(name_or_path: str | Path) -> Path:
 
 
 def LoadStudy(path: str | Path) -> Study:
-    """Loads and checks a study's file; its factors are checked when the scenario is known.
-
-    Args:
-        path: or the name of one that is shipped.
+    """Load and check a study file, except its factors.
 
     Raises:
-        DrakeTeleopError: naming file and field of what is wrong.
+        DrakeTeleopError: with file and field.
     """
     path = study_file(path)
     data = read_yaml(path)
@@ -188,22 +147,22 @@ def LoadStudy(path: str | Path) -> Study:
     return study
 
 
-def _scenario_of(study: Study, path: Path) -> str | Path:
+def _scenario_path(study: Study, path: Path) -> str | Path:
     known = study.scenario in ScenarioNames()
     return study.scenario if known else path.parent / study.scenario
 
 
 def _check_values(factor: Factor, where: str) -> None:
-    """Checks each value by itself: whether it goes with the others is known in a run."""
+    """Check each value alone; combinations are checked in the runs."""
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
-        data = _changed({}, {factor.field: value})
+        data = _with_changes({}, {factor.field: value})
         check_structure(Scenario, data, where)
         check_ranges(yaml_load_typed(schema=Scenario, data=yaml_dump(data)), where)
 
 
-def _changed(data: Any, changes: dict[str, Any]) -> Any:
-    """A copy of a scenario's data with some fields, `block.field`, changed or added."""
+def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
+    """Return a copy of a scenario's data with changed fields (`block.field`)."""
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")
@@ -212,7 +171,7 @@ def _changed(data: Any, changes: dict[str, Any]) -> Any:
             if not isinstance(inner.get(block), dict):
                 inner[block] = {}
             inner = inner[block]
-        # Fields that are whole numbers take no 3.0; those that are not take a 3.
+        # Integer fields reject 3.0; float fields accept 3.
         whole = isinstance(value, float) and value.is_integer()
         inner[last] = int(value) if whole else value
     return data

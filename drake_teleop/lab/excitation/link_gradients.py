@@ -1,15 +1,7 @@
-"""Gradients of whatever depends on the motion of a serial arm's links, in one sweep.
+"""Gradients of functions of a serial arm's link motions in one sweep (T48, T49).
 
-It goes from the hand to the base, as the adjoint of the forward recursion of `slave/arm.py`.
-
-A scalar J depends on each link's motion ``[s, omega, alpha, p, R]`` (world coordinates). Its
-derivatives with respect to them are the seeds; the one with respect to R is the vector g of
-``dJ = g . dtheta`` for a rotation dtheta of the link. `pull_back` turns seeds into dJ/dq, dJ/dqd
-and dJ/dqdd.
-
-Joint torques need no second recursion: the weighted sum of torques ``c . tau`` is the power of the
-links' wrenches (f, n) under the joint velocities c (virtual power), so the same sweep carries it,
-with the velocities (v, w) of the links under c as two more variables.
+The sweep is the adjoint of the recursion of `slave/arm.py`. Seeds are the derivatives of a scalar J
+by each link's motion ``[s, omega, alpha, p, R]`` in W; for R it is g of ``dJ = g . dtheta``.
 """
 
 from __future__ import annotations
@@ -32,26 +24,26 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.slave.arm import MOTION_SIZE, SLIDES
 
-#: Of a link's seeds: s, omega, alpha, p, theta, and v, w of virtual power.
+#: Seeds of a link: s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
 _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 
 @njit(cache=True)
 def to_world(motion, a):
-    """R a, with the R of a link's motion (21,); a and the result are triples."""
+    """Return R a, with R of a motion (21,); a is a triple."""
     return apply(nine(motion, 12), a)
 
 
 @njit(cache=True)
 def to_link(motion, a):
-    """R^T a."""
+    """Return R^T a."""
     return apply(transposed(nine(motion, 12)), a)
 
 
 @njit(cache=True)
 def seed_vector(motion, place, gradient, seed):
-    """J depends on s, omega or alpha (`place` 0, 3, 6) as expressed in the link's own frame."""
+    """Add the seed of s, omega or alpha (`place` 0, 3, 6) in the link's frame."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, three(motion, place)))
@@ -59,19 +51,17 @@ def seed_vector(motion, place, gradient, seed):
 
 @njit(cache=True)
 def seed_point(motion, point, gradient, seed):
-    """J depends on the position in W of a point (3,) fixed to the link; `gradient` is in W."""
+    """Add the seed of a point (3,) fixed to the link; `gradient` is in W."""
     add_into(seed, _P, gradient)
     add_into(seed, _THETA, cross(to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """J depends on the wrench, Eqs. (1)-(2), that moves phi about the link's origin, in the link.
+    """Add the seed of the wrench, Eqs. (1)-(2), of `phi` about the link's origin.
 
     Args:
-        motion: (21,) of the link.
-        phi: (10,) of the body.
-        g_force, g_torque: dJ/df and dJ/dtau, triples in the link's frame.
+        g_force, g_torque: triples in the link's frame.
         seed: (21,), added to.
     """
     s = to_link(motion, three(motion, _S))
@@ -80,7 +70,7 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
     lever = cross(g_torque, h)
     gs = plus(times(phi[0], g_force), lever)
     ga = plus(cross(h, g_force), apply(inertia, g_torque))
-    # f holds w x (w x h), tau holds w x (I w).
+    # Terms of f: w x (w x h); of tau: w x (I w).
     gw = plus(cross(cross(w, h), g_force), cross(h, cross(g_force, w)))
     gw = plus(gw, cross(apply(inertia, w), g_torque))
     gw = plus(gw, apply(inertia, cross(g_torque, w)))
@@ -92,13 +82,11 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
 
 @njit(cache=True)
 def seed_joint_torque(table, motions, c, virtual, seeds):
-    """J is c . tau, the joint torques without those of rotors and damping.
+    """Add the seeds of J = c . tau without rotor inertia and damping.
 
     Args:
-        table: `ArmModel.table`.
-        motions: (n+1, 21), `link_motions`.
         c: (n,) weights.
-        virtual: (n+1, 6) filled with the links' velocities under c, `pull_back` wants them.
+        virtual: (n+1, 6) output: velocities under c, for `pull_back`.
         seeds: (n+1, 21), added to.
     """
     n = motions.shape[0] - 1
@@ -132,14 +120,11 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 
 @njit(cache=True)
 def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
-    """Adds dJ/dq, dJ/dqd and dJ/dqdd of the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
+    """Add the gradients of the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
 
     Args:
-        table: `ArmModel.table`.
         motions: (n+1, 21), `link_motions` at (q, qd, qdd).
-        qd, qdd: (n,) [rad/s], [rad/s^2].
-        c: (n,) as in `seed_joint_torque`, or zeros.
-        virtual: (n+1, 6) from there, or zeros.
+        c, virtual: (n,), (n+1, 6) as in `seed_joint_torque`, or zeros.
         seeds: (n+1, 21).
     """
     n = motions.shape[0] - 1

@@ -1,0 +1,369 @@
+"""Collision candidates of an arm and its surroundings, as shapes and as bounding capsules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    Box,
+    CollisionFilterDeclaration,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    GeometrySet,
+    HalfSpace,
+    ProximityProperties,
+    Role,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.geometry import Capsule as CapsuleShape
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    ModelInstanceIndex,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+    WeldJoint,
+)
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, motions_of
+from drake_teleop.load.inertia import inertia_about_origin
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.plant import finalize
+
+# Vertices of the circumscribed polygon of a cylinder.
+_RIM = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within `radius` [m] of a segment with `ends` (2, 3) [m]."""
+
+    ends: Array
+    radius: float
+
+    def moved(self, X: RigidTransform) -> Capsule:
+        """Return the capsule transformed by X."""
+        return Capsule(X.multiply(self.ends.T).T, self.radius)
+
+    def holds(self, other: Capsule) -> bool:
+        """Return whether this capsule contains another one."""
+        distances = _distances(self.ends, other.ends)
+        return bool(np.all(distances + other.radius <= self.radius + 1e-9))
+
+
+def bounding_capsule(shape: Shape) -> Capsule:
+    """Return a small capsule around a shape, in its frame."""
+    if isinstance(shape, Sphere):
+        return Capsule(np.zeros((2, 3)), shape.radius())
+    if isinstance(shape, CapsuleShape):
+        end = np.array([0.0, 0.0, shape.length() / 2])
+        return Capsule(np.array([-end, end]), shape.radius())
+    points = _hull(shape)
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    half = (points.max(axis=0) - points.min(axis=0)) / 2
+    candidates = []
+    for axis in np.eye(3):
+        for share in (0.0, 0.4, 0.6, 0.8, 0.9, 1.0):
+            end = share * axis * half
+            ends = np.array([middle - end, middle + end])
+            radius = float(_distances(ends, points).max())
+            length = 2 * share * float(axis @ half)
+            candidates.append((np.pi * radius**2 * (length + 4 / 3 * radius), ends, radius))
+    _, ends, radius = min(candidates, key=lambda candidate: candidate[0])
+    return Capsule(ends, radius)
+
+
+def _hull(shape: Shape) -> Array:
+    if isinstance(shape, Box):
+        corners = np.array(np.meshgrid(*3 * [[-0.5, 0.5]])).reshape(3, 8).T
+        return corners * shape.size()
+    if isinstance(shape, Ellipsoid):
+        corners = np.array(np.meshgrid(*3 * [[-1.0, 1.0]])).reshape(3, 8).T
+        return corners * [shape.a(), shape.b(), shape.c()]
+    if isinstance(shape, Cylinder):
+        angle = 2 * np.pi * np.arange(_RIM) / _RIM
+        radius = shape.radius() / np.cos(np.pi / _RIM)
+        rim = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        half = shape.length() / 2
+        ends = [np.column_stack([rim, np.full(_RIM, z)]) for z in (-half, half)]
+        return np.concatenate(ends)
+    hull = shape.GetConvexHull()
+    return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+
+
+def _distances(ends: Array, points: Array) -> Array:
+    along = ends[1] - ends[0]
+    length = float(along @ along)
+    share = np.clip((points - ends[0]) @ along / length, 0, 1) if length > 0 else 0 * points[:, 0]
+    return np.linalg.norm(points - ends[0] - np.multiply.outer(share, along), axis=1)
+
+
+#: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
+CLEARANCE = 0.005
+# Neighbours by design: pairs below the clearance in this share of random postures, or with a
+# smaller variation of distance than this [m].
+_NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
+# Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
+# postures that capsules may block.
+_CONTACT_BAND_M, _EXCESS_QUANTILE, _BLOCKED_SHARE = (-0.02, 0.05), 0.25, 0.1
+# Smallest number of postures near contact for a correction.
+_MIN_POSTURES = 5
+# Share of postures below which near capsules count although their shapes were never near.
+_RARE_SHARE = 0.05
+
+_TABLE = "drake_teleop_table"
+# Replaces a half space, for which Drake has no distances; wider than any arm.
+_PLATE, _X_PLANE_PLATE = Box(10, 10, 1), RigidTransform([0, 0, -0.5])
+_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+# The table as a ball of 1 km radius: 2 mm too low at 2 m distance.
+_TABLE_CAPSULE = Capsule(np.full((2, 3), (0.0, 0.0, -1e3)), 1e3)
+
+_Pair = tuple[GeometryId, GeometryId]
+Parse = Callable[[MultibodyPlant], tuple[ModelInstanceIndex, Frame]]
+
+
+class Scene:
+    """Plant and scene graph of the arm with its heaviest load.
+
+    Args:
+        reserve: (10,) phi of an additional load on the sensor.
+        visuals_count: True: visual shapes also count as collision shapes.
+
+    Raises:
+        DrakeTeleopError: for a shape that is too large for an arm.
+    """
+
+    def __init__(
+        self, parse: Parse, reserve: Array, *, visuals_count: bool, where: str = ""
+    ) -> None:
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
+        instance, self.sensor_frame = parse(self.plant)
+        _add_load(self.plant, instance, self.sensor_frame, reserve)
+        _make_solid(self.plant, self.scene_graph, visuals_count)
+        _check_sizes(self.plant, self.scene_graph, where)
+        _add_shape(self.plant, self.plant.world_body(), RigidTransform(), HalfSpace(), _TABLE)
+        finalize(self.plant)
+        self.arm = ArmModelFromPlant(self.plant, instance, self.sensor_frame.name())
+        self.diagram = builder.Build()
+        self._rows = self._link_rows()
+
+    def _link_rows(self) -> dict[BodyIndex, int]:
+        """Return the link of every body, a row of `link_motions` (-1: world)."""
+        rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
+        for row, name in enumerate(self.arm.joint_names):
+            joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
+            for body in self.plant.GetBodiesKinematicallyAffectedBy([joint.index()]):
+                rows[body] = row
+        return rows
+
+    def without_neighbours(
+        self, postures: Array, start: Array | None
+    ) -> tuple[dict[_Pair, Array], list[str]]:
+        """Return pairs of shapes that may collide, with distances in each posture (inf: far).
+
+        Excluded are pairs on one link, always near or at a constant distance. Shapes that touch in
+        the start posture are excluded too, and their bodies are returned.
+
+        Args:
+            postures: (T, n).
+            start: (n,), if known.
+        """
+        manager = self.scene_graph.collision_filter_manager()
+        for link in set(self._rows.values()):
+            together = [
+                shape
+                for body, row in self._rows.items()
+                if row == link
+                for shape in self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
+            ]
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(together)))
+        candidates = self.scene_graph.model_inspector().GetCollisionCandidates()
+        context = self.diagram.CreateDefaultContext()
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        scene_context = self.scene_graph.GetMyContextFromRoot(context)
+        q = self.plant.GetPositions(plant_context)
+        all_postures = postures if start is None else np.vstack([postures, start])
+        distances = {pair: np.full(len(all_postures), np.inf) for pair in candidates}
+        for k, posture in enumerate(all_postures):
+            q[self.arm.position_index] = posture
+            self.plant.SetPositions(plant_context, q)
+            query = self.scene_graph.get_query_output_port().Eval(scene_context)
+            for found in query.ComputeSignedDistancePairwiseClosestPoints(_CONTACT_BAND_M[1]):
+                distances[found.id_A, found.id_B][k] = found.distance
+        # A new manager: declarations of a manager older than the context have no effect there.
+        manager = self.scene_graph.collision_filter_manager()
+        touching = list[str]()
+        for (a, b), of_all in list(distances.items()):
+            of_pair = distances[a, b] = of_all[: len(postures)]
+            constant = of_pair.max() < of_pair.min() + _MIN_VARIATION_M
+            neighbours = constant or np.mean(of_pair < CLEARANCE) >= _NEIGHBOUR_SHARE
+            touch = start is not None and of_all[-1] < CLEARANCE
+            if touch and not neighbours:
+                touching.append(" and ".join(self._body_names(a, b)))
+            if touch or neighbours:
+                exclude = CollisionFilterDeclaration().ExcludeBetween
+                manager.Apply(exclude(GeometrySet(a), GeometrySet(b)))
+                del distances[a, b]
+        return distances, sorted(set(touching))
+
+    def _body_names(self, *shapes: GeometryId) -> list[str]:
+        inspector = self.scene_graph.model_inspector()
+        frames = map(inspector.GetFrameId, shapes)
+        return sorted(self.plant.GetBodyFromFrameId(frame).name() for frame in frames)
+
+    def capsules(
+        self, candidates: dict[_Pair, Array], postures: Array
+    ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
+        """Return rows, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
+
+        Excluded are pairs inside larger capsules, and pairs whose capsules are near regardless of
+        their shapes.
+        """
+        inspector = self.scene_graph.model_inspector()
+        motions = empty_motions(1, self.arm.num_joints)
+        context = self.diagram.CreateDefaultContext()
+        plant_context = self.plant.GetMyContextFromRoot(context)
+        q = self.plant.GetPositions(plant_context)[self.arm.position_index][np.newaxis]
+        motions_of(self.arm.table, q, 0 * q, 0 * q, motions)
+        capsules: dict[GeometryId, tuple[int, Capsule]] = {}
+        for shape in sorted({shape for pair in candidates for shape in pair}, key=_number):
+            body = self.plant.GetBodyFromFrameId(inspector.GetFrameId(shape))
+            row = self._rows[body.index()]
+            X_WB = self.plant.EvalBodyPoseInWorld(plant_context, body)
+            X_LB = X_WB if row < 0 else _pose(motions[0, row]).InvertAndCompose(X_WB)
+            capsule = bounding_capsule(inspector.GetShape(shape))
+            capsules[shape] = row, capsule.moved(X_LB @ inspector.GetPoseInFrame(shape))
+            if inspector.GetName(shape).endswith(_TABLE):
+                capsules[shape] = row, _TABLE_CAPSULE
+        outer = {shape: _outermost(shape, capsules) for shape in capsules}
+        outer_shapes = sorted({outer[shape] for shape in outer}, key=_number)
+        shape_distances: dict[tuple[int, int], Array] = {}
+        for (a, b), of_pair in candidates.items():
+            first, second = sorted((outer_shapes.index(outer[a]), outer_shapes.index(outer[b])))
+            shape_distances[first, second] = np.minimum(
+                of_pair, shape_distances.get((first, second), np.inf)
+            )
+        pairs = np.array(sorted(shape_distances), dtype=np.int64).reshape(-1, 2)
+        capsule_rows = np.array([capsules[shape][0] for shape in outer_shapes], dtype=np.int64)
+        shapes = [capsules[shape][1] for shape in outer_shapes]
+        motions = empty_motions(len(postures), self.arm.num_joints)
+        motions_of(self.arm.table, postures, 0 * postures, 0 * postures, motions)
+        ends = np.array([capsule.ends for capsule in shapes]).reshape(-1, 2, 3)
+        radii = np.array([capsule.radius for capsule in shapes])
+        capsules_apart = capsule_distances(motions, capsule_rows, ends, radii, pairs)
+        used, distances = [], []
+        for k, (a, b) in enumerate(pairs):
+            distance = _minimum_distance(shape_distances[a, b], capsules_apart[:, k])
+            near, capsules_near = shape_distances[a, b] < CLEARANCE, capsules_apart[:, k] < distance
+            if near.sum() >= _MIN_POSTURES:
+                useful = np.mean(capsules_near[near]) > np.mean(capsules_near[~near])
+            else:
+                useful = near.any() or 0 < np.mean(capsules_apart[:, k] < CLEARANCE) < _RARE_SHARE
+            if useful:
+                used.append(k)
+                distances.append(distance)
+        return capsule_rows, ends, radii, pairs[used], np.array(distances)
+
+
+def _minimum_distance(of_shapes: Array, capsules_apart: Array) -> float:
+    """Return the minimum distance of two capsules from (T,) distances in random postures [m].
+
+    Capsules are larger than their shapes, so the lower quartile of their excess near contact is
+    subtracted. At least 90 % of the free postures remain feasible.
+    """
+    touching = (of_shapes > _CONTACT_BAND_M[0]) & (of_shapes < _CONTACT_BAND_M[1])
+    excess = (
+        (of_shapes - capsules_apart)[touching] if touching.sum() >= _MIN_POSTURES else np.zeros(1)
+    )
+    free = capsules_apart[of_shapes > CLEARANCE]
+    return float(
+        min(CLEARANCE - np.quantile(excess, _EXCESS_QUANTILE), np.quantile(free, _BLOCKED_SHARE))
+    )
+
+
+def _number(shape: GeometryId) -> int:
+    return int(shape.get_value())
+
+
+def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
+    """Return the shape of the largest capsule around that of `shape` on its link."""
+    row, capsule = capsules[shape]
+    holding = [
+        (other.radius, -_number(name), name)
+        for name, (other_row, other) in capsules.items()
+        if other_row == row and other.holds(capsule)
+    ]
+    return max(holding, key=lambda entry: entry[:2])[2]
+
+
+def _pose(motion: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix(motion[12:].reshape(3, 3)), motion[9:12])
+
+
+def _add_load(
+    plant: MultibodyPlant, instance: ModelInstanceIndex, frame: Frame, phi: Array
+) -> None:
+    mass = float(phi[0])
+    unit = inertia_about_origin(phi) / mass
+    moments, products = np.diag(unit), unit[np.triu_indices(3, 1)]
+    inertia = SpatialInertia(mass, phi[1:4] / mass, UnitInertia(*moments, *products))
+    body = plant.AddRigidBody("drake_teleop_reserve", instance, inertia)
+    plant.AddJoint(
+        WeldJoint("drake_teleop_reserve", frame, body.body_frame(), RigidTransform.Identity())
+    )
+
+
+def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
+    """Add visual shapes where needed; replace half spaces by plates."""
+    inspector = scene_graph.model_inspector()
+    for index in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(index))
+        for k, solid in enumerate(plant.GetCollisionGeometriesForBody(body)):
+            if isinstance(shape := inspector.GetShape(solid), HalfSpace):
+                X_BG = inspector.GetPoseInFrame(solid)
+                scene_graph.RemoveRole(plant.get_source_id(), solid, Role.kProximity)
+                _add_shape(plant, body, X_BG, shape, f"drake_teleop_plane_{k}")
+        if plant.GetCollisionGeometriesForBody(body) and not visuals_count:
+            continue
+        for k, visual in enumerate(plant.GetVisualGeometriesForBody(body)):
+            X_BG, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)
+            _add_shape(plant, body, X_BG, shape, f"drake_teleop_solid_{k}")
+
+
+def _check_sizes(plant: MultibodyPlant, scene_graph: SceneGraph, where: str) -> None:
+    inspector = scene_graph.model_inspector()
+    for index in range(plant.num_bodies()):
+        body = plant.get_body(BodyIndex(index))
+        for solid in plant.GetCollisionGeometriesForBody(body):
+            shape = inspector.GetShape(solid)
+            if isinstance(shape, HalfSpace):  # replaced by a plate
+                continue
+            capsule = bounding_capsule(shape)
+            size = np.ptp(capsule.ends, axis=0).max() + 2 * capsule.radius
+            if not size <= _MAX_SIZE_M:
+                raise DrakeTeleopError(
+                    f"a shape of {body.name()} is {size:.3g} m large, more than {_MAX_SIZE_M:g} m",
+                    where=where,
+                    remedy="give all lengths in metres",
+                )
+
+
+def _add_shape(
+    plant: MultibodyPlant, body: RigidBody, X_BG: RigidTransform, shape: Shape, name: str
+) -> None:
+    if isinstance(shape, HalfSpace):
+        X_BG, shape = X_BG @ _X_PLANE_PLATE, _PLATE
+    plant.RegisterCollisionGeometry(body, X_BG, shape, name, ProximityProperties())

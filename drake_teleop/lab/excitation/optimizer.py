@@ -1,0 +1,337 @@
+"""Optimiser of excitation trajectories.
+
+Penalties with L-BFGS lead random candidates to the limits; SLSQP then minimises. All improving
+feasible iterates are recorded, because SLSQP often ends on an infeasible one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.lab.excitation.criteria import Criterion
+from drake_teleop.lab.excitation.limits import (
+    LIMITS,
+    Limits,
+    criterion_gradient,
+    empty_motions,
+    limit_uses,
+    motions_of,
+    sensor_vectors,
+)
+from drake_teleop.load.trajectory import FourierTrajectory
+
+Bounds = list[tuple[float | None, float | None]]
+"""Lower and upper bound of each unknown; None: unbounded."""
+
+# Samples of a period per harmonic.
+_SAMPLES_PER_HARMONIC = 24
+# Size of random motions, as a share of the speed and acceleration limits.
+_RELATIVE_SIZE = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Specification of a design.
+
+    Args:
+        table: `ArmModel.table`, with the heaviest load.
+        home: (n,) posture around which half of the candidates are drawn [rad].
+        period: [s].
+        harmonics: N of Eq. (9), at least 2.
+    """
+
+    table: Array
+    limits: Limits
+    criterion: Criterion
+    home: Array
+    period: float
+    harmonics: int
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Criterion and limits at one point.
+
+    Attributes:
+        log_criterion: smooth logarithm of the criterion.
+        uses: (7,) smooth largest use of each of `LIMITS`.
+        gradients: (8, unknowns) of both, the criterion first.
+        largest_use: exact largest use of any limit.
+    """
+
+    log_criterion: float
+    uses: Array
+    gradients: Array
+    largest_use: float
+
+
+class Problem:
+    """Problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+        n, free = len(task.home), 2 * (task.harmonics - 1)
+        samples = _SAMPLES_PER_HARMONIC * task.harmonics
+        unit = np.eye(free)
+        basis = FourierTrajectory.at_rest(
+            np.zeros(free), unit[:, : free // 2], unit[:, free // 2 :], 1 / task.period
+        )
+        #: (3, T, free): q, qd, qdd of unit coefficients.
+        self._basis = np.stack(basis.evaluate(np.arange(samples) * task.period / samples))
+        self._motions = empty_motions(samples, n)
+        self._vectors = np.empty((3, samples, 3))
+        self._gradients = np.empty((1 + len(LIMITS), 3, samples, n))
+
+    def trajectory(self, x: Array) -> FourierTrajectory:
+        """Return the trajectory with the unknowns x."""
+        n = len(self.task.home)
+        sine, cosine = x[n:].reshape(2, n, -1)
+        return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
+
+    def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
+        """Return a random motion around the home or a random posture."""
+        task, limits = self.task, self.task.limits
+        rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
+        size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
+        spread = np.tile(
+            np.repeat(_RELATIVE_SIZE * np.minimum(size, limits.q_half), task.harmonics - 1), 2
+        )
+        q0 = task.home + 0.1 * rng.standard_normal(len(size))
+        if not near_home:
+            q0 = limits.q_middle + 0.6 * limits.q_half * rng.uniform(-1, 1, len(size))
+        return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
+
+    def bounds(self, x: Array) -> Bounds | None:
+        """Return the bounds of a descent from x; None: unbounded."""
+        return None
+
+    def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
+        """Evaluate criterion and limits at x, with the sharpness of their smooth maxima."""
+        task, n = self.task, len(self.task.home)
+        coefficients = x[n:].reshape(2, n, -1).swapaxes(1, 2).reshape(-1, n)
+        joints = self._basis @ coefficients
+        joints[0] += x[:n]
+        motions_of(task.table, *joints, self._motions)
+        sensor_vectors(self._motions, self._vectors)
+        self._gradients[0] = 0.0
+        s, omega, alpha = self._vectors
+        value, g_V = task.criterion.smooth(s, omega, alpha, criterion_sharpness)
+        criterion_gradient(task.table, self._motions, joints[1], joints[2], g_V, self._gradients[0])
+        smooth, largest = np.empty((2, len(LIMITS)))
+        limit_uses(
+            task.table, *joints, self._motions, task.limits, limit_sharpness,
+            smooth, largest, self._gradients[1:],
+        )  # fmt: skip
+        return Evaluation(value, smooth, self._gradients_by_unknowns(), float(largest.max()))
+
+    def value(self) -> float:
+        """Return the exact criterion of the last evaluated point."""
+        s, omega, alpha = self._vectors
+        return self.task.criterion.value(s, omega, alpha, self.task.period)
+
+    def _gradients_by_unknowns(self) -> Array:
+        g = self._gradients
+        by_q0 = g[:, 0].sum(axis=1)
+        # (8, free, n), summed over position, velocity, acceleration and time.
+        by_coefficients = (self._basis.transpose(0, 2, 1) @ g).sum(axis=1)
+        count, free, n = by_coefficients.shape
+        by_coefficients = (
+            by_coefficients.reshape(count, 2, free // 2, n).swapaxes(2, 3).reshape(count, -1)
+        )
+        return np.hstack([by_q0, by_coefficients])
+
+
+#: Share of each limit; the grid misses up to 0.9 % of a fifth harmonic's peak.
+MARGIN = 0.985
+# Largest use of a feasible iterate on the grid.
+_MAX_FEASIBLE_USE = 0.9885
+
+# Size of a batch of candidates, and number of followed ones.
+_NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
+# (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
+_LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
+# (sharpness of the criterion, of the maxima, iterations) of SLSQP.
+_SLSQP_STAGES = ((12.0, 200.0, 80), (40.0, 400.0, 120))
+_TOLERANCE = 1e-5
+# A start ends without a feasible iterate after so many evaluations, or after the first stage of
+# SLSQP outside this factor of the best.
+_MAX_INFEASIBLE_EVALUATIONS, _MAX_RATIO_TO_BEST = 250, 1.08
+# A bounded descent is repeated while it improves the criterion by this factor.
+_MIN_IMPROVEMENT = 0.995
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Best feasible trajectory of its start so far; `seconds` is thread CPU time."""
+
+    seconds: float
+    evaluations: int
+    start: int
+    value: float
+    trajectory: FourierTrajectory
+
+
+def design(
+    problem: Problem,
+    *,
+    seed: int,
+    starts: int = 4,
+    seconds: float | None = None,
+    progress: Callable[[float, float], None] = lambda done, best: None,
+) -> list[Iterate]:
+    """Minimise the criterion within the limits; return feasible iterates in order.
+
+    Args:
+        seed: of the candidates; without `seconds` the result is reproducible.
+        starts: number of followed candidates.
+        seconds: thread CPU time; replaces `starts`.
+        progress: called with completed share and best criterion.
+    """
+    search = _Search(problem, starts, seconds, progress)
+    with one_blas_thread(), suppress(_TimeOutError):
+        for candidate in search.candidates(np.random.default_rng(seed)):
+            if seconds is None and search.start == starts:
+                break
+            with suppress(_InfeasibleStartError):
+                search.follow(candidate)
+            search.start += 1
+    return search.found
+
+
+class _TimeOutError(Exception):
+    """Ends all optimisers."""
+
+
+class _InfeasibleStartError(Exception):
+    """Ends a start that does not become feasible."""
+
+
+class _Search:
+    def __init__(
+        self,
+        problem: Problem,
+        starts: int,
+        seconds: float | None,
+        progress: Callable[[float, float], None],
+    ) -> None:
+        self._problem, self._starts = problem, starts
+        self._seconds, self._progress = seconds, progress
+        self.start = 0
+        self.found: list[Iterate] = []
+        self._best = self._best_of_start = float("inf")
+        self._evaluations = self._all_evaluations = 0
+        self._key = b""
+        from scipy.optimize import minimize
+
+        self._minimize = minimize
+        # Compile before the clock starts.
+        self._last = problem.evaluate(
+            self._problem.candidate(np.random.default_rng(0), near_home=True), 1.0, 1.0
+        )
+        self._start_time = time.thread_time()
+
+    def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
+        """Yield random motions, the best of each batch first."""
+        while True:
+            batch = [
+                self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)
+            ]
+            merit = []
+            for x in batch:
+                self._count_evaluation()
+                point = self._problem.evaluate(x, *_LBFGS_STAGES[0][:2])
+                merit.append(point.log_criterion + 10 * max(point.uses.max() - 1, 0))
+            for k in np.argsort(merit)[:_NUM_FOLLOWED]:
+                yield batch[k]
+
+    def follow(self, x: Array) -> None:
+        """Descend from x."""
+        self._evaluations, self._best_of_start = 0, float("inf")
+        for criterion_sharpness, limit_sharpness, weight, iterations in _LBFGS_STAGES:
+            options = {"maxiter": iterations}
+            stage = (criterion_sharpness, limit_sharpness, weight)
+            x = self._minimize(self._penalised, x, stage, "L-BFGS-B", jac=True, options=options).x
+        is_bounded = self._problem.bounds(x) is not None
+        for k, stage in enumerate(_SLSQP_STAGES):
+            hopeless = self._best_of_start > _MAX_RATIO_TO_BEST * self._best
+            if k > 0 and hopeless and not is_bounded:
+                return
+            x = self._run_slsqp(x, *stage)
+        before = float("inf")
+        while is_bounded and self._best_of_start < _MIN_IMPROVEMENT * before:
+            before = self._best_of_start
+            x = self._run_slsqp(x, *_SLSQP_STAGES[-1])
+
+    def _run_slsqp(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float, iterations: int
+    ) -> Array:
+        found: Array = self._minimize(
+            lambda x, *sharpness: self._evaluate_once(x, *sharpness).log_criterion,
+            x,
+            (criterion_sharpness, limit_sharpness),
+            "SLSQP",
+            jac=lambda x, *sharpness: self._evaluate_once(x, *sharpness).gradients[0],
+            bounds=self._problem.bounds(x),
+            constraints={
+                "type": "ineq",
+                "fun": lambda x, *sharpness: MARGIN - self._evaluate_once(x, *sharpness).uses,
+                "jac": lambda x, *sharpness: -self._evaluate_once(x, *sharpness).gradients[1:],
+                "args": (criterion_sharpness, limit_sharpness),
+            },
+            options={"maxiter": iterations, "ftol": _TOLERANCE},
+        ).x
+        return found
+
+    def _penalised(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float, weight: float
+    ) -> tuple[float, Array]:
+        point = self._evaluate_once(x, criterion_sharpness, limit_sharpness)
+        excess = np.maximum(point.uses - MARGIN, 0)
+        value = point.log_criterion + weight * float(excess @ excess)
+        return value, point.gradients[0] + (2 * weight * excess) @ point.gradients[1:]
+
+    def _evaluate_once(
+        self, x: Array, criterion_sharpness: float, limit_sharpness: float
+    ) -> Evaluation:
+        """Evaluate a point; SLSQP requests its value, limits and gradients separately."""
+        key = np.array([*x, criterion_sharpness, limit_sharpness]).tobytes()
+        if key != self._key:
+            self._count_evaluation()
+            self._last = self._problem.evaluate(x, criterion_sharpness, limit_sharpness)
+            self._key = key
+            if self._last.largest_use <= _MAX_FEASIBLE_USE:
+                self._record_iterate(x)
+            elif self._evaluations > _MAX_INFEASIBLE_EVALUATIONS and self._best_of_start == float(
+                "inf"
+            ):
+                raise _InfeasibleStartError
+        return self._last
+
+    def _record_iterate(self, x: Array) -> None:
+        value = self._problem.value()
+        if value < self._best_of_start:
+            self._best_of_start = value
+            self._best = min(value, self._best)
+            seconds = time.thread_time() - self._start_time
+            trajectory = self._problem.trajectory(x)
+            self.found.append(
+                Iterate(seconds, self._all_evaluations, self.start, value, trajectory)
+            )
+
+    def _count_evaluation(self) -> None:
+        self._evaluations += 1
+        self._all_evaluations += 1
+        done = self.start / self._starts
+        if self._seconds is not None:
+            done = (time.thread_time() - self._start_time) / self._seconds
+            if done >= 1:
+                raise _TimeOutError
+        if self._evaluations % 20 == 0:
+            self._progress(done, self._best)

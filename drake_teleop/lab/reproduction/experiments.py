@@ -1,0 +1,251 @@
+"""Experiments of the paper and their values: free movements (Figs. 6, 7), contact (Fig. 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.arrays import Array
+from drake_teleop.common.progress import Progress, Stage
+from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
+from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact
+from drake_teleop.load.compensation import contact_wrench, scaled_wrench
+from drake_teleop.station.result import SimulationResult
+from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.simulation import MakeSimulator, advance, read_log, simulate
+from drake_teleop.station.station import GetBlock, MakeTeleopStation
+
+Values = dict[str, Any]
+
+SIGMAS = (1.0, 0.5, 0.0)
+_THRESHOLD_OVER_FREE = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class FreeMotion:
+    """Free movement with its wrench for each sigma (N, 6)."""
+
+    scenario: Scenario
+    result: SimulationResult
+    scaled: dict[float, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMotion:
+    """Contact transition, and the same movement without the sheet spring.
+
+    Attributes:
+        raw, calculated: (N, 6) F - F_o and contact wrench.
+        contact: (N,) true contact.
+        threshold: of the detection [N].
+    """
+
+    scenario: Scenario
+    touched: SimulationResult
+    free: SimulationResult
+    raw: Array
+    calculated: Array
+    raw_free: Array
+    calculated_free: Array
+    contact: NDArray[np.bool_]
+    threshold: float
+
+
+def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
+    """Run a free movement; calculate its wrench for each sigma."""
+    result = _simulate(scenario, estimate, progress)
+    scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
+    return FreeMotion(scenario, result, scaled)
+
+
+def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
+    """Run the contact transition with and without the sheet."""
+    touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
+    free_stage = stage("Fig. 8: the same without contact")
+    free = _simulate(without_sheet(scenario), estimate, free_stage)
+    calculated_free = _scaled(free, estimate, 0.0)
+    return ContactMotion(
+        scenario=scenario,
+        touched=touched,
+        free=free,
+        raw=_scaled(touched, estimate, 1.0),
+        calculated=_scaled(touched, estimate, 0.0),
+        raw_free=_scaled(free, estimate, 1.0),
+        calculated_free=calculated_free,
+        contact=in_contact(touched),
+        threshold=_THRESHOLD_OVER_FREE * float(_force_norm(calculated_free).max()),
+    )
+
+
+def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
+    """Run a free movement with an ideal sensor; eliminate the true load from the reaction force.
+
+    The ideal sensor samples V phi. Drake's reaction force of the tool's weld does not use V, so it
+    is an independent check.
+
+    Returns:
+        (N, 6) F - V phi [N, N m] after the settling time; only rounding errors if V is correct.
+    """
+    rate, simulation = scenario.rates.log_hz, scenario.simulation
+    phi = slave_arm(scenario).phi_load
+    ideal = replace(scenario, wrist_sensor__ideal=True, rates__sensor_hz=rate)
+    station = MakeTeleopStation(ideal, load_estimate=np.concatenate([np.zeros(6), phi]))
+    plant, simulator = GetBlock(station, "slave_plant"), MakeSimulator(station, simulation)
+    context = plant.GetMyContextFromRoot(simulator.get_context())
+    reactions = plant.get_reaction_forces_output_port()
+    weld = plant.GetJointByName("sensor_weld")
+    place = list(plant.GetJointIndices()).index(weld.index())
+    wrenches = np.empty((round((simulation.settle + simulation.duration) * rate) + 1, 6))
+    for k in range(len(wrenches)):
+        advance(simulator, k * (1 / rate))  # the same product as Drake's event times
+        reaction = reactions.Eval(context)[place]
+        wrenches[k] = *reaction.translational(), *reaction.rotational()
+        if k % 256 == 0:
+            progress(k / len(wrenches))
+    progress(1.0)
+    result = read_log(simulator, simulation.settle)
+    taken = np.rint((result["sample_time"][:, 0] + simulation.settle) * rate).astype(int)
+    _, s, omega, alpha = sensor_samples(result)
+    started = taken >= 0
+    return contact_wrench(
+        wrenches[taken[started]], np.zeros(6), s[started], omega[started], alpha[started], phi
+    )
+
+
+def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Values:
+    """Return the values of Figs. 6 and 7 for one component of the wrench.
+
+    Args:
+        ideal: (N, 6) from `eliminated_reaction`.
+        unit: suffix of the names.
+    """
+    raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
+    vector = slice(0, 3) if component < 3 else slice(3, 6)
+    scale = run.scenario.force_scaling.force_scale
+    peak = float(np.abs(raw).max())
+    return {
+        f"peak_raw_{unit}": peak,
+        f"peak_raw_master_{unit}": scale * peak,
+        "half_ratio": _rms(half) / _rms(raw),
+        f"residual_max_{unit}": float(np.abs(rest).max()),
+        f"residual_rms_{unit}": _rms(rest),
+        f"residual_norm_max_{unit}": _largest_norm(run.scaled[0.0][:, vector]),
+        f"residual_ideal_max_{unit}": _largest_norm(ideal[:, vector]),
+    }
+
+
+def contact_values(run: ContactMotion) -> Values:
+    """Return the values of Fig. 8."""
+    t, force_norm = run.touched.t, _force_norm(run.calculated)
+    detected = force_norm > run.threshold
+    window = _contact_window(run)
+    after = t > t[window][-1] if window.any() else np.zeros(len(t), dtype=bool)
+    return {
+        "true_s": _first_time(t, run.contact),
+        "detected_s": _first_time(t, detected),
+        "threshold_N": run.threshold,
+        "raw_detectable": bool(raw_excess(run).max() > 0),
+        "false_alarm_0_6_s": bool(detected[after].any()),
+        "peak_contact_N": float(force_norm.max()),
+        "peak_true_contact_N": _largest_norm(run.touched["true_contact_wrench_W"][:, :3]),
+        "peak_inertial_N": _largest_norm((run.raw - run.calculated)[:, :3]),
+        "duration_s": float(np.count_nonzero(run.contact) * (t[1] - t[0])),
+        "largest_deflection_mm": 1e3 * float(np.abs(run.touched["sheet_state"][:, 0]).max()),
+        "free_residual_norm_max_N": float(_force_norm(run.calculated_free).max()),
+        "free_residual_norm_max_Nm": _largest_norm(run.calculated_free[:, 3:]),
+    }
+
+
+def raw_excess(run: ContactMotion) -> Array:
+    """Return (4,) excess of f_x, f_y, f_z, |f| over the free range [N]."""
+    touched, free = (
+        np.column_stack([raw[:, :3], _force_norm(raw)])
+        for raw in (run.raw[_contact_window(run)], run.raw_free)
+    )
+    if not len(touched):
+        return np.full(4, -np.inf)
+    return np.maximum(
+        touched.max(axis=0) - free.max(axis=0), free.min(axis=0) - touched.min(axis=0)
+    )
+
+
+def identification_values(load: LoadIdentification, scenario: Scenario) -> Values:
+    """Return errors and expected accuracy of the estimate."""
+    truth = true_parameters(scenario)
+    error = load.estimate - truth
+    mass, moment = load.estimate[6], load.estimate[7:10]
+    true_mass, true_moment = truth[6], truth[7:10]
+    deviations = load.batch.standard_deviations
+    return {
+        "mass_kg": float(mass),
+        "mass_error_percent": 100 * abs(float(error[6] / true_mass)),
+        "com_error_mm": 1e3 * float(np.linalg.norm(moment / mass - true_moment / true_mass)),
+        "inertia_error_max_g_m2": 1e3 * float(np.abs(error[10:]).max()),
+        "offset_error_N": float(np.linalg.norm(error[:3])),
+        "offset_error_Nm": float(np.linalg.norm(error[3:6])),
+        "mass_std_percent": 100 * float(deviations[6] / mass),
+        "recursive_against_batch_std": load.recursive_against_batch,
+        "kappa_w10": load.kappa_w10,
+        "duration_s": load.trajectory.period,
+        "samples": load.batch.samples,
+    }
+
+
+def without_sheet(scenario: Scenario) -> Scenario:
+    """Return the scenario without the sheet spring, with another seed."""
+    return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
+
+
+def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> SimulationResult:
+    station = MakeTeleopStation(scenario, load_estimate=estimate)
+    return simulate(station, scenario.simulation, progress=progress)
+
+
+def true_parameters(scenario: Scenario) -> Array:
+    """Return (16,) true offsets and phi, Eq. (7)."""
+    return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
+
+
+def _scaled(result: SimulationResult, estimate: Array, sigma: float) -> Array:
+    wrench, s, omega, alpha = sensor_samples(result)
+    offsets, phi, no_object = estimate[:6], estimate[6:], np.zeros(10)
+    scales = {"sigma_gripper": sigma, "sigma_object": sigma, "gamma": 1.0}
+    return scaled_wrench(wrench, offsets, s, omega, alpha, phi, no_object, **scales)
+
+
+def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
+    """Return (N,) from first contact to FILTER_TAIL_S after the last."""
+    t = run.touched.t
+    if not run.contact.any():
+        return run.contact
+    times = t[run.contact]
+    return (t >= times[0]) & (t <= times[-1] + FILTER_TAIL_S)
+
+
+def reversal_without_contact(run: ContactMotion) -> float | None:
+    """Return the time of the largest raw force after the contact [s]."""
+    t, force_norm = run.touched.t, _force_norm(run.raw)
+    window = _contact_window(run)
+    if not window.any():
+        return None
+    force_norm[t <= t[window][-1]] = 0.0
+    return float(t[np.argmax(force_norm)])
+
+
+def _force_norm(wrench: Array) -> Array:
+    return np.linalg.norm(wrench[:, :3], axis=1)
+
+
+def _largest_norm(vectors: Array) -> float:
+    return float(np.linalg.norm(vectors, axis=1).max())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _first_time(t: Array, happened: NDArray[np.bool_]) -> float | None:
+    return float(t[np.argmax(happened)]) if happened.any() else None
