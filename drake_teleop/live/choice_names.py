@@ -1,4 +1,4 @@
-"""What a driver may choose, by name: each choice is recorded as a number of these."""
+"""Names of the choices of a drive; a choice is an index into them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 OWN = "as in the scenario"
 NETWORKS = (OWN, *NETWORK_PRESETS, "custom")
 SENSORS = (OWN, *SENSOR_PRESETS)
-#: What each number of a choice means.
+#: Names of each choice; a choice is the index of its name.
 NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
 
 
 def first_choices(scenario: Scenario) -> dict[str, int]:
-    """The choices that leave a scenario as it is."""
+    """Return the choices that leave a scenario unchanged."""
     return {
         "network": 0,
         "method": METHODS.index(scenario.passivity.method),

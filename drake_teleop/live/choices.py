@@ -1,8 +1,4 @@
-"""What of its station a driver chooses while it runs: network, method, grip, object, sensor.
-
-A choice is a number, as every input of a drive; together they make another scenario, whose station
-goes on where the present one is (`drake_teleop.live.handing_on`).
-"""
+"""Scenario that follows from the driver's choices: network, method, grip, object, sensor."""
 
 from __future__ import annotations
 
@@ -27,20 +23,20 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-#: What is grasped, if the scenario's tool holds nothing.
+#: Gripped object, if the scenario has no payload.
 OBJECT = Payload(mass=0.8)
-#: In which the hand goes over to what it feels of another station [s].
+#: Duration of the cross-fade to the rendered wrench of a new station [s].
 BLEND = 0.25
-# Of `wave`'s line, where the scenario does not use it [N m s/rad]. A ball on a leaf has 1.5 N m of
-# friction about the sensor, which a line of the default 0.05 does not hold: over 0.2 s it topples.
+# Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
+# ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
 _TURNING = 0.5
 _TENTH_OF_MS, _PERCENT, _PER_MILLE = 1e-4, 1e-2, 1e-3
 
 
 def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """The scenario with everything that the driver has chosen.
+    """Return the scenario with all choices of the driver.
 
-    Contact is detected with the sensor alone whose noise is known, the scenario's own.
+    Contact detection needs the scenario's own sensor and a load with a noise floor.
     """
     changes: dict[str, object] = {
         "passivity__method": METHODS[inputs.method],
@@ -84,16 +80,16 @@ def _noise_is_known(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
 
 
 def _object_phi(scenario: Scenario) -> Array:
-    """(10,) of the object alone, about So in S."""
+    """Return phi (10,) of the object alone, about So in S."""
     held = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return held - NominalSlave(empty.slave).arm.phi_load
 
 
 def known_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """(16,) what the station knows of its load in another scenario than it was identified in.
+    """Return the load estimate (16,) [offsets, phi] for scenario `now`; None without a load.
 
-    It is told what it grasps, as a robot is; and another sensor is tared as the first one was.
+    Mass parameters change with the arm model; offsets change as if the new sensor were tared.
     """
     if load is None:
         return None
@@ -110,7 +106,7 @@ def _offset(scenario: Scenario) -> Array:
 
 
 def filled_after(scenario: Scenario) -> float:
-    """How long it takes until a new channel passes on all that it gets [s]."""
+    """Return the time until a new channel delivers all packets [s]."""
     if scenario.is_direct:
         return 0.0
     return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME

@@ -1,4 +1,4 @@
-"""What the page shows of a station that runs: forces, energy, contact, and what is not right."""
+"""Values of a running station for the page: forces, energy, contact and warnings."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 Array = NDArray[np.float64]
 
-#: A calculated contact force at the slave that is a contact [N]; above what noise and motion leave.
+#: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
 CONTACT = 2.0
 _AT_LIMIT = 0.999
-_HAND_PULLS = 59.0  # N of the 60 that a hand can
+_HAND_PULLS = 59.0  # N; the limit of a hand is 60 N
 _SILENT = 0.05  # s
 
 
 @njit(cache=True)
 def _least_and_most(vectors, origins, out):
-    """Writes the least and the largest length of vectors (n, 3 or more) from `origins` to `out`."""
+    """Write the smallest and largest norm of vectors (n, 3 or more) minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -40,7 +40,7 @@ def _least_and_most(vectors, origins, out):
 
 @njit(cache=True)
 def _at_limits(values, limits):
-    """Which columns of (n, k) `values` get to `limits` (k,): their bits are set."""
+    """Return a bit mask of the columns of `values` (n, k) that reach `limits` (k,)."""
     found = 0
     for row in range(len(values)):
         for k in range(len(limits)):
@@ -51,10 +51,9 @@ def _at_limits(values, limits):
 
 @njit(cache=True)
 def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Adds the work of some rows to `energy` (2,), as of `Cockpit.frame` [J].
+    """Add the work of new rows to `energy` (2,) [J].
 
-    `before` (4,) is the time and p_WS of the row before them, nan if there is none; then of the
-    last of them.
+    `before` (4,) is [t, p_WS] of the previous row, nan without one; the last row replaces it.
     """
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
@@ -72,13 +71,9 @@ def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Makes frames for the page out of the rows of the log.
+    """Frames of the page, computed from rows of the log.
 
-    It is called between two slices, when nothing of it is in the processor's caches any more: there
-    each call of numpy takes several times as long as in a loop.
-
-    Args:
-        scenario: of the station.
+    Loops are compiled: between two slices the caches are cold, and NumPy calls are slow.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -94,16 +89,16 @@ class Cockpit:
         self._forces = np.zeros((3, 2))
 
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Numbers of the newest rows, for JSON: every one of them is finite.
+        """Return the values of the newest rows for JSON; all numbers are finite.
 
         Args:
-            rows: as `Session.news` gives them, one at least.
-            inputs: that hold.
+            rows: from `Session.news`, at least one.
+            inputs: in force now.
 
         Returns:
-            "t" [s]; "f": least and largest measured, contact and felt force, all at the hand [N];
-            "contact"; "energy": of the hand into the device, of the tool into what it touches [J];
-            "tool" and "stylus" [m]; "words": what is clipped or in a safe state.
+            "t" [s]; "f": smallest and largest measured, contact and rendered force at the hand [N];
+            "contact"; "energy": of the hand into the device, of the tool into the environment [J];
+            "tool", "stylus": positions [m]; "words": active limits, faults and safe states.
         """
         nothing = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", nothing)
@@ -160,5 +155,4 @@ class Cockpit:
 
 
 def _numbers(values: Array, digits: int) -> list[float]:
-    """Rounded, for JSON; what is not finite is 0 (and a fault, which has its words)."""
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

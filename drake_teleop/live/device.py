@@ -1,4 +1,4 @@
-"""Which haptic device drives: one that sends by itself, or one whose client is started here."""
+"""Haptic device of a drive."""
 
 from __future__ import annotations
 
@@ -13,17 +13,13 @@ _ENDS = 2.0  # s
 
 
 class DrivenBy:
-    """The link to a device, and the device's client if it is ours to start.
-
-    Attributes:
-        link: to the device.
+    """Link to a haptic device, and the client process if this program starts it.
 
     Args:
-        address: udp://127.0.0.1:PORT, on which a device's client is listened to; or
-            haply://HOST:PORT, an Inverse3 at Haply's service.
+        address: udp://127.0.0.1:PORT of a device client, or haply://HOST:PORT of an Inverse3.
 
     Raises:
-        DrakeTeleopError: for another address, or a port that is taken.
+        DrakeTeleopError: for another address, or if the port is in use.
     """
 
     def __init__(self, address: str) -> None:
@@ -42,7 +38,7 @@ class DrivenBy:
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def close(self) -> None:
-        """Ends both; a client that is gone leaves its device without force."""
+        """Close the link and end the client, which releases the device."""
         self.link.close()
         if self._client is None:
             return

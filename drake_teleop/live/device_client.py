@@ -1,10 +1,9 @@
-"""What runs beside a haptic device: its pose to the station, the force back, at 1 kHz.
+"""Client of a haptic device: sends its pose to the station, displays the force, at 1 kHz.
 
     python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
     python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
 
-In a process of its own, so that no slice of the station holds it up; all that keeps a hand safe is
-here (`device_guard`). The virtual device is a mass in a simulated hand that taps and presses.
+A separate process, so that the station cannot delay its safety functions (`device_guard`).
 """
 
 from __future__ import annotations
@@ -41,33 +40,33 @@ _REMEMBERED = 100_000  # ticks
 
 
 class Device(Protocol):
-    """Any hardware, at its own pace."""
+    """Interface of a haptic device."""
 
     @property
     def limits(self) -> Limits:
-        """What it may give."""
+        """Largest force and torque, and their slew rates."""
 
     def read(self) -> Place | None:
-        """Waits for its next place, half a second at most; None if there is none."""
+        """Wait for the next pose; return None after half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
-        """Displays [f; tau] in B until the next call."""
+        """Display the wrench [f; tau] in B [N, N m] until the next call."""
 
     def close(self) -> None:
-        """Lets it go, without force."""
+        """Release the device without force."""
 
 
 class Client:
-    """One device and one station.
+    """Connection of a device and a station.
 
     Attributes:
-        guard: between the two.
-        behind: how old the place was that each force answered [s].
+        guard: safety functions.
+        behind: age of the position that each force answers [s].
 
     Args:
-        device: the hardware.
+        device: hardware.
         address: of the station, udp://127.0.0.1:PORT.
-        observe: whether passivity is observed.
+        observe: whether the passivity observer is on.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -81,7 +80,7 @@ class Client:
         self._last: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
-        """One place there and one force back; what was set, None without a place."""
+        """Exchange one pose and force; return the displayed wrench, None without a pose."""
         place = self._device.read()
         now = clock()
         self._listen()
@@ -104,7 +103,7 @@ class Client:
                 packet = self._socket.recv(LONGEST + 1)
             except BlockingIOError:
                 return
-            except ConnectionError:  # nobody listens there yet
+            except ConnectionError:  # the station is not started yet
                 continue
             command = unpacked_force(packet)
             if command is None or command.number > self._number:
@@ -126,17 +125,13 @@ class Client:
             return
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Release the device and close the socket."""
         self._device.close()
         self._socket.close()
 
 
 class Simulated:
-    """A virtual device as hardware, in real time.
-
-    Args:
-        virtual: the device.
-    """
+    """Virtual device in real time."""
 
     limits = Limits(force=10.0)
 
@@ -146,32 +141,28 @@ class Simulated:
         self._due = self._moved = time.perf_counter()
 
     def read(self) -> Place:
-        """See `Device`."""
+        """See `Device.read`."""
         self._due += _PERIOD
         now = time.perf_counter()
         if self._due > now:
             time.sleep(self._due - now)
         now = time.perf_counter()
-        if now - self._due > _LATE:  # what was missed is not made up for
+        if now - self._due > _LATE:  # missed ticks are not made up for
             self._due = self._moved = now
         self.virtual.move(self._wrench[:3], max(now - self._moved, 1e-6))
         self._moved = now
         return Place(self.virtual.position)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device`."""
+        """See `Device.set`."""
         self._wrench = wrench
 
     def close(self) -> None:
-        """See `Device`."""
+        """See `Device.close`."""
 
 
 def made(address: str, grip: str, depth: float) -> Device:
-    """The device of an address: `virtual`, or haply://HOST:PORT.
-
-    Raises:
-        DrakeTeleopError: for another one, or if it does not answer.
-    """
+    """Return the device of an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
         return Simulated(VirtualDevice(tapping(depth), grip))
     if address.startswith("haply://"):
@@ -180,7 +171,7 @@ def made(address: str, grip: str, depth: float) -> Device:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs until the time is over, Ctrl-C, or the device is gone."""
+    """Run until the time is over, Ctrl-C, or the device disconnects."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")

@@ -1,19 +1,12 @@
-"""What stands between a force command and a haptic device's motors, beside the device.
+"""Safety functions between force commands and the motors of a haptic device.
 
-It knows which force was set and how far the device then moved, which nobody else knows in time:
-
-* silence: 20 ms after the last command the force fades, at 50 ms it is zero; afterwards it
-  may grow by 100 N/s;
-* the device's largest force and torque, and their largest slew;
-* a passivity observer (Hannaford and Ryu 2002): the energy that the hand has put in through this
-  port, E += -f_k . (x_k+1 - x_k). Before each tick the next motion is foreseen to be the last one,
-  and once again what it differed from the one before. What the force would give out along it
-  beyond E is taken off it, as by a damper of 100 N s/m at most. 30 uJ are kept back, once, for no
-  motion is foreseen exactly. Held from tick to tick a stiff wall gives out more than was put in;
-  so does one that is late.
-
-The energy that may come out again is bounded, so that a wall does not live on what was rubbed off
-long ago; E itself, from the beginning, is then never less than what is counted.
+* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms; its limit then
+  rises by 100 N/s.
+* Limits of force, torque and their slew rates.
+* Passivity observer (Hannaford and Ryu 2002) of the energy into the port,
+  E += -f_k . (x_k+1 - x_k), at most 0.3 J. The next displacement is extrapolated from the last two.
+  A force that would return more than E is reduced, by at most a damper of 100 N s/m; a reserve
+  of 30 uJ covers the extrapolation error.
 """
 
 from __future__ import annotations
@@ -22,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-SILENT = 0.05  #: without a command the force is zero from then on [s]
+SILENT = 0.05  #: age of a command at which the force is zero [s]
 _FADES = 0.02  # s
 _RETURNS = 100.0  # N/s
 _MOST, _RESERVE = 0.3, 3e-5  # J
@@ -33,7 +26,7 @@ _Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Limits:
-    """Of a device: force [N], torque [N m], slew of the force [N/s] and of the torque [N m/s]."""
+    """Limits of force [N], torque [N m] and their slew rates [N/s, N m/s]."""
 
     force: float
     torque: float = 0.0
@@ -42,15 +35,11 @@ class Limits:
 
 
 class DeviceGuard:
-    """One tick after another; see the module.
+    """Safety functions of one device; see the module.
 
     Attributes:
-        energy: that the hand has put in since the beginning [J].
-        slowed: how often the observer has changed the force.
-
-    Args:
-        limits: of the device.
-        observe: whether passivity is observed.
+        energy: of the hand into the device since the start [J].
+        slowed: number of forces that the passivity observer has changed.
     """
 
     def __init__(self, limits: Limits, *, observe: bool = True) -> None:
@@ -65,12 +54,12 @@ class DeviceGuard:
     def tick(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """The wrench to be set now (6,) [N, N m].
+        """Return the wrench to display (6,) [N, N m].
 
         Args:
-            position: (3,) where the device is [m].
-            wrench: (6,) the last command [N, N m].
-            age: of that [s].
+            position: (3,) of the device [m].
+            wrench: (6,) last command [N, N m].
+            age: of the command [s].
             period: since the last tick [s].
         """
         x = (float(position[0]), float(position[1]), float(position[2]))
@@ -79,7 +68,7 @@ class DeviceGuard:
         given = -_dot(self._force, moved)
         self.energy += given
         self._available = min(self._available + given, _MOST)
-        # As fast as it was, and faster by as much as it has become; for as long as now.
+        # Extrapolate the speed linearly, over a period of the same length.
         speed, before = _times(1.0 / period, moved), self._speed
         coming = (
             period * (2.0 * speed[0] - before[0]),
@@ -95,7 +84,7 @@ class DeviceGuard:
         torque = _shortened(_times(share, torque), limits.torque)
         force = _slewed(self._force, force, limits.slew * period)
         torque = _slewed(self._torque, torque, limits.torque_slew * period)
-        if share == 0.0:  # whatever the slew: at 50 ms there is none
+        if share == 0.0:  # the timeout overrides the slew limit
             force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         elif self._observe:
             force = _shortened(self._passive(force, coming, period), limits.force)
@@ -103,7 +92,6 @@ class DeviceGuard:
         return (*force, *torque)
 
     def _share(self, age: float, period: float) -> float:
-        """Of a command of that age; counts how much force is allowed after silence."""
         if not age < SILENT:
             self._quiet = True
         elif self._quiet:
@@ -136,7 +124,6 @@ def _times(share: float, a: _Vector) -> _Vector:
 
 
 def _sound(a: Sequence[float]) -> _Vector:
-    """It, or zero if it is not finite."""
     x, y, z = float(a[0]), float(a[1]), float(a[2])
     return (x, y, z) if math.isfinite(x + y + z) else (0.0, 0.0, 0.0)
 

@@ -1,8 +1,4 @@
-"""The station's end of a haptic device: the newest pose in, a force out, and how late they are.
-
-One device at a time: whoever sends first, until it has been silent for 50 ms. What is no packet,
-repeats an earlier one or was overtaken by a later one changes nothing but a counter.
-"""
+"""Station side of a haptic device: receives poses, sends forces, measures lateness."""
 
 from __future__ import annotations
 
@@ -28,26 +24,28 @@ from drake_teleop.live.device_packets import (
 from drake_teleop.live.inputs import ANGLE, LENGTH
 from drake_teleop.robots.udp import endpoint, listening
 
-_MOST = 256  # packets at once
-_REMEMBERED = 2000  # packets, of which lateness is told
-# After silence the hand's place is taken anew, with the clutch open for so long [s].
+_MOST = 256  # packets per poll
+_REMEMBERED = 2000  # packets in the statistics of lateness
+# Duration of the open clutch after silence, while the hand moves to the device's pose [s].
 _SETTLES = 0.05
 
 
 class DeviceLink:
-    """Listens on a port of this machine for a device; see the module.
+    """UDP link to the client of one haptic device on this machine.
+
+    It accepts the first sender, until that one is silent for 50 ms.
 
     Attributes:
-        refused: packets that were none, or another sender's.
-        refusal: why the last of them was.
-        lost: packets that never came, or came too late.
-        port: that it listens on.
+        refused: number of invalid packets and packets of another sender.
+        refusal: reason of the last refusal.
+        lost: number of missing or overtaken packets.
+        port: number of the UDP port.
 
     Args:
         address: udp://127.0.0.1:PORT.
 
     Raises:
-        DrakeTeleopError: for another machine's address, or a port that is taken.
+        DrakeTeleopError: for an address of another machine, or if the port is in use.
     """
 
     def __init__(self, address: str) -> None:
@@ -67,16 +65,12 @@ class DeviceLink:
         self._state: DeviceState | None = None
         self._heard, self._since, self._now = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
-        # Arrival less the device's time, whose least is the difference of the clocks; `behind`.
+        # Arrival minus the device's time; the minimum is the clock offset.
         self._waited: deque[float] = deque(maxlen=_REMEMBERED)
         self._behind: deque[float] = deque(maxlen=_REMEMBERED)
 
     def poll(self, now: float) -> DeviceState | None:
-        """Takes what has come; the newest state, None if there is none or it is silent.
-
-        Args:
-            now: a steady clock [s].
-        """
+        """Receive waiting packets; return the newest state, None if the device is silent."""
         self._now = now
         for _ in range(_MOST):
             try:
@@ -92,11 +86,11 @@ class DeviceLink:
             self.refused += 1
             self.refusal = refusal(packet) if state is None else "is from a second device"
             return
-        if silent:  # a new one, or the same one again
+        if silent:  # a new device, or the same one after a pause
             self._peer, self._since, self._state = peer, now, None
             self._waited.clear()
         elif self._state is not None:
-            if state.number <= self._state.number:  # was counted as lost
+            if state.number <= self._state.number:  # already counted as lost
                 self.lost -= state.number < self._state.number
                 return
             self.lost += state.number - self._state.number - 1
@@ -106,27 +100,27 @@ class DeviceLink:
         self._behind.append(state.behind)
 
     def silent(self, now: float) -> bool:
-        """Whether nothing has come for 50 ms."""
+        """Return whether no valid packet has come for 50 ms."""
         return now - self._heard > SILENT
 
     def send(self, wrench: np.ndarray) -> None:
-        """Answers the newest state with the wrench (6,) that the hand shall feel [N, N m]."""
+        """Answer the newest state with the wrench (6,) [N, N m]."""
         if self._state is None or self._peer is None:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
         try:
             self._socket.sendto(packed_force(command), self._peer)
-        except OSError:  # what cannot be sent now is too old later
+        except OSError:  # a later attempt would send an old force
             return
 
     def begin_anew(self, now: float) -> None:
-        """Where the device is next is where the station's device starts."""
+        """Make the device's present pose correspond to the station's start pose."""
         self._origin, self._since = self._state, now
 
     def lead(self, now: float) -> Mapping[str, float]:
-        """What the device makes of the `Inputs`: it holds the hand's place, or nobody does.
+        """Return the `Inputs` of the device's pose; a silent device releases the hand.
 
-        Where it was first is where the station's device starts. Its clutch counts if it is open.
+        The clutch is contained only if it is open.
         """
         state = self.poll(now)
         if state is None or self._origin is None:
@@ -142,7 +136,7 @@ class DeviceLink:
         return values
 
     def figures(self, now: float) -> dict[str, float]:
-        """Packets a second, lateness of packets and of the force at the hand, p99 [ms]; lost."""
+        """Return packets per second, lateness of packets and force [ms], and losses."""
         late = np.array(self._waited or [0.0])
         behind = np.array(self._behind or [0.0])
         spent = min(now - self._since, 1e-3 * _REMEMBERED) if len(self._waited) > 1 else np.inf
@@ -155,11 +149,11 @@ class DeviceLink:
         }
 
     def text(self) -> str:
-        """The same at the last `poll` in words, for the page, and what was refused."""
+        """Return the state of the link at the last `poll` in words."""
         return self._heard_text() + self.refused_text()
 
     def refused_text(self) -> str:
-        """Return how many packets were refused, and why the last was; "" if none was."""
+        """Return the number of refused packets and the last reason, or ""."""
         if not self.refused:
             return ""
         return f". Refused packets: {self.refused}; the last one {self.refusal}"
@@ -179,7 +173,7 @@ class DeviceLink:
         return said + (f"; {found['lost']:.0f} packets lost" if found["lost"] else "")
 
     def close(self) -> None:
-        """Frees the port."""
+        """Close the port."""
         self._socket.close()
 
 

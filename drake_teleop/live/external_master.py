@@ -1,7 +1,6 @@
-"""A haptic device that is not simulated, in the place of operator, device and force display.
+"""Master side of a real haptic device, in place of operator, simulated device and force display.
 
-Its pose comes in between slices, and goes over to the new one on a straight line within a tick; the
-force for it goes out. So the slave's command has no steps, and the twist is that of the way.
+The pose moves to the newest one on a straight line within a tick: the slave's command has no steps.
 """
 
 from __future__ import annotations
@@ -36,21 +35,21 @@ from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 
-#: In which it takes poses [s], and [ms].
+#: Period of the poses [s], and [ms].
 TICK, TICK_MS = 2e-3, 2
-# Of what is displayed: it fades within FADE [s] and comes back by so much a second [1/s], of the
-# largest; it changes by SLEW of the largest a second at most [1/s].
+# Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
+# largest slew rate [1/s].
 _FADE, _RETURN, _SLEW = 0.05, 4.0, 150.0
-# Of the path: whether it is held, its start [s], from where (7,), by which way (3,) and turn (3,).
+# Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
 _HELD, _START, _FROM, _WAY, _TURN, _PATH = 0, 1, 2, 9, 12, 15
-# Of what is displayed: the wrench (6,), a `Fault`, the share of the largest that is allowed.
+# Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
 _WRENCH = float(Fault.WRENCH)
 
 
 @njit(cache=True)
 def _on_way(path, time, out):
-    """Writes pose (7,) and twist (6,) into `out` (13,)."""
+    """Write pose (7,) and twist (6,) at `time` into `out` (13,)."""
     share = min(max((time - path[_START]) / TICK, 0.0), 1.0)
     r = (share * path[_TURN], share * path[_TURN + 1], share * path[_TURN + 2])
     start = (path[_FROM], path[_FROM + 1], path[_FROM + 2], path[_FROM + 3])
@@ -66,7 +65,7 @@ def _on_way(path, time, out):
 
 @njit(cache=True)
 def _display(wrench, held, period, most, last, now):
-    """One period of what is displayed, `now` (8,) after `last`; `most` (2,) [N, N m]."""
+    """Write the displayed wrench after one period to `now` (8,); `most` (2,) [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
@@ -88,25 +87,24 @@ def _display(wrench, held, period, most, last, now):
 
 
 class ExternalMaster(LeafSystem):
-    """Pose in, force out; see the module.
+    """Haptic device with pose input and force output.
 
-    While the device is not held the force fades within 50 ms. It comes back over a quarter of a
-    second, and never changes by more than its largest in 7 ms. What comes to the hand and is no
-    wrench is a fault, and fades it too.
+    While released, or after a non-finite command, the force fades within 50 ms. It returns over a
+    quarter of a second, and changes by at most its largest value in 7 ms.
 
     .. pydrake_system::
 
         name: ExternalMaster
         input_ports:
-        - wrench_command: (6,) F_E_B, what the hand shall feel [N, N m]
+        - wrench_command: (6,) F_E_B, to be rendered [N, N m]
         output_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - master_state: (12,) place [m], yaw, pitch, roll [rad] as in `task_space`; no speeds
+        - master_state: (12,) position [m], yaw, pitch, roll [rad] as in `task_space`; zero speeds
         - force_to_master: (6,) for the device [N, N m]
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two side by side
-        - hand_wrench_E: (6,) minus the force: all that is known of the hand
+        - hand_wrench_E: (6,) minus the displayed force, an estimate
 
     Args:
         start: (7,) X_BE.
@@ -138,7 +136,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Lead(self, context: Context, target: Array | None) -> None:
-        """From now on the device is on its way to `target` (7,) X_BE, or with None not held."""
+        """Move the device towards `target` (7,) X_BE; None releases it."""
         now, path = self._at(context), np.zeros(_PATH)
         path[_START], path[_FROM:_WAY] = context.get_time(), now[:7]
         if target is not None:
@@ -147,7 +145,7 @@ class ExternalMaster(LeafSystem):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """A real hand is what it is: as of `LiveHand`, for nothing."""
+        """Do nothing: a real hand has no impedance setting."""
 
     def _at(self, context: Context) -> Array:
         _on_way(context.get_numeric_parameter(self._path).value(), context.get_time(), self._now)
@@ -189,16 +187,16 @@ class ExternalMaster(LeafSystem):
 
 
 def with_device(scenario: Scenario) -> Scenario:
-    """The scenario with a device whose place is all that is known, in the place of an arm's."""
+    """Return the scenario with a task-space device in place of a serial arm."""
     if scenario.master.model not in (PHANTOM, LEADER):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
-    """A master side (docs/station.md) of a real device and `kinematic_scaling`.
+    """Return a master side (docs/station.md) of a real device and `kinematic_scaling`.
 
-    Its blocks have the names that they have in `MakeLiveMasterSide`; `goes_over` as there.
+    Names and `goes_over` are those of `MakeLiveMasterSide`.
     """
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])

@@ -1,8 +1,7 @@
-"""Inputs in simulated time: how fast keys and sticks move the hand, and how fast it may move.
+"""Rate inputs of keys and sticks, and motion limits, in simulated time.
 
-At 1/10 of real time a hand that moves by 0.3 m/s moves the simulated stylus by 3 m/s. Without a
-limit that saturates the wrist sensor, and forces are rendered where nothing is touched. A motion
-within the limits passes unchanged and without delay.
+In slow motion a hand moves the simulated arm faster than in real time. Without limits this
+saturates the wrist sensor and renders forces without contact.
 """
 
 from __future__ import annotations
@@ -14,15 +13,15 @@ from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.inputs import ANGLE, LENGTH, RANGES, Inputs
 
 _REPEATED = 1.0  # s
-# The target is ahead of what moves evenly: the hand neither hangs back nor goes on after it [s].
+# Lead time of the target, which compensates the lag of the hand at constant speed [s].
 _LEAD = dict.fromkeys(("x", "y", "z"), BEHIND) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
-# Of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. The stylus of a page has
-# a smooth path to each target already; the position of a device is the path.
+# Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
+# limited only for a device; the path of a page's hand is smooth.
 _PLACE, _TURN = (0.8, 20.0), (8.0, 250.0)
 
 
 class Steering:
-    """Moves the target at rates, of keys and sticks, per simulated second."""
+    """Integrator of rates per simulated second."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -30,11 +29,11 @@ class Steering:
         self._until = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Return the inputs at which other rates begin; they end 1 s after their last repetition.
+        """Return the inputs when new rates begin; they end 1 s after their last repetition.
 
         Args:
             rates: by input, per simulated second; others are 0.
-            inputs: that hold.
+            inputs: in force now.
             now: the clock [s].
         """
         if not self._rates:
@@ -58,11 +57,11 @@ class Steering:
 
 
 class Follower:
-    """Follows the target of the inputs, coordinate by coordinate.
+    """Speed limit of each coordinate of the target; slower motions pass unchanged.
 
     Args:
-        slice_s: how often it steps [s].
-        scales: slave over master, of translation and of rotation.
+        slice_s: period of the steps [s].
+        scales: slave over master, of translation and rotation.
         device: whether accelerations are limited, too.
     """
 
@@ -75,12 +74,7 @@ class Follower:
             self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
 
     def step(self, inputs: Inputs, *, free: bool) -> Inputs:
-        """Return the inputs with the target of this slice.
-
-        Args:
-            inputs: that are requested.
-            free: whether the target may jump, because it does not move the arm.
-        """
+        """Return the limited inputs; with `free` the target may jump, as the arm is still."""
         followed = {
             name: axis.step(getattr(inputs, name), free) for name, axis in self._axes.items()
         }
@@ -88,8 +82,6 @@ class Follower:
 
 
 class _Axis:
-    """One coordinate: its largest speed per slice, change of that, and range."""
-
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._moved = 0.0
@@ -109,7 +101,7 @@ class _Axis:
         return self._at
 
     def _braking(self, distance: float) -> float:
-        """The speed v from which it stops there: v + (v - change) + (v - 2 change) + ..."""
+        """Return the speed v with v + (v - change) + (v - 2 change) + ... = distance."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

@@ -1,4 +1,4 @@
-"""Where a live hand wants the stylus: a smooth path from wherever it is to its newest target."""
+"""Simulated hand of a live drive, with a smooth path to the newest target."""
 
 from __future__ import annotations
 
@@ -31,27 +31,25 @@ from drake_teleop.station.scenario import Scenario
 
 Array = NDArray[np.float64]
 
-# Of the ways to a target [rad/s]: along it with three equal poles, so that the force that it takes
-# has no steps; turning, with two. A step of the target by 10 mm takes 12 N of a firm hand for a
-# moment, and the tool is half way after 46 ms. Where nobody moves anything it goes gently.
+# Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
+# for rotation. With a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers half
+# the distance in 46 ms. After a change of the grip the path is slower.
 _SPEED, _GENTLY, _TURNING = 2 * math.pi * 16.0, 2 * math.pi * 5.0, 2 * math.pi * 5.0
-#: How far a target should be ahead of what moves evenly [s], so that the hand neither hangs back
-#: when it begins nor goes on when it ends: by no more than it makes in 5 ms, and it returns.
+#: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
+#: stop the error is at most the distance of 5 ms.
 BEHIND = 2.5 / _SPEED
-# A path: whether the stylus is held, when it began [s], its poles [rad/s], its target X_BE (7,);
-# then how far the start was from there (3,), its velocity (3,), its acceleration (3,), and how far
-# as a rotation vector in B (3,), its rate (3,).
+# Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
+# target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
 _HELD, _START, _POLES, _TARGET, _AWAY, _TURNED, _PATH = 0, 1, 2, 3, 10, 19, 25
 _WANTED = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
 @njit(cache=True)
 def _wanted_into(path, time, pose, out):
-    """Writes the wanted X_BE (7,), its twist [v; omega] (6,) and acceleration (3,) into `out`.
+    """Write the intended X_BE (7,), twist [v; omega] (6,) and acceleration (3,) to `out`.
 
-    Each axis obeys (d/dt + w)^3 x = 0, and each rotation (d/dt + w)^2 r = 0, whose solutions are
-    exact at any time: nothing depends on how a simulation is cut into slices. Who lets go wants the
-    stylus where it is, `pose` (7,).
+    (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, which are independent of the
+    slices. A released hand intends the present `pose` (7,).
     """
     if path[_HELD] < 0.5:
         out[:7] = pose
@@ -94,7 +92,7 @@ def _wanted_into(path, time, pose, out):
 
 @njit(cache=True)
 def _rate_of(r, omega):
-    """The rate of a rotation vector r [rad] that turns with omega [rad/s], three numbers each."""
+    """Return the rate of a rotation vector r [rad] from omega [rad/s]."""
     square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     c = 1.0 / 12.0 + square / 720.0
     if square > 1e-4:
@@ -106,7 +104,7 @@ def _rate_of(r, omega):
 
 @njit(cache=True)
 def _led_into(path, time, now, target, poles):
-    """Writes the path to `target` (7,), which begins at `time` as what is wanted `now` (16,)."""
+    """Write the path to `target` (7,) that starts from the intention `now` (16,)."""
     path[_HELD], path[_START], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
     turned = logarithm(multiply(now, conjugate(target)))
@@ -119,10 +117,9 @@ def _led_into(path, time, now, target, poles):
 
 @njit(cache=True, borrows=True)
 def _wrench_into(path, time, impedance, mass, pose, twist, wanted, wrench):
-    """Writes the wrench (6,) of the hand on the stylus; `wanted` (16,) is scratch.
+    """Write the wrench (6,) of the hand on the stylus; `wanted` (16,) is scratch.
 
-    Who moves on purpose knows the hand's own mass [kg], and draws its spring beyond what is wanted
-    by what accelerates that.
+    An additional spring displacement accelerates the hand's own mass [kg].
     """
     _wanted_into(path, time, pose, wanted)
     for k in range(3):
@@ -131,7 +128,7 @@ def _wrench_into(path, time, impedance, mass, pose, twist, wanted, wrench):
 
 
 class LiveHand(Operator):
-    """The hand of an operator whose intention is led from outside, on a smooth way to a target.
+    """Hand of an operator whose intention follows targets from outside.
 
     .. pydrake_system::
 
@@ -141,11 +138,7 @@ class LiveHand(Operator):
         - twist_master: (6,) [v; omega] of E in B
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - intent: (7,) X_BE that it wants
-
-    Args:
-        config: the grip.
-        start: (7,) X_BE that it holds until it is led elsewhere.
+        - intent: (7,) intended X_BE
     """
 
     __slots__ = ONE_DICT
@@ -161,10 +154,9 @@ class LiveHand(Operator):
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def Lead(self, context: Context, target: Array | None) -> None:
-        """From now on it wants the stylus at `target` (7,) X_BE, or with None lets go of it.
+        """Start a path to `target` (7,) X_BE from the present pose and speed.
 
-        The way begins where it is, as fast as it is. A hand that lets go pulls nowhere; only its
-        damping is left.
+        None releases the stylus: only the hand's damping remains.
         """
         path = np.zeros(_PATH)
         if target is not None:
@@ -172,11 +164,9 @@ class LiveHand(Operator):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """The hand's impedance becomes another one, and it goes on to pull as it did.
+        """Change the hand's impedance without a step of its wrench.
 
-        What it wants is as much nearer to the stylus as the hand has become stiffer, as much
-        nearer to its speed as it has become more damped, and accelerates as much less as it has
-        become heavier; from there it goes gently to where it was led.
+        The intention scales with stiffness, damping and mass, and returns slowly to the target.
         """
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD] < 0.5:
@@ -219,10 +209,10 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
-    """`MakeMasterSide` with a hand that is led while the station runs: `LiveHand.Lead`.
+    """Return `MakeMasterSide` with a `LiveHand`.
 
-    The scenario's operator gives the grip; it should intend nothing, and have no task. One that
-    follows another station goes over to what is felt now: `GoesOver`.
+    Only the grip of the scenario's operator is used. With `goes_over` the rendered wrench
+    cross-fades from that of the previous station.
     """
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])

@@ -1,11 +1,9 @@
-"""The Haply Inverse3, by the websocket of Haply's service on this machine (Inverse Service 3).
+"""The Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
-Its messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], the grip's
-`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}, in `wireless_verse_grip` or
-`verse_grip`. Each is answered by a force, `inverse3[0].commands.set_cursor_force.values`; else the
-service sends no next one. Its axes, x to the right, y away from the operator, z up, are turned into
-B. Button a opens the clutch. Written from public clients of the service, and tried with a virtual
-one alone, not with the device.
+Messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], and the grip's
+`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. The service sends the next one after
+a force, `inverse3[0].commands.set_cursor_force.values`. Its axes (x right, y forward, z up) are
+rotated into B. Button a opens the clutch. Tested only with a virtual service, not with the device.
 """
 
 from __future__ import annotations
@@ -25,18 +23,14 @@ _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse
 
 
 class Heard(NamedTuple):
-    """What a message says: which device, and where it is in B."""
+    """Name of a device, and its state in B."""
 
     device: str
     state: DeviceState
 
 
 def read_message(text: Any) -> Heard | None:
-    """What is in a message, None if no device is, or none at a place where it can be. Never raises.
-
-    Args:
-        text: as it came.
-    """
+    """Return the device of a message, None without a plausible pose. Never raises."""
     if not isinstance(text, (str, bytes)) or len(text) > _LONGEST:
         return None
     try:
@@ -58,7 +52,7 @@ def read_message(text: Any) -> Heard | None:
 
 
 def written_force(device: str, wrench: Sequence[float]) -> str:
-    """The message that displays a force (its first three numbers, in B)."""
+    """Return the message that displays the first three numbers of a wrench in B."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -73,16 +67,13 @@ def _number(value: Any) -> float:
 
 
 class HaplyDevice:
-    """An Inverse3 at a service.
-
-    Args:
-        address: haply://HOST:PORT, 10001 if there is none.
+    """An Inverse3 at haply://HOST:PORT; the default port is 10001.
 
     Raises:
-        DrakeTeleopError: if nobody answers there.
+        DrakeTeleopError: if the service does not answer.
     """
 
-    limits = Limits(force=8.0)  # of 10 N at its peak (D)
+    limits = Limits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
 
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
@@ -107,7 +98,7 @@ class HaplyDevice:
         self._device = ""
 
     def read(self) -> Place | None:
-        """See `Device`."""
+        """See `Device.read`."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -122,13 +113,13 @@ class HaplyDevice:
         return Place(heard.state.position, heard.state.orientation, heard.state.flags)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device`."""
+        """See `Device.set`."""
         from websockets.exceptions import ConnectionClosed
 
-        with contextlib.suppress(ConnectionClosed):  # `read` says so
+        with contextlib.suppress(ConnectionClosed):  # `read` reports it
             self._socket.send(written_force(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
-        """See `Device`."""
+        """See `Device.close`."""
         self.set((0.0,) * 6)
         self._open.close()

@@ -1,8 +1,7 @@
-"""What a driver does, as whole numbers: what is recorded is exactly what was simulated.
+"""Inputs of a driver as integers, so that the record is exactly the simulated input.
 
-A recorded drive is a table `inputs.csv`: one row for each change, with its time in ms since the
-start and every input; the last row is the end of the drive, so far as it was recorded. Choices are
-written by name. A comment above has what else the motion depends on, such as versions.
+`inputs.csv` has a row for each change, with its time since the start [ms] and every input, choices
+by name. The last row is the end. A comment contains versions on which the motion depends.
 """
 
 from __future__ import annotations
@@ -28,32 +27,32 @@ from drake_teleop.station.scenario import Scenario
 
 Array = NDArray[np.float64]
 
-#: The file of a drive's inputs.
+#: File of a drive's inputs.
 INPUTS = "inputs.csv"
-#: The inputs change between slices of this length [ms], and a slice is simulated at once.
+#: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
-LENGTH, ANGLE = 1e-5, 1e-4  #: units of place [m] and rotation [rad]
+LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SHARE, _SCALE = 1e-2, 1e-5
 _LONGEST = 36_000_000  # ms; ten hours, as of a scenario
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that a driver may change, in whole numbers.
+    """All inputs that a driver may change, as integers.
 
     Attributes:
-        x, y, z: where the hand wants the stylus, from its start, along the axes of B [10 um].
-        rx, ry, rz: the wanted turn from the start as a rotation vector in B [0.1 mrad].
-        held: 1 while the hand holds the stylus, 0 when it has let go.
-        clutch: 1 while the motion goes to the slave.
-        sigma: share of the gripper's non-contact wrench, of all of it if it is not told apart [%].
-        sigma_object: share of a gripped object's [%].
+        x, y, z: intended position of the stylus from its start, in B [10 um].
+        rx, ry, rz: intended rotation vector from the start, in B [0.1 mrad].
+        held: 1 while the hand holds the stylus.
+        clutch: 1 while motion is transmitted to the slave.
+        sigma: scale of the gripper's (without one: all) non-contact wrench [%].
+        sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
         force_scale: of force and torque, slave to master [1e-5].
-        network, method, grip, sensor: which of `choices.NAMES`.
-        delay, jitter, loss: of the network that is "custom" [0.1 ms, %, 0.1 %].
+        network, method, grip, sensor: index into `NAMES`.
+        delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
         object: 1 while the tool holds an object.
-        detection: 1 if contact is detected.
+        detection: 1 with contact detection.
     """
 
     x: int = 0
@@ -80,14 +79,14 @@ class Inputs:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
-        """Those with which a scenario starts."""
+        """Return the inputs at the start of a scenario."""
         sigma, sigma_object, gamma = (round(s / _SHARE) for s in scenario.force_scaling.scales())
         scale = round(scenario.force_scaling.force_scale / _SCALE)
         started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
         return started.changed(first_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """With other values, each brought into its range; what is no finite number is left out."""
+        """Return inputs with new values, clipped to their ranges, without non-finite ones."""
         changes = {}
         for name in values.keys() & RANGES.keys():
             value, (low, high) = values[name], RANGES[name]
@@ -97,30 +96,30 @@ class Inputs:
 
     @property
     def target(self) -> tuple[int, ...]:
-        """What leads the hand."""
+        """Inputs that move the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property
     def station(self) -> tuple[int, ...]:
-        """What decides which station it is."""
+        """Inputs on which the station depends."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
 
     @property
     def channel(self) -> tuple[int, ...]:
-        """What of that decides about network and method."""
+        """Inputs on which channel and passivity method depend."""
         return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
-        """The wanted X_BE (7,), of (3,) the stylus' position at the start [m]; None: let go."""
+        """Return the intended X_BE (7,) for a start position (3,) [m]; None if released."""
         if not self.held:
             return None
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def held_at(self, pose: Array, start: Array) -> Inputs:
-        """With the hand that wants the stylus at `pose` (7,) X_BE, as nearly as numbers allow."""
+        """Return inputs of a hand that holds the stylus at `pose` (7,) X_BE."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -128,7 +127,7 @@ class Inputs:
 
     @property
     def scales(self) -> dict[str, float]:
-        """As `ForceScaling.SetScales` takes them."""
+        """Arguments of `ForceScaling.SetScales`."""
         return {
             "sigma_gripper": _SHARE * self.sigma,
             "sigma_object": _SHARE * self.sigma_object,
@@ -147,9 +146,9 @@ _CHOICES = {
     **dict.fromkeys(("object", "detection"), (0, 1)),
     "sensor": (0, len(SENSORS) - 1),
 }
-#: The inputs that another station follows from.
+#: Inputs whose change requires another station.
 CHOICES = frozenset(_CHOICES)
-#: Of each input. The hand's box is 0.3 m wide: beyond it the device has its end stops.
+#: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
 RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
     **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
@@ -163,34 +162,25 @@ _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the first lines of a file of inputs.
-
-    Args:
-        made_by: what the motion depends on besides: versions by the name of the package, and so on.
-    """
+    """Return the first lines of a file; `made_by` contains versions and digests by name."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
-    """A line of it: what holds from this time on [ms]."""
+    """Return the line of the inputs from a time on [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
     values |= {name: names[values[name]] for name, names in NAMES.items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """The changes in a file of inputs, with their times [ms]; the last one is the end.
+    """Return the changes in a file with their times [ms]; the last one is the end.
 
-    A last line that was being written when its process was killed is left out.
-
-    Args:
-        path: of the file.
-        made_by: as of `header`, of this process.
+    An incomplete last line is ignored. `made_by` is that of this process.
 
     Raises:
-        DrakeTeleopError: naming file and line, for whatever else is wrong; or if the drive cannot
-            be repeated exactly.
+        DrakeTeleopError: with file and line; or if the drive cannot be repeated exactly.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]

@@ -1,8 +1,7 @@
-"""A drive with its driver and watchers, in the time of any clock; without any page.
+"""A drive with its driver and spectators, on any clock and independent of the page.
 
-One client drives, the others watch; when the driver goes the next client that asks drives. A hand
-that nobody leads lets go at once, with the clutch open; a quarter of a second later simulated time
-stands still and the record is complete on the disk.
+After the driver leaves, the next client that asks drives. Without a driver the hand lets go and the
+clutch opens; a quarter of a second later the simulation stops, with a complete record.
 """
 
 from __future__ import annotations
@@ -31,43 +30,42 @@ from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
 Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
-"""Returns what a frame contains of the 3D scene, at the newest of some rows of a log."""
+"""Function from rows of a log to the 3D scene's part of a frame."""
 
-#: Frames for the page [s].
+#: Period of the frames for the page [s].
 FRAME = 1 / 60
-_SHORTEST = 0.25 * FRAME  # between two of them
-#: The contact force at the hand from which a gamepad vibrates [N].
+_SHORTEST = 0.25 * FRAME  # s, shortest time between two frames
+#: Smallest contact force at the hand that a gamepad displays [N].
 TOUCH = 0.12
-# How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
+# Time without a driver until the simulation stops [s]; most slices between two polls of messages.
 _ALONE, _IN_A_ROW = 0.25, 4
-_KEPT_BACK = 0.05  # N of which it is said
+_KEPT_BACK = 0.05  # N, smallest removed force that the page reports
 _LONGEST_MS = 36_000_000
 _LIMP = {"held": 0, "clutch": 0}
-# Of this package, of Drake, and of Drake's assertions.
+# Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
 
 
 class Live:
-    """What happens when messages and the clock's ticks come in.
+    """Event handler of a drive: messages of pages and ticks of the clock.
 
     Attributes:
-        refused: how many messages were none.
-        stopped: why simulated time stands still until a reset; "" if nothing has failed.
-        asked: the scene that is asked for, "" for none; time stands still until `change`.
-        scene: that is driven.
-        pace: when slices are due.
-        recorded: folders of the drives that are over.
+        refused: number of invalid messages.
+        stopped: failure that stops the simulation until a reset; "" without one.
+        asked: requested scene, "" for none; the simulation waits for `change`.
+        scene: present scene.
+        pace: timing of the slices.
+        recorded: folders of the completed drives.
 
     Args:
-        scenario: as `live_scenario` makes it.
-        load: what the station knows of its load.
-        record: the folder of the record; None for none. If it is not empty, as after a reset, the
-            record goes into the next free one beside it.
-        show: what shows the scene.
+        scenario: from `live_scenario`.
+        load: identified load of the station.
+        record: folder, or if it is not empty the next free one beside it; None for none.
+        show: returns the scene's part of a frame.
         now: the clock [s].
-        link: to a haptic device that is the hand; None for that of a page.
-        log: whether the log is recorded, too, or the inputs that it follows from alone.
-        begin: inputs with which it begins, other than the scenario's.
+        link: to a haptic device; None for the hand of a page.
+        log: whether the log is recorded in addition to the inputs.
+        begin: initial inputs that differ from the scenario's.
     """
 
     def __init__(
@@ -97,7 +95,6 @@ class Live:
         self._begin(now)
 
     def _begin(self, now: float) -> None:
-        """A drive from the scenario's start."""
         folder = None if self._record is None else _free(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
@@ -122,13 +119,12 @@ class Live:
     def change(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
     ) -> None:
-        """A drive of another scenario, the scene that was asked for."""
+        """Start a drive of the requested scene."""
         self._scenario, self._load, self._show = scenario, load, show
         self.scene, self.asked = self.asked, ""
         self._restart(now)
 
     def _restart(self, now: float) -> None:
-        """Close the record and begin again. What fails stops the drive, or is said in it."""
         self.stopped = ""
         self._try(self.end)
         failure = self.stopped
@@ -136,12 +132,12 @@ class Live:
         self._refusal = failure
 
     def refuse(self, why: str, now: float) -> None:
-        """The scene that was asked for cannot be driven; the present one goes on."""
+        """Continue the present scene, and report why the requested one is impossible."""
         self.asked, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know of the scenario."""
+        """Return the constants of the scenario for a page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
@@ -157,20 +153,20 @@ class Live:
         }
 
     def join(self, client: int, now: float) -> None:
-        """A page has connected; the first one drives."""
+        """Add a page; the first one drives."""
         self._clients.append(client)
         if self._driver is None:
             self._hand_over(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """A page has gone. If it was the driver, the hand lets go."""
+        """Remove a page; the hand of the driver lets go."""
         self._clients.remove(client)
         if client == self._driver:
             self._driver, self._alone_since = None, now
             self._wanted, self._steering = self._wanted.changed(_LIMP), Steering()
 
     def hear(self, client: int, text: Any, now: float) -> None:
-        """A message of a page; what is not one changes nothing but a counter."""
+        """Handle a message of a page; count an invalid one."""
         said = parse(text)
         if said is None:
             self.refused += 1
@@ -198,7 +194,6 @@ class Live:
             self._restart(now)
 
     def _hand_over(self, client: int, now: float) -> None:
-        """The client takes hold of the stylus where it is."""
         self._driver = client
         self._wanted, self._steering = self._session.stylus().changed({"clutch": 1}), Steering()
         if self._asleep:
@@ -212,16 +207,16 @@ class Live:
 
     @property
     def still(self) -> bool:
-        """Whether simulated time stands still."""
+        """Whether simulated time is stopped."""
         return self._paused or self._asleep or bool(self.stopped or self.asked)
 
     def wait(self, now: float) -> float:
-        """How long there is nothing to do [s]."""
+        """Return the time until the next slice or frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.still else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulates what is due, at most four slices; gives a frame when one is due."""
+        """Simulate at most four due slices; return a frame if one is due."""
         for _ in range(_IN_A_ROW):
             now = clock()
             if self.still or self.pace.wait(now) > 0:
@@ -233,7 +228,7 @@ class Live:
         if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
             self._asleep = True
             self._try(self._session.keep)
-        # What the driver has just done or touched is shown at once; frames then go along with it.
+        # A new input or contact is shown at once; the schedule of frames then restarts.
         heeded = self._heeded and now >= self._framed + _SHORTEST
         if now < self._frame_due and not heeded:
             return None
@@ -242,7 +237,6 @@ class Live:
         return self.frame()
 
     def _listen(self, now: float) -> None:
-        """A device that speaks drives without a page, too."""
         if self._link is None or self._link.poll(now) is None:
             return
         self._alone_since = now
@@ -251,7 +245,7 @@ class Live:
             self.pace.start(now)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Where the station or the disk cannot go on, the drive stops and says why."""
+        """Run an action; a failure stops the drive with its message."""
         try:
             action()
         except _FAILURES as error:
@@ -268,7 +262,7 @@ class Live:
             present = self._session.inputs
             if self._wanted.station == present.station:
                 self.stopped = one_line(str(error))
-            else:  # there is no such station: the present one goes on
+            else:  # there is no such station: keep the present one
                 self._refusal = one_line(str(error))
                 kept = {name: getattr(present, name) for name in CHOICES}
                 self._wanted = self._wanted.changed(kept)
@@ -283,13 +277,12 @@ class Live:
             self.stopped = "ten hours are over"
 
     def _followed(self, wanted: Inputs) -> Inputs:
-        """The inputs of this slice; what does not move the arm may jump."""
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
         return self._follower.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """What a page is shown now."""
+        """Return the present frame for the pages."""
         rows = self._session.news()
         if len(rows["t"]):
             self._frame = self._cockpit.frame(rows, self._session.inputs) | self._show(rows)
@@ -327,7 +320,7 @@ class Live:
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Completes its record; a device may go on in another drive.
+        """Complete the record; keep the link for the next drive.
 
         Raises:
             CannotWrite: if the record cannot be completed.
@@ -342,7 +335,7 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        """Ends the drive, and the link to a device.
+        """End the drive and the link to a device.
 
         Raises:
             CannotWrite: if the record of any of its drives is incomplete.
@@ -355,8 +348,8 @@ class Live:
 
 
 def _free(folder: Path) -> Path:
-    """Return the folder if it is absent or empty, else the first absent one of DIR-2, DIR-3, ..."""
-    folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no neighbour
+    """Return the folder if it is absent or empty, else the first absent of DIR-2, DIR-3, ..."""
+    folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
     names = (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2))

@@ -1,4 +1,4 @@
-"""The log of a drive, written by a thread beside it: a part takes as long as three slices."""
+"""Log of a drive, written by a separate thread: a part takes as long as three slices."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from drake_teleop.station.simulation import LogOnDisk
 
 
 class LogBeside(LogOnDisk):
-    """`LogOnDisk` that does not wait for the disk until `finish`, or the next part.
-
-    What the disk refuses is raised then. The arguments are those of `LogOnDisk`.
-    """
+    """`LogOnDisk` that waits for the disk only in `finish` and before the next part."""
 
     def __init__(
         self,
@@ -30,10 +27,10 @@ class LogBeside(LogOnDisk):
         self._writing: Future[None] = self._thread.submit(_load)
 
     def finish(self) -> None:
-        """Waits until what has been taken is on the disk.
+        """Wait until all rows taken so far are on the disk.
 
         Raises:
-            DrakeTeleopError: if it cannot be written.
+            DrakeTeleopError: if they cannot be written.
         """
         self._writing.result()
 
@@ -43,5 +40,5 @@ class LogBeside(LogOnDisk):
 
 
 def _load() -> None:
-    """What the first part would wait for: a tenth of a second."""
+    """Import polars on the thread, which takes 0.1 s."""
     import polars  # noqa: F401

@@ -1,4 +1,4 @@
-"""What a page may say: one small JSON object, of which nothing is taken that is not expected."""
+"""Messages of a page: one small JSON object."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from typing import Any
 
 from drake_teleop.live.scenes import SCENES
 
-#: Bytes of a message; a longer one closes the connection.
+#: Largest message [bytes]; a longer one closes the connection.
 LONGEST = 4096
-#: Seconds for one simulated second.
+#: Largest clock time per simulated time.
 SLOWEST = 20.0
 
 
 def parse(text: Any) -> dict[str, Any] | None:
-    """What a message asks for; None if it is not one.
+    """Return the valid requests of a message; None without any.
 
     Returns:
-        Any of "set" (a dict of numbers by input), "rates" (likewise, per simulated second),
-        "pause" (bool), "slow" (1 to 20), "scene" (one of `SCENES`), "reset" and "drive" (True);
-        nothing else is in it.
+        Any of "set" and "rates" (numbers by input), "pause" (bool), "slow" (1 to 20), "scene" (of
+        `SCENES`), "reset" and "drive" (True).
     """
     if not isinstance(text, str) or len(text) > LONGEST:
         return None
@@ -46,7 +45,6 @@ def parse(text: Any) -> dict[str, Any] | None:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a number of a size that means something; true and false are none."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
     return abs(value) < 1e15 and math.isfinite(value)

@@ -1,4 +1,4 @@
-"""The folder of a recorded drive, while it is driven."""
+"""Folder of a recorded drive during the drive."""
 
 from __future__ import annotations
 
@@ -18,15 +18,12 @@ from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
 
 LOAD, SCENARIO = "load.npz", "scenario.yaml"
-#: If this file exists, the hand's place in the inputs is that of a device.
+#: Marker file: the positions in the inputs are those of a haptic device.
 DEVICE = "device.txt"
 
 
 def made_by(scenario: Scenario) -> dict[str, str]:
-    """Return what the motion of a drive depends on besides its inputs, by name.
-
-    Versions, and a digest of the files that the scenario names, such as models.
-    """
+    """Return versions and a digest of the scenario's files, by name."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
         value = left.pop()
@@ -39,15 +36,10 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """The folder of a drive without its log.
-
-    Args:
-        folder: absent, or without a drive.
-        scenario, load, device: as of `Session`.
-        inputs: at the start.
+    """Folder of a drive without its log.
 
     Raises:
-        CannotWrite: if there is a drive, or no room.
+        CannotWrite: if the folder contains a drive, or the disk is full.
     """
 
     def __init__(
@@ -61,7 +53,7 @@ class Record:
     ) -> None:
         make_folder(folder)
         self._folder, path, self._last = folder, folder / INPUTS, ""
-        with naming(path):  # never that of another drive
+        with naming(path):  # mode x never overwrites another drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
             write_scenario(folder / SCENARIO, scenario)
@@ -76,7 +68,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Records a change at once: it outlives the process."""
+        """Write a change at once, so that it survives the end of the process."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -88,7 +80,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end of the drive; remove the record of a drive that never began."""
+        """Write the end of the drive; remove the record of one that never started."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)
@@ -98,7 +90,7 @@ class Record:
     def _remove(self) -> None:
         with suppress(OSError):
             self._file.close()
-        with suppress(OSError):  # a file of somebody else is in the folder
+        with suppress(OSError):  # the folder contains other files
             for name in (INPUTS, SCENARIO, LOAD, DEVICE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()

@@ -1,4 +1,4 @@
-"""What there is to touch in a drive: stations to choose from in the page."""
+"""Scenes of a drive: stations that the page offers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from drake_teleop.live.session import live_scenario
 from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
-#: Scene -> a shipped scenario; "own" is what the drive was begun with.
+#: Shipped scenario of each scene; "own" is the scenario of the drive.
 _SHIPPED = {
     "leaf": "touch",
     "slot": "peg_in_slot",
@@ -17,12 +17,7 @@ SCENES = ("own", *_SHIPPED)
 
 
 def scene(name: str, own: Scenario) -> Scenario:
-    """A scenario to drive.
-
-    Args:
-        name: one of `SCENES`.
-        own: that the drive was begun with.
-    """
+    """Return the scenario of one of `SCENES`; "own" is the drive's first scenario."""
     if name == "own":
         return own
     scenario = LoadScenario(_SHIPPED[name])

@@ -1,7 +1,7 @@
-"""`drake-teleop drive`: one page on this machine, and the socket that drives.
+"""Server of `drake-teleop drive`: one page on this machine and its socket.
 
-One port of 127.0.0.1 serves page, 3D viewer, scenes and socket, to clients that send the token of
-the address; the socket, to this page alone. Nothing else listens.
+One port of 127.0.0.1 serves page and scenes to clients with the token of the address, and the
+socket only to this page. No other port is open.
 """
 
 from __future__ import annotations
@@ -52,25 +52,25 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
 _HOST = "127.0.0.1"
 _MOST_CLIENTS = 8
-# Turns of the loop from a socket that can be read to what has been said: one wakes its reader.
+# Iterations of asyncio's loop from a readable socket to a handled message.
 _STEPS_OF_A_MESSAGE = 3
-_BEHIND = 2**18  # bytes that wait for a slow page, before it misses frames
-# s: for the clients, for the thread of the drive.
+_BEHIND = 2**18  # unsent bytes above which a slow page misses frames
+# Timeouts of the clients and of the drive's thread [s].
 _CLOSES, _ENDS = 1.0, 4.0
 _OR_DEVICE = ("", " or until the device sends")
-# Of websockets' log everything else is about connections that failed, which a client causes.
+# All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
 
 
 class LiveDrive:
-    """A station that is being driven, in a thread of its own.
+    """A drive on its own thread.
 
     Attributes:
-        url: of the page; whoever has it may drive.
-        recorded: folders of the drives that are over.
-        ended: afterwards, why simulated time had stopped; "" if it had not.
-        ms: afterwards, the simulated time [ms].
+        url: of the page; its token permits to drive.
+        recorded: folders of the completed drives.
+        ended: after the end, why the simulation had stopped, or "".
+        ms: after the end, the simulated time [ms].
     """
 
     def __init__(
@@ -100,12 +100,10 @@ class LiveDrive:
         self._check()
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Start a thread that ends with the drive."""
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
         self._threads[-1].start()
 
     def _prepare(self, scenario: Scenario, device: bool) -> None:
-        """Identify the load, and make the 3D scenes before anything listens."""
         with show_progress(True) as stage:
             self._load = _load_of(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
@@ -121,7 +119,7 @@ class LiveDrive:
         told(1.0)
 
     def wait(self) -> None:
-        """Wait until the drive is over: after `stop`, or Ctrl-C.
+        """Wait for the end of the drive, by `stop` or Ctrl-C.
 
         Raises:
             DrakeTeleopError: if the record is not complete.
@@ -134,7 +132,7 @@ class LiveDrive:
         self._check()
 
     def until_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM, and return which.
+        """Wait for Ctrl-C or SIGTERM and return its name.
 
         Raises:
             DrakeTeleopError: if the record is not complete.
@@ -147,7 +145,6 @@ class LiveDrive:
             return str(signal) or "Ctrl-C"
 
     def _check(self) -> None:
-        """Raise what ended the drive, if it was an error."""
         if self._failed is not None:
             raise self._failed
 
@@ -158,9 +155,9 @@ class LiveDrive:
             thread.join()
 
     def _end(self) -> None:
-        """Stop within 4 s, whatever further signals come.
+        """Stop within 4 s, also if further signals arrive.
 
-        Compiled code in another thread cannot be ended, and Python may crash at its exit then.
+        Compiled code on another thread cannot be ended, and Python may crash at its exit then.
         """
         self._stop.set()
         end = time.monotonic() + _ENDS
@@ -178,11 +175,10 @@ class LiveDrive:
         return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
 
     def _run(self, scenario: Scenario, record: Path | None) -> None:
-        """Run the drive on its thread."""
         try:
             self._live = self._make(scenario, record)
             asyncio.run(self._serve())
-        except (Exception, SystemExit) as error:  # the second is a failed assertion of Drake
+        except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
         finally:
             if self._device is not None:
@@ -231,7 +227,6 @@ class LiveDrive:
                     await asyncio.wait_for(server.wait_closed(), 2 * _CLOSES)
 
     async def _drive(self, server: Server) -> None:
-        """The one loop: slices and frames, and messages whenever there is time between them."""
         refusal = ""
         with without_collections():
             while not self._stop.is_set():
@@ -251,10 +246,7 @@ class LiveDrive:
                 await self._sleep()
 
     async def _sleep(self) -> None:
-        """Until there is something to do; then messages that have come are listened to.
-
-        As asyncio waits in whole milliseconds, the last one is slept through without it.
-        """
+        """Wait until the next event, then handle waiting messages."""
         rest = self._live.wait(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
@@ -263,7 +255,6 @@ class LiveDrive:
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
-        """Identify the load on another thread, which may take minutes."""
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
         scenario, show = self._offered[live.asked], self._views[live.asked].show
@@ -289,8 +280,6 @@ class LiveDrive:
                 await page.send(self._hello(page))
 
     def _until_stopped(self, name: str) -> Progress:
-        """A stage that ends its computation when the drive ends."""
-
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the drive has ended")
@@ -304,7 +293,7 @@ class LiveDrive:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Serve a file, or let a socket be opened; refuse everything that is not our own page's."""
+        """Serve a file or open a socket, only for our page."""
         host = f"{_HOST}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
@@ -328,7 +317,6 @@ class LiveDrive:
         return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
 
     async def _meet(self, connection: ServerConnection) -> None:
-        """A page, from its first message to its last."""
         live = self._live
         if len(connection.server.connections) > _MOST_CLIENTS:
             await connection.close(1013, "too many pages")
@@ -349,7 +337,7 @@ class LiveDrive:
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
-    """What the station is told of its load; with its noise, so that contact may be detected."""
+    """Return the identified load with its noise floor, None if it is estimated online."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -357,9 +345,9 @@ def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | Non
 
 
 def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile what the first slices need before anybody waits for them: a minute, once."""
+    """Compile the functions of the first slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
-    for z in (-1, -2):  # one row first, then several: to numba they are of different types
+    for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.frame(session.news(), session.inputs)
         session.apply(session.inputs.changed({"z": z}))
         session.advance()
@@ -389,21 +377,21 @@ def drive(
     browser: bool = False,
     device: str | None = None,
 ) -> LiveDrive:
-    """Drives a station in the browser: its hand by mouse, keys, gamepad or touch.
+    """Drive a station in the browser: its hand by mouse, keys, gamepad or touch.
 
-    The drive goes on in a thread of its own. In a notebook the page is shown where the value of
-    this call is; elsewhere open its `url`. `wait()` returns when it is over, `stop()` ends it.
+    The drive runs on its own thread: `wait()` returns at its end, `stop()` ends it. A notebook
+    shows the page as the value of this call; elsewhere open its `url`.
 
     Args:
-        scenario: or the name of a shipped one, or a YAML file. Its operator gives the grip alone.
-        record: a folder for the drive, which `run --inputs` repeats; None for none.
-        port: of 127.0.0.1; 0 for any that is free.
-        browser: whether to open the page in the user's browser.
-        device: a haptic device that is the hand: udp://127.0.0.1:PORT, on which one is listened
-            to, or haply://localhost:10001.
+        scenario: or a shipped name, or a YAML file; only the grip of its operator is used.
+        record: folder of the drive, which `run --inputs` repeats; None for none.
+        port: of the page on 127.0.0.1; 0 for any free port.
+        browser: whether to open the page.
+        device: haptic device that replaces the hand: udp://127.0.0.1:PORT of a device client, or
+            haply://localhost:10001.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used, or a port is taken.
+        DrakeTeleopError: if the scenario is invalid, or the port is in use.
     """
     if not isinstance(scenario, Scenario):
         scenario = LoadScenario(scenario)
@@ -417,10 +405,10 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """`drake-teleop drive`: until Ctrl-C or SIGTERM.
+    """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: as `drive`; if the record is not complete; or with what had stopped it.
+        DrakeTeleopError: as `drive`, or if the drive had stopped or its record is not complete.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
@@ -433,10 +421,10 @@ def drive_command(
 
 
 def waits(device: str | None) -> str:
-    """Return what a drive waits for, for the terminal."""
+    """Return for which event a drive waits."""
     return "nothing runs until that page is open" + _OR_DEVICE[device is not None]
 
 
 def _tell(text: str) -> None:
-    """Tell on the terminal what no page may show."""
+    """Print on stderr, which no page shows."""
     print(text, file=sys.stderr, flush=True)

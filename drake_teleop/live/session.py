@@ -1,8 +1,7 @@
-"""A station that runs in slices, and takes its inputs between them; without any clock or page.
+"""A station that runs in slices and takes its inputs between them; without clock and page.
 
-The inputs alone decide what happens: `repeat` simulates a recorded drive again, bit by bit,
-however it was cut into slices. A recorded drive is a folder with `scenario.yaml`, `load.npz` (what
-the station knew of its load), `inputs.csv` and `log.parquet`.
+The motion depends on the inputs alone: `repeat` gives the same log, for any division into slices.
+A recorded drive is a folder with `scenario.yaml`, `load.npz`, `inputs.csv` and `log.parquet`.
 """
 
 from __future__ import annotations
@@ -36,25 +35,21 @@ from drake_teleop.station.signals import LOG, SIGNALS, signal_of
 from drake_teleop.station.simulation import MakeSimulator, advance, columns, read_log
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
-#: Of a log on disk: two seconds. A longer part takes longer to copy, which a driver would notice; a
-#: file of its own takes 10 ms of CPU however short it is.
+#: Rows in a part of a log on disk, two seconds. Copying a longer part would delay a slice; each
+#: part takes at least 10 ms of CPU.
 _PART_ROWS = 2000
-# Of a change of scales [s]. A slider that is moved changes them 60 times a second, and each ramp
-# begins slowly: with longer ones nothing would happen until it rests.
+# Duration of a change of scales [s]. A moving slider starts a ramp 60 times a second, and ramps
+# start slowly: longer ones would not progress until the slider rests.
 _RAMP = 0.05
-# The shortest step that error control may ask for [s]: a slice in contact has time for no more.
-# A third-order step follows vibrations up to 1.7 / step = 1.1 kHz without exciting them; the ball
-# on a leaf vibrates at up to 700 Hz.
+# Shortest step of error control [s], for real time in contact. A third-order step is stable for
+# vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
 _SHORTEST_STEP = 2.5e-4
-#: By how much another channel may raise what a pressing hand feels [N].
+#: Largest increase of the rendered force after a change of channel [N].
 _MOST_RISE = 0.9
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """A scenario as it is driven: without intent, task and settling time.
-
-    Its steps are controlled, see `_Station`.
-    """
+    """Return a scenario without intent, task and settling, with error-controlled steps."""
     return replace(
         scenario,
         operator__intent=[],
@@ -67,9 +62,9 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 
 def with_all_signals(log: SimulationResult) -> SimulationResult:
-    """A log with what only some stations have: a channel's signals, and contact that is detected.
+    """Return a log that has the signals of channel and contact detection.
 
-    Without a channel the slave receives the command of now, and no energy is counted.
+    Without a channel the received pose is the present command, and energies are 0.
     """
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
@@ -82,13 +77,13 @@ def with_all_signals(log: SimulationResult) -> SimulationResult:
 
 
 class _Station:
-    """A station that runs, and what of it is spoken to.
+    """A running station, and access to its blocks and signals.
 
     Args:
         scenario: of the station.
-        estimate: what it knows of its load.
-        load: whose noise floor it knows.
-        number: of the stations of this drive, which have different noise; the first is 0.
+        estimate: load estimate (16,).
+        load: with the noise floor.
+        number: of the station in this drive, from 0; added to the seed.
         device: as of `Session`.
     """
 
@@ -111,33 +106,30 @@ class _Station:
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
-        if scenario.simulation.integrator == "runge_kutta3":  # the one with error control
+        if scenario.simulation.integrator == "runge_kutta3":  # has error control
             take_short_steps_in_contact(self.simulator, _SHORTEST_STEP)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
         self.columns = columns(self.station)
 
     def block(self, name: str) -> tuple[Any, Context]:
-        """A block, and its context."""
         led = self.station.GetSubsystemByName("master_side").GetSubsystemByName("led")
         inside = led.HasSubsystemNamed(name)
         found = led.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
         return found, found.GetMyMutableContextFromRoot(self.context)
 
     def value(self, signal: str) -> NDArray[np.float64]:
-        """A signal now."""
         values: NDArray[np.float64] = self.station.GetOutputPort(signal).Eval(self.context).copy()
         return values
 
     def open(self, closed: bool) -> None:
-        """Opens or closes the clutch."""
         self.station.GetInputPort("clutch").FixValue(self.context, [float(closed)])
 
     def follow(self, other: _Station, channel_anew: bool) -> float:
-        """Goes on where another station is; returns how long its clutch has to be open [s]."""
+        """Continue another station's state; return how long the clutch stays open [s]."""
         anew = {"channel"} if channel_anew else set()
         if not self.scenario.load_estimator.enabled:
-            anew.add("load_estimator")  # it was told something else
+            anew.add("load_estimator")  # its configured load differs
         hand_on(other.station, other.context, self.station, self.context, anew)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block("wrist_sensor")
@@ -167,19 +159,19 @@ class _Station:
 
 
 class Session:
-    """A running station with a hand that is led.
+    """A running station with a hand that follows inputs.
 
     Attributes:
-        scenario: that is driven, as `live_scenario` makes it.
-        inputs: that hold now.
+        scenario: of the drive, from `live_scenario`.
+        inputs: in force now.
         ms: simulated time since the start [ms].
 
     Args:
         scenario: to drive.
-        load: what the station knows of its load; None if it learns it.
-        log: a folder for the log; None keeps it in memory, until `news` has told of it.
-        record: where scenario, load and inputs go to; None for nowhere.
-        device: whether the inputs' place is that of a haptic device, and not what a hand wants.
+        load: identified load; None if it is estimated online.
+        log: folder of the log; None keeps it in memory until `news` returns it.
+        record: folder of scenario, load and inputs; None for none.
+        device: whether positions are those of a haptic device.
     """
 
     def __init__(
@@ -207,7 +199,7 @@ class Session:
         self._now.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
-        """Sets the inputs from now on, and records them if they are others.
+        """Set the inputs from now on; record a change.
 
         Raises:
             DrakeTeleopError: if there is no such station; then nothing has changed.
@@ -230,7 +222,6 @@ class Session:
             self._record.write(self.ms, inputs)
 
     def _change(self, inputs: Inputs) -> None:
-        """Goes on with another station."""
         scenario = chosen(self.scenario, self._load, inputs)
         scenario.check()
         estimate = known_estimate(self.scenario, self._load, scenario)
@@ -244,16 +235,16 @@ class Session:
         else:
             self._earlier.append(self._rows())
         station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
-        station.sink.Clear()  # the row of now, which the other station has recorded
+        station.sink.Clear()  # the previous station has recorded this row
         self._now, self._seen, self._stations = station, 0, self._stations + 1
 
     @property
     def filling(self) -> bool:
-        """Whether the clutch is open because a new channel is not filled yet."""
+        """Whether the clutch is open because a new channel delivers no packets yet."""
         return self.ms < self._fills_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
-        """Simulates the next `ms` milliseconds."""
+        """Simulate the next `ms` milliseconds."""
         end = self.ms + ms
         if self.ms < self._fills_ms <= end:
             self._advance_to(self._fills_ms)
@@ -265,13 +256,13 @@ class Session:
 
     def _advance_to(self, ms: int) -> None:
         self.ms = ms
-        # A product, as Drake's event times are: see `simulate`.
+        # The same product as Drake's event times, see `simulate`.
         advance(self._now.simulator, 1e-3 * ms)
 
     def news(self) -> dict[str, NDArray[np.float64]]:
-        """The rows of the log since the last call: (n, k) by signal, and "t" (n,) [s].
+        """Return the rows since the last call: (n, k) by signal, and "t" (n,) [s].
 
-        What was not recorded is forgotten. Call it at least once a second.
+        Without a recorded log they are then discarded. Call it at least once a second.
         """
         sink, seen = self._now.sink, self._seen
         data, times = sink.data()[:, seen:].T.copy(), sink.sample_times()[seen:]
@@ -285,7 +276,7 @@ class Session:
         return found
 
     def pressed(self) -> float:
-        """The calculated contact force of the log's last row, at the hand [N]; 0 if unknown."""
+        """Return the last contact force at the hand's scale [N]; 0 if unknown."""
         part, sink = self._now.columns.get("contact_wrench_S"), self._now.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -293,22 +284,22 @@ class Session:
         return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
 
     def stylus(self) -> Inputs:
-        """The inputs of a hand that takes hold of the stylus where it is, without pulling."""
+        """Return inputs of a hand that takes the stylus at its pose."""
         return self.inputs.held_at(self._now.value("pose_master"), self._start)
 
     def force(self) -> NDArray[np.float64]:
-        """(6,) what a device shall display now [N, N m]."""
+        """Return the wrench (6,) for the device [N, N m]."""
         return self._now.value("force_to_master")
 
     def kept_back(self) -> float:
-        """What another channel has brought, and the hand does not feel until it eases off [N]."""
+        """Return the force that the limit of a new channel removes [N]."""
         if self._stations == 1:
             return 0.0
         over, context = self._now.block("goes_over")
         return float(over.kept_back(context))
 
     def keep(self) -> None:
-        """Brings everything until now to the disk; the session may go on."""
+        """Write all rows and inputs until now; the session may continue."""
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -319,14 +310,14 @@ class Session:
         return with_all_signals(read_log(self._now.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        """What is in memory of the log."""
+        """Return the rows of the log that are in memory."""
         parts = [*self._earlier, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """Ends the record; that of a drive that never began is removed."""
+        """End the record; remove that of a drive that never started."""
         record, self._record = self._record, None
         try:
             if record is not None:
@@ -341,11 +332,11 @@ class Drive:
     """A recorded drive.
 
     Attributes:
-        scenario: that was driven, as long as it was.
-        load: what the station knew of its load.
+        scenario: of the drive, with its duration.
+        load: identified load of the station.
         changes: of the inputs, with their times [ms]; the last is the end.
-        device: whether a haptic device was its hand.
-        folder: of the recording.
+        device: whether a haptic device was the hand.
+        folder: of the record.
     """
 
     scenario: Scenario
@@ -360,10 +351,10 @@ class Drive:
 
 
 def read_drive(folder: str | Path) -> Drive:
-    """Reads the folder of a recorded drive.
+    """Return the recorded drive in a folder.
 
     Raises:
-        DrakeTeleopError: if it is none, or naming what in it cannot be used.
+        DrakeTeleopError: with the invalid file.
     """
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO)
@@ -379,13 +370,13 @@ def read_drive(folder: str | Path) -> Drive:
 def repeat(
     drive: Drive, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
 ) -> SimulationResult:
-    """Simulates a recorded drive again; the log is the same, bit by bit.
+    """Simulate a recorded drive again; the log is the same, bit by bit.
 
     Args:
-        drive: as `read_drive` reads it.
+        drive: from `read_drive`.
         progress: called with the fraction done.
-        log: a folder that the log goes to; None for one in memory.
-        slice_ms: what is simulated at once, between changes [ms].
+        log: folder of the log; None for one in memory.
+        slice_ms: longest step between changes [ms].
     """
     session = Session(drive.scenario, drive.load, log=log, device=drive.device)
     end = drive.changes[-1][0]

@@ -1,4 +1,4 @@
-"""Steps of a station that has to be in time while its tool bounces."""
+"""Integration steps of a station in real time while its tool bounces."""
 
 from __future__ import annotations
 
@@ -10,28 +10,26 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 
 _NOTHING = EventStatus.DidNothing()
-# s: for so long after a step that was too long, all are short.
+# Duration of short steps after a rejected one [s].
 _STAYS_SHORT = 4e-3
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Lets error control ask for no shorter steps, and not ask again for a while where it did.
+    """Bound the steps of error control from below, and keep them short after a rejection.
 
-    A step that error control rejects takes time and leads nowhere; where a tool bounces that would
-    be two of five. After one all steps are the shortest that it may ask for, and 4 ms later it is
-    asked again.
+    A bouncing tool makes error control reject two of five steps, which takes time. It resumes 4 ms
+    after a rejection.
 
     Args:
-        simulator: of a station, with an integrator that has error control.
-        shortest: step that error control may ask for [s]; the integrator's longest if that is
-            shorter.
+        simulator: of a station, whose integrator has error control.
+        shortest: step of error control [s]; at most the integrator's longest.
     """
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
     shortest = min(shortest, longest)
     integrator.set_requested_minimum_step_size(shortest)
     integrator.set_throw_on_minimum_step_size_violation(False)
-    # What the simulator calls must not keep it alive.
+    # The monitor must not keep the simulator alive.
     station: Any = weakref.ref(simulator)
     rejected, until = 0, math.inf
 

@@ -1,10 +1,8 @@
-"""The station of a task under a condition, and what an interval in it was.
+"""Station and stimulus of an experiment's task under a condition.
 
-The level of a stimulus goes into the inputs of a drive, in their whole numbers. A contact of F
-newton at the tool, for somebody who presses with P, is the share gamma F / P of what is touched;
-in the other interval it is none, so that eyes see the same in both. A mass of m at the hand is a
-share sigma of the load, more than the condition has (of a held object, if the condition has eta).
-What counts as the level is what it then was: with the force that was pressed with.
+Integer inputs of a drive set the stimulus. To render F newton of a contact force P at the tool,
+gamma is scaled by F / P; the other interval has gamma = 0. For a mass m at the hand, sigma (or the
+eta of a held object) is increased. The recorded level uses the measured contact force.
 """
 
 from __future__ import annotations
@@ -37,26 +35,26 @@ from drake_teleop.station.slave.plant import NominalSlave
 Array = NDArray[np.float64]
 
 _MOST = RANGES["gamma"][1]  # %
-# A contact force counts when it lasts [s], and as a touch from here on [N].
+# Averaging time of a contact force [s], and smallest force of a touch [N].
 _LASTS, _TOUCHED = 0.02, 0.5
-# Of the slot: the tip stands so near the floor [m], for so long [s].
+# The tip is on the floor of the slot within this distance [m] for this time [s].
 _NEAR, _STANDS = 2e-3, 0.2
 
 
 def load_of(scenario: Scenario) -> IdentifiedLoad | None:
-    """What a station is told of its load, if it does not learn it."""
+    """Return the identified load; None if the station estimates it online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """A task under a condition.
+    """Station of a task under a condition.
 
     Attributes:
-        task, condition: which.
-        scenario: with the condition's network and method, and its object if there is one.
-        load: what the station knows of it.
-        mass: at the hand, of the load or object whose share is felt [kg].
+        task, condition: of the experiment.
+        scenario: with the condition's network, method and object.
+        load: identified load of the station.
+        mass: of the load or object at the hand [kg].
     """
 
     task: Task
@@ -66,11 +64,11 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Those of an interval, in the units of `Inputs`.
+        """Return the inputs of an interval, in the units of `Inputs`.
 
         Args:
-            level: of its stimulus; 0 for none.
-            pressed: the contact force at the tool that is expected [N].
+            level: of the stimulus; 0 for none.
+            pressed: expected contact force at the tool [N].
         """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
@@ -85,11 +83,11 @@ class Apparatus:
         return {name: min(round(value), _MOST) for name, value in values.items()}
 
     def felt(self, shown: float, inputs: dict[str, int], rows: Rows) -> Felt:
-        """What an interval was.
+        """Return the result of an interval.
 
         Args:
-            shown: the level that it should have; 0 for none.
-            inputs: as above.
+            shown: intended level; 0 for none.
+            inputs: of the interval.
             rows: of its log.
         """
         force = rows.force()
@@ -106,12 +104,12 @@ class Apparatus:
 def make_apparatus(
     task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
-    """The station of a task under a condition, to be driven.
+    """Return the station of a task under a condition.
 
     Args:
-        task, condition: which.
+        task, condition: of the experiment.
         scenario: of the task.
-        load: that was identified in it.
+        load: identified in this scenario.
 
     Raises:
         DrakeTeleopError: if there is no such station.
@@ -142,15 +140,11 @@ def make_apparatus(
 
 
 class Rows:
-    """The log of an interval, as it comes in.
+    """Measures of an interval's log, row by row.
 
     Attributes:
         time: of the last row [s].
-        done_at: when the tool had come to the floor of the slot [s]; 0 before.
-
-    Args:
-        task: that is done.
-        scenario: that is driven; with the task's slot, if it has one.
+        done_at: time at which the tool reached the floor of the slot [s]; 0 before.
     """
 
     def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
@@ -162,7 +156,7 @@ class Rows:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """The newest rows, as `Session.news` gives them."""
+        """Add the newest rows, from `Session.news`."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -173,7 +167,6 @@ class Rows:
             self._look(self._insert, rows)
 
     def _look(self, insert: Insert, rows: dict[str, Array]) -> None:
-        """Whether the tip stands on the slot's floor."""
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
@@ -185,14 +178,13 @@ class Rows:
             self.done_at = self._on_floor
 
     def force(self) -> float:
-        """The largest contact force at the tool that lasted for 20 ms [N]."""
+        """Return the largest 20 ms mean of the contact force at the tool [N]."""
         return _largest(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """The largest change of the felt force that lasted for 20 ms [N].
+        """Return the largest change of the rendered force [N] after the time `after` [s].
 
-        Args:
-            after: what was felt in the tenth of a second before is what it changes from [s].
+        It is averaged over 20 ms, and relative to the mean over the 0.1 s before.
         """
         felt = np.concatenate(self._felt)
         begin = round(after / self._dt)
@@ -201,7 +193,6 @@ class Rows:
 
 
 def _largest(values: Array, dt: float) -> float:
-    """Of the means over 20 ms."""
     n = max(1, round(_LASTS / dt))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[n:] - sums[:-n]) / n

@@ -1,6 +1,6 @@
-"""What an experiment asks of its participants, and under which conditions: the file."""
+"""Design of an experiment: its YAML file with tasks and conditions."""
 
-# No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
+# No postponed annotations: yaml_load_typed reads the types of the fields.
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,7 @@ _FOLDER = Path(__file__).parent
 @settings
 @dataclass
 class Condition:
-    """What differs between trials, and is hidden from the participant."""
+    """Condition of a trial, hidden from the participant."""
 
     name: str = plain("", "for tables and pictures; no participant sees it")
     sigma: float = quantity(0.0, "1", 0.0, 3.0, "share of the non-contact wrench that is felt")
@@ -50,7 +50,7 @@ class _Task:
 @settings
 @dataclass
 class ContactDetection(_Task):
-    """In which of two intervals was the contact felt? The tool touches in both."""
+    """In which of two intervals was the contact rendered? The tool touches in both."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "least contact force at the tool that is shown")
     high: float = quantity(20.0, "N", 1e-2, 1e3, "largest one, also that of practice")
@@ -61,7 +61,7 @@ class ContactDetection(_Task):
 @settings
 @dataclass
 class ApparentMass(_Task):
-    """In which of two intervals was the tool heavier? It is moved to and fro in both."""
+    """In which of two intervals was the tool heavier? It is moved back and forth in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "least additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest one, also that of practice")
@@ -71,7 +71,7 @@ class ApparentMass(_Task):
 @settings
 @dataclass
 class PegInSlot(_Task):
-    """The tool goes into the slot, down to its floor: how long it takes, and with which force."""
+    """Insertion of the tool into a slot, with completion time and largest contact force."""
 
     scenario: str = plain("insert", "as of the others; its operator has a task !Insert")
     trials: int = quantity(8, "1", 1, 1000, "of each condition")
@@ -85,9 +85,9 @@ Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
 @settings
 @dataclass
 class SimulatedParticipant:
-    """Who takes part with `--simulated`: feels the station's force with noise, and compares.
+    """Participant of `--simulated`, who compares the rendered force with normal noise.
 
-    The response to an interval is the largest change of the felt force, plus normal noise.
+    The response to an interval is the largest change of the rendered force.
     """
 
     noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
@@ -100,7 +100,7 @@ class SimulatedParticipant:
 @settings
 @dataclass
 class Experiment:
-    """A blind experiment: the tasks, and the conditions that they are done under."""
+    """Blind experiment: tasks, and conditions of its trials."""
 
     description: str = plain("", "what the experiment is about; no participant sees it")
     consent: str = plain("", "what participants read first, and agree to")
@@ -116,10 +116,10 @@ class Experiment:
     simulated: SimulatedParticipant = field(default_factory=SimulatedParticipant)
 
     def check(self, where: str) -> None:
-        """Checks all that can be checked without the scenarios.
+        """Check the experiment without its scenarios.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
@@ -153,21 +153,18 @@ class Experiment:
 
 
 def ExperimentNames() -> list[str]:
-    """The experiments that are shipped."""
+    """Return the names of the shipped experiments."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Loads and checks an experiment's file.
+    """Return a checked experiment, and the scenario of each task.
 
     Args:
-        path: or the name of one that is shipped.
-
-    Returns:
-        The experiment, and the scenario of each task.
+        path: of a YAML file, or the name of a shipped one.
 
     Raises:
-        DrakeTeleopError: naming file and field of what is wrong.
+        DrakeTeleopError: with the file and the invalid field.
     """
     expect((str, Path), path, "study")
     names = ExperimentNames()

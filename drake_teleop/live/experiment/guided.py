@@ -1,8 +1,7 @@
-"""A drive in which a participant is led through an experiment; without any page.
+"""Experiment of one participant, in place of `Live`.
 
-It takes the place of `Live`: each interval is a `Live` of its own, from the scenario's start, and a
-recorded drive, which `run --inputs` repeats. The page is told what the hand feels, for it has to
-come to the hand, and nothing else of the forces, of the condition, or of the stimulus.
+Each interval is a `Live` with its own record, which `run --inputs` repeats. The page receives the
+rendered force for the display, but no other force, condition or stimulus.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from drake_teleop.live.live import FRAME, Live, Show
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
-#: Between the intervals of a trial [s].
+#: Pause between the intervals of a trial [s].
 _GAP = 0.8
 _KNOWN = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
@@ -38,26 +37,26 @@ _HIDDEN = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "s
 
 
 def unseen(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The rows without what would draw forces."""
+    """Return rows without the forces that the 3D scene would draw."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
 
 class Guided:
-    """What happens when messages and the clock's ticks come in; as `Live` has it.
+    """Event handler of an experiment, with the interface of `Live`.
 
     Attributes:
-        refused: how many messages were none.
-        asked: always "": there is no scene to ask for.
+        refused: number of invalid messages.
+        asked: always "", there are no scenes.
 
     Args:
         procedure: of the participant.
         stations: of each task and condition.
         scenarios: of the tasks.
-        store: beside whose trials the drives are recorded.
-        shows: what shows the scene of each task.
+        store: of the trials; the drives are recorded in its folder.
+        shows: scene's part of a frame, for each task.
         now: the clock [s].
-        link: to a haptic device that is the hand.
+        link: to a haptic device.
     """
 
     def __init__(
@@ -80,7 +79,7 @@ class Guided:
         self._prepare(now)
 
     def _prepare(self, now: float) -> None:
-        """The station of the next interval, at its start."""
+        """Start the station of the next interval."""
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared
         self._apparatus = self._stations[trial.task, trial.condition]
@@ -109,7 +108,7 @@ class Guided:
         return self._show(unseen(rows))
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know."""
+        """Return the constants for a page."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -117,7 +116,7 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """A page has connected; the first one drives."""
+        """Add a page; the first one drives."""
         self._clients.append(client)
         if self._driver is None:
             self._hand_over(client, now)
@@ -128,7 +127,7 @@ class Guided:
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """A page has gone. If it was the driver, the trial will begin again."""
+        """Remove a page; after the driver's, the trial starts again."""
         self._clients.remove(client)
         if client == self._driver:
             self._leave_alone(now)
@@ -142,7 +141,6 @@ class Guided:
         self._keep_up(now)
 
     def _keep_up(self, now: float) -> None:
-        """Another interval has its own station."""
         with self._noting():
             if self._procedure.prepared != self._prepared:
                 self._live.end()
@@ -150,14 +148,14 @@ class Guided:
 
     @contextmanager
     def _noting(self) -> Iterator[None]:
-        """Keep what cannot be written for `tick`, which ends the experiment with it."""
+        """Keep a `CannotWrite` for `tick`, which ends the experiment with it."""
         try:
             yield
         except CannotWrite as error:
             self._unwritten = str(error)
 
     def hear(self, client: int, text: Any, now: float) -> None:
-        """A message of a page; what is not one changes nothing but a counter."""
+        """Handle a message of a page; count an invalid one."""
         said = parse_study(text)
         if said is None:
             self.refused += 1
@@ -184,12 +182,12 @@ class Guided:
             self._live.pace.start(now)
 
     def wait(self, now: float) -> float:
-        """How long there is nothing to do [s]."""
+        """Return the time until the next slice or frame [s]."""
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
     def stopped(self) -> str:
-        """Why simulated time stands still; "" if nothing has failed."""
+        """Failure that stops the simulation, or ""."""
         return self._live.stopped
 
     @property
@@ -202,7 +200,7 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulates what is due; gives a frame when one is due.
+        """Simulate the due slices; return a frame if one is due.
 
         Raises:
             CannotWrite: if a trial or a drive cannot be written.
@@ -223,7 +221,6 @@ class Guided:
         return self.frame()
 
     def _look(self, now: float) -> None:
-        """Whether the interval is over."""
         task, live = self._procedure.task, self._live
         slot = isinstance(task, PegInSlot)
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
@@ -237,7 +234,7 @@ class Guided:
         self._keep_up(now)
 
     def frame(self) -> dict[str, Any]:
-        """What a page is shown now."""
+        """Return the present frame for the pages."""
         inner = self._live.frame()
         felt = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
@@ -260,7 +257,7 @@ class Guided:
         }
 
     def close(self) -> None:
-        """Ends the drive; its trials are on the disk."""
+        """End the drive."""
         self._live.close()
         if self._link is not None:
             self._link.close()

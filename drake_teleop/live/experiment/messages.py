@@ -1,4 +1,4 @@
-"""What the page of an experiment may say: less than that of a drive, and nothing of the station."""
+"""Messages of an experiment's page, a subset of those of a drive."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 from drake_teleop.live.messages import parse
 
-#: Of a drive's inputs, those that are the hand's.
+#: Inputs of a drive that move the hand.
 HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """What a message asks for; None if it is not one.
+    """Return the valid requests of a message; None without any.
 
     Returns:
         Any of "set" and "rates" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).

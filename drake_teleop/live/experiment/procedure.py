@@ -1,8 +1,7 @@
-"""What a participant goes through, one step after another; without page, clock and station.
+"""Sequence of a participant's trials; without page, clock and station.
 
-The order is drawn from the experiment's seed and the participant's number: the tasks, in each task
-practice first, and then rounds in which each condition comes once. So the levels of a condition
-find its threshold while the others go on beside it, and nobody gets used to one of them.
+The order is drawn from the seed and the participant's number: the tasks, and for each task
+practice and then rounds with every condition once.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from drake_teleop.live.experiment.design import ContactDetection, Experiment, Pe
 from drake_teleop.live.experiment.psychometrics import Psi
 from drake_teleop.live.experiment.store import Row, Store
 
-#: Where a participant stands; `go` leads on from each but GAP, INTERVAL and ANSWER.
+#: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
 CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, TOLD, BREAK, END = (
     *("consent", "task", "ready", "interval", "gap", "answer"),
     *("told", "break", "end"),
@@ -25,12 +24,12 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, TOLD, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial that will be.
+    """A planned trial.
 
     Attributes:
-        task, condition: which of the experiment's.
-        practice: whether it does not count.
-        signal: the interval that has the stimulus, 1 or 2; 0 where there are none.
+        task, condition: index in the experiment.
+        practice: whether it is not evaluated.
+        signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
     """
 
     task: int
@@ -41,15 +40,15 @@ class Trial:
 
 @dataclass(frozen=True)
 class Felt:
-    """What an interval was.
+    """Result of an interval.
 
     Attributes:
-        level: of the stimulus; 0 if it had none, or if it cannot have been felt.
+        level: of the stimulus; 0 without one.
         force_N: largest contact force at the tool.
-        valid: False if it has to be done again: the tool touched nothing.
-        done: whether the tool got to the floor of the slot.
+        valid: False without contact; the trial is then repeated.
+        done: whether the tool reached the floor of the slot.
         time_s: until then.
-        lost_s: that the machine was too slow by.
+        lost_s: simulation time behind the clock.
     """
 
     level: float = 0.0
@@ -61,7 +60,7 @@ class Felt:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """All trials of a participant, in order."""
+    """Return all trials of a participant, in order."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -79,20 +78,15 @@ def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
 
 
 class Procedure:
-    """One participant's way through an experiment; it begins where its rows end.
+    """State of one participant in an experiment; it continues after the stored rows.
 
     Attributes:
-        phase: see `CONSENT` and the following.
-        interval: 1 or 2 of the trial; of peg in slot 1.
-        level: of the trial's stimulus, as it should be.
-        prepared: counts the intervals that are to come, also those that come again.
+        phase: `CONSENT` to `END`.
+        interval: 1 or 2 of the trial; 1 for peg in slot.
+        level: intended level of the trial's stimulus.
+        prepared: number of intervals prepared so far.
         said: whether the last answer was right, for practice.
-        again: whether the trial is done again, because the tool touched nothing.
-
-    Args:
-        experiment: its design.
-        participant: the number.
-        store: where trials go to, and come from.
+        again: whether the trial is repeated, because the tool touched nothing.
     """
 
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
@@ -114,27 +108,27 @@ class Procedure:
 
     @property
     def number(self) -> int:
-        """Of the trial, from 0; as many as there are at the end."""
+        """Number of the trial, from 0; at the end the number of trials."""
         return len(self._rows)
 
     @property
     def trial(self) -> Trial:
-        """The one that is next or under way."""
+        """Present or next trial."""
         return self.trials[min(self.number, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
-        """Of that trial."""
+        """Task of that trial."""
         return self.experiment.tasks[self.trial.task]
 
     @property
     def shown(self) -> float:
-        """The level of the present interval."""
+        """Level of the present interval."""
         return self.level if self.trial.signal == self.interval else 0.0
 
     @property
     def pressed(self) -> float:
-        """The contact force that the participant presses with, so far as it is known [N]."""
+        """Median contact force of the participant so far [N]."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))
@@ -149,7 +143,7 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """The participant goes on."""
+        """Continue after a page of text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
@@ -160,7 +154,7 @@ class Procedure:
             self._go_on()
 
     def finished(self, felt: Felt) -> None:
-        """The present interval is over."""
+        """End the present interval with its result."""
         self._felt[self.interval - 1] = felt
         if not felt.valid:
             self._new_trial()
@@ -174,17 +168,17 @@ class Procedure:
             self.phase = ANSWER
 
     def second(self) -> None:
-        """The gap between the intervals is over."""
+        """Start the second interval."""
         self.phase = INTERVAL
 
     def interrupted(self) -> None:
-        """Whoever drives has gone: the trial begins again."""
+        """Restart the trial after the driver has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """The participant says which interval it was; at any other time it says nothing."""
+        """Store the interval that the participant chose, in the phase `ANSWER`."""
         if self.phase == ANSWER:
             self._over(interval, interval == self.trial.signal, time_s)
 
@@ -221,7 +215,6 @@ class Procedure:
             self._psi[trial.task, trial.condition].answered(row.level, bool(row.correct))
 
     def _go_on(self) -> None:
-        """To what comes after a trial."""
         before = self.trials[self.number - 1]
         if self.number == len(self.trials):
             self.phase = END
@@ -236,8 +229,8 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """What the participant may know."""
-        number = self.number - (self.phase == TOLD)  # of a trial that is over
+        """Return the state that the participant may see."""
+        number = self.number - (self.phase == TOLD)  # TOLD belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,

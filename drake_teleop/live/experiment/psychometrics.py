@@ -1,15 +1,11 @@
-"""Thresholds from answers: which stimulus to show next, and what the answers say. Without Drake.
+"""Thresholds from two-interval forced-choice answers, and the next level to present.
 
-A participant says in which of two intervals a stimulus was (two-interval forced choice), so that
-how ready somebody is to say "yes" does not matter. Of a stimulus of level x
+    d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2)
 
-    d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2),
-
-so the threshold is where d' is 1, and 76 % of the answers are right if nobody lapses. (Power law of
-d': Foley and Legge, Vision Research 21, 1981. Phi: Green and Swets, Signal detection theory and
-psychophysics, 1966.) All three parameters are unknown. `Psi` has their joint probability on a grid,
-and asks for the level whose answer will tell most about the threshold: the psi method of Kontsevich
-and Tyler, Vision Research 39, 1999, with the others marginalised (Prins, J. Vision 13(7), 2013).
+At the threshold d' is 1 (76 % correct without lapses). Power law: Foley and Legge, Vision Research
+21, 1981. Phi: Green and Swets, Signal detection theory and psychophysics, 1966. The level is chosen
+by the psi method (Kontsevich and Tyler, Vision Research 39, 1999) with slope and lapse marginalised
+(Prins, J. Vision 13(7), 2013).
 """
 
 from __future__ import annotations
@@ -23,29 +19,24 @@ from scipy.special import ndtr, xlogy
 
 Array = NDArray[np.float64]
 
-#: What is thought possible beforehand, all of it as likely: log-uniform thresholds and slopes.
+#: Grid of the uniform prior; thresholds and slopes are uniform in the logarithm.
 _THRESHOLDS = 81
 _SLOPES = np.geomspace(0.7, 3.0, 7)
 _LAPSES = np.array([0.0, 0.02, 0.04, 0.08])
-# Thresholds may lie so much beyond the levels that can be shown.
+# Factor of the range of thresholds beyond the range of levels.
 _BEYOND = 2.0
 _LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """P(correct) as above; the arguments broadcast. Level and threshold in one unit, level >= 0."""
+    """Return P(correct) for levels >= 0; the arguments broadcast."""
     d = (level / threshold) ** slope
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A quantity with its 95 % interval.
-
-    Attributes:
-        value: the median.
-        low, high: where 2.5 % and 97.5 % of the probability lie below.
-    """
+    """Median of a quantity, and its 2.5 % and 97.5 % quantiles."""
 
     value: float
     low: float
@@ -53,10 +44,10 @@ class Estimate:
 
 
 class Psi:
-    """What is known of one participant in one condition.
+    """Posterior of threshold, slope and lapse on a grid, of one participant in one condition.
 
     Args:
-        low, high: the range of levels that can be shown, both > 0.
+        low, high: range of levels, both > 0.
     """
 
     def __init__(self, low: float, high: float) -> None:
@@ -67,7 +58,7 @@ class Psi:
         )
         shape = (_THRESHOLDS, len(_SLOPES), len(_LAPSES))
         self._likely = np.full(shape, 1.0 / math.prod(shape))
-        # (levels, thresholds, the rest): P(correct) at all that may be asked.
+        # P(correct) as (levels, thresholds, slopes and lapses).
         self._correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
         self._correct = self._correct.reshape(_LEVELS, _THRESHOLDS, -1)
 
@@ -75,10 +66,9 @@ class Psi:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
-        """The level whose answer leaves the least expected entropy of the threshold.
+        """Return the level with the least expected entropy of the threshold.
 
-        It is the same as the largest mutual information of answer and threshold, as entropy now is
-        the same for all levels.
+        This maximises the mutual information of answer and threshold.
         """
         likely = self._likely.reshape(_THRESHOLDS, -1)
         right = np.einsum("ltk,tk->lt", self._correct, likely)  # P(correct and threshold)
@@ -91,15 +81,15 @@ class Psi:
         return float(self.levels[np.argmin(lost)])
 
     def answered(self, level: float, correct: bool) -> None:
-        """Takes an answer to any level >= 0 into account, also one that was not asked for."""
+        """Update the posterior with an answer to any level >= 0."""
         p = self._probability(level)
         self._likely = self._likely * (p if correct else 1.0 - p)
         self._likely /= self._likely.sum()
 
     def threshold(self) -> Estimate:
-        """Where d' is 1, in the unit of the levels."""
+        """Return the threshold in the unit of the levels."""
         share = self._likely.sum(axis=(1, 2))
-        # The probability of a node is spread over its cell, evenly in the logarithm.
+        # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
         edges = math.log(self._thresholds[0]) + step * (np.arange(_THRESHOLDS + 1) - 0.5)
         below = np.concatenate([[0.0], np.cumsum(share)])
@@ -107,7 +97,7 @@ class Psi:
         return Estimate(float(value), float(low), float(high))
 
     def d_prime(self, level: float) -> Estimate:
-        """d' at a level."""
+        """Return d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._likely.sum(axis=2).ravel()
         order = np.argsort(values)

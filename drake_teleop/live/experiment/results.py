@@ -1,10 +1,9 @@
-"""What came out of an experiment: thresholds, d', times and forces with 95 % intervals.
+"""Results of an experiment: thresholds, d', times and forces with 95 % intervals.
 
-`results.csv` has a row for each quantity of each participant, task and condition, and one over all
-participants from two on. Of one participant a threshold and d' are medians of what is probable
-after its answers (`Psi`), times and forces geometric means over the trials with t intervals of the
-logarithm, a share Wilson's. Over participants it is the geometric mean with the t interval of the
-logarithm, of a share the mean with the t interval. d' is that at the middle of the levels.
+A row of `results.csv` is a quantity of a participant, task and condition; participant 0 stands for
+all participants. For one participant, threshold and d' are posterior medians (`Psi`), times and
+forces geometric means with t intervals of the logarithm, and shares have Wilson intervals. For all
+participants it is the geometric mean (share: mean) with its t interval. d' is at the middle level.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """A row of the table; participant 0 stands for all of them."""
+    """Row of the table; participant 0 stands for all participants."""
 
     task: str
     condition: str
@@ -50,7 +49,7 @@ class Result(NamedTuple):
 
 
 def results(experiment: Experiment, store: Store) -> list[Result]:
-    """All rows of the table; what nothing is known of is left out."""
+    """Return all rows of the table."""
     found = []
     known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
     for task in experiment.tasks:
@@ -97,7 +96,7 @@ def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
 
 
 def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
-    """The (geometric) mean with its t interval; of one value the interval is not known."""
+    """Return the (geometric) mean with its t interval, nan for one value."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
@@ -109,7 +108,7 @@ def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
 
 
 def _wilson(successes: int, n: int) -> Estimate:
-    """A share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
+    """Return a share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
     p, z2 = successes / n, _Z**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
@@ -117,7 +116,7 @@ def _wilson(successes: int, n: int) -> Estimate:
 
 
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
-    """Writes trials.csv, results.csv and results.png into the folder; returns the table."""
+    """Write trials.csv, results.csv and results.png; return the table."""
     import polars as pl
 
     found = results(experiment, store)
@@ -137,7 +136,6 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
 
 
 def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
-    """A panel for each quantity: small points for participants, a large one for all of them."""
     from drake_teleop.common.style import Picture, house_style
 
     shown = [quantity for quantity in _SHOWN if any(r.quantity == quantity for r in found)]
@@ -177,7 +175,7 @@ def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
             axes.plot([r.low, r.high], [place, place], color=colour, linewidth=thick)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    # There may be no power of ten among what is shown.
+    # The range may contain no power of ten.
     least, most = axes.get_xlim()
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 3, 4, 6) if most < 30 * least else (3,)))
     axes.xaxis.set_minor_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""The page of an experiment: that of `drive`, whose cockpit gives way to what is asked."""
+"""Page of an experiment: that of `drive` with questions in place of its instruments."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """An experiment whose page is open to one participant.
+    """Experiment whose page is open to one participant.
 
     Args:
-        experiment, scenarios: as `LoadExperiment` gives them.
+        experiment, scenarios: from `LoadExperiment`.
         store: of the trials.
-        participant: whose turn it is.
+        participant: number.
         port, device: as of `drive`.
     """
 
@@ -47,7 +47,6 @@ class ExperimentDrive(LiveDrive):
         super().__init__(scenarios[0], None, port, device)
 
     def _prepare(self, scenario: Scenario, device: bool) -> None:
-        """Make a 3D scene for each task. Arrows would show which force is rendered."""
         for task in map(str, range(len(self._scenarios))):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
@@ -61,7 +60,7 @@ class ExperimentDrive(LiveDrive):
         return Guided(*setup, time.perf_counter(), link)
 
     def done(self) -> tuple[int, int]:
-        """Trials that the participant has done, and all."""
+        """Return the numbers of finished and of all trials."""
         return self._procedure.number, len(self._procedure.trials)
 
     def _page(self) -> str:
@@ -88,8 +87,8 @@ def serve_experiment(
         browser: whether to open the page.
 
     Raises:
-        DrakeTeleopError: with what had stopped the drive.
-        KeyboardInterrupt: if the participant has not done all trials.
+        DrakeTeleopError: why the drive had stopped.
+        KeyboardInterrupt: if trials are left.
     """
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:

@@ -1,10 +1,9 @@
-"""Participants that are simulated: the station runs, and an observer with noise compares.
+"""Simulated participants: an observer with noise compares the forces of a simulated station.
 
-In each interval the hand is led by a script: down to what there is to touch and up again, or to and
-fro. The response to an interval is the largest change of the force that the station displayed, plus
-normal noise whose standard deviation grows with it; the interval of the larger one is the answer.
-The peg goes into the slot by the simulated operator of `docs/operator.md`. A participant of its own
-has its own noise, and nothing else: none learns or tires.
+In each interval a scripted hand presses down and up, or moves back and forth. The response is the
+largest change of the rendered force plus normal noise; the interval with the larger one is the
+answer. The peg is inserted by the simulated operator of `docs/operator.md`. Participants differ
+only in their noise; they do not learn or tire.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 from drake_teleop.station.task_measures import contact_force, task_measures
 
-# The hand moves from here on [s]; what it feels in the tenth of a second before is rest.
+# Start of the hand's motion [s].
 _BEGINS = 0.4
-_UNIT = 1e-5  # m, of the inputs
+_UNIT = 1e-5  # m, unit of the inputs
 _NEWS_MS = 200
 
 
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """The station of each task under each condition; loads are identified if they are not known."""
+    """Return the station of each task and condition; identify unknown loads."""
     found = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_of(scenario)
@@ -50,7 +49,7 @@ def all_apparatus(
 
 
 def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """The scenario with noise of its own for each interval of each trial of each participant."""
+    """Return the scenario with a seed for this participant, trial and interval."""
     number = 2 * procedure.number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -64,14 +63,14 @@ def take_part(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """A simulated participant does what it has not done.
+    """Run the remaining trials of a simulated participant.
 
     Args:
         experiment: with its `simulated`.
         scenarios, stations: as of `all_apparatus`.
-        store: where trials go to.
-        participant: its number.
-        progress: is told the trials that are done, and all.
+        store: of the trials.
+        participant: number.
+        progress: called with the numbers of finished and of all trials.
     """
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
@@ -97,10 +96,9 @@ def take_part(
 def compared(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """The interval, 1 or 2, that the observer thinks was stronger.
+    """Return the interval, 1 or 2, with the larger noisy response.
 
-    Of responses r1 and r2 with deviations s1 and s2, P(r1 + s1 n1 > r2 + s2 n2) is that of
-    d' = (r1 - r2) / s where both deviations are s: a difference of `noise` at rest is d' = 1.
+    With equal standard deviations s, d' = (r1 - r2) / s: a difference of `noise` at rest is d' = 1.
     """
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
@@ -112,7 +110,7 @@ def compared(
 
 
 def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
-    """What it was, and the response of an observer without noise [N]."""
+    """Return the result, and the response without noise [N]."""
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
@@ -137,7 +135,6 @@ def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
 
 
 def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
-    """The simulated operator brings the peg into the slot."""
     task, condition = apparatus.task, apparatus.condition
     assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
     scenario = replace(
