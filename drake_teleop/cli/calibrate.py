@@ -1,9 +1,9 @@
-"""`drake-teleop calibrate`: identify the load from a stream until it is known, with advice.
+"""`drake-teleop calibrate`: guided identification of the load from a live stream.
 
 Files in the output folder, beside those of `identify`:
 
 ============= ==================================================================================
-log.parquet   the recorded log, for `identify log.parquet`; log.yaml with a table for each stream
+log.parquet   recorded log, for `identify log.parquet`; log.yaml with a table for each stream
               if the source delivers poses or an IMU
 settling.png  half-widths of the intervals over time, with the advice
 summary.json  that of `identify`, with "tolerance", "known" (by name), "all_known",
@@ -39,7 +39,7 @@ from drake_teleop.robots.calibration import Look
 from drake_teleop.robots.joints import SensorPoseOfJoints
 from drake_teleop.robots.sources_and_sinks import recorded
 
-_BAR, _DECADES = 24, 3.0  # cells, and decades of the half-width over the tolerance
+_BAR, _DECADES = 24, 3.0  # cells of a bar, and decades of the half-width over the tolerance
 
 
 def calibrate_command(
@@ -57,22 +57,18 @@ def calibrate_command(
     arm: SensorPoseOfJoints | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """The command `calibrate`; see the top of this module.
+    """Run `calibrate` and return its summary.
 
     Args:
-        source, real_time, motion, sensor_pose: see `source_of`.
-        out: the folder.
+        source, real_time, motion, sensor_pose, arm: see `source_of`.
+        out: folder.
         until: see `read_tolerance`.
-        largest: the sensor's range [N], [N m].
+        largest: range of the sensor [N], [N m].
         seconds, cutoff_hz, delay: see `calibrate`.
-        arm: as for `compensate_command`.
         quiet: no table.
 
-    Returns:
-        the summary.
-
     Raises:
-        DrakeTeleopError: if one of them cannot be used, or nothing of a load is in the record.
+        DrakeTeleopError: if an argument is invalid, or the record contains no load.
     """
     tolerance = read_tolerance(until)
     make_folder(out)
@@ -117,7 +113,7 @@ def calibrate_command(
 
 
 def shown(at: Look, tolerance: Tolerance) -> Group:
-    """The table of a look, and what to do next."""
+    """Return the table of an intermediate result, and the advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "asked", "unit"):
@@ -143,7 +139,7 @@ def shown(at: Look, tolerance: Tolerance) -> Group:
 
 
 def _bar(half: float, known: bool) -> Text:
-    """Full at the tolerance, empty `_DECADES` above it."""
+    """Return a bar that is full at the tolerance and empty `_DECADES` above it."""
     share = 1.0 - np.log10(max(half, 1.0)) / _DECADES if np.isfinite(half) else 0.0
     cells = int(np.clip(share, 0.0, 1.0) * _BAR)
     return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")
@@ -160,7 +156,7 @@ def _verdict(at: Look, k: int) -> str:
 
 
 def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
-    """Half-widths of the 95 % intervals over the tolerances, and the advice under them."""
+    """Draw half-widths of the 95 % intervals over the tolerances, with the advice."""
     with house_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

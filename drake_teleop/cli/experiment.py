@@ -1,4 +1,4 @@
-"""`drake-teleop drive --study STUDY.yaml`: an experiment in the page, or with simulated people."""
+"""`drake-teleop drive --study STUDY.yaml`: an experiment with people or simulated participants."""
 
 from __future__ import annotations
 
@@ -26,22 +26,18 @@ def experiment_command(
     browser: bool = True,
     device: str | None = None,
 ) -> pl.DataFrame:
-    """Goes on with an experiment where its folder ends.
+    """Continue an experiment and return the table of `write_results`.
 
     Args:
-        study: the experiment's file, or the name of one that is shipped.
-        out: the folder of the results.
-        participant: whose turn it is; by default of the first who has not done all, or else the
-            next number.
-        simulated: how many simulated participants there are in all; 0: people, in the page.
+        study: YAML file, or the name of a shipped experiment.
+        out: folder of the results.
+        participant: number; default: the first with trials left, or the next number.
+        simulated: total number of simulated participants; 0 for people in the page.
         port, browser, device: as of `drive`.
 
-    Returns:
-        The table of `write_results`.
-
     Raises:
-        DrakeTeleopError: for a bad file, or a folder of something else.
-        KeyboardInterrupt: after what is done has been written.
+        DrakeTeleopError: for an invalid file, or a folder with other contents.
+        KeyboardInterrupt: after the results have been written.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
@@ -61,7 +57,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """The participant who goes on: the one that is wanted, or has not done all, or a new one."""
+    """Return the requested participant, or the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

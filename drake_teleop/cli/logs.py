@@ -1,4 +1,4 @@
-"""The commands `identify`, `eliminate` and `detect`: write the results, print a table."""
+"""Commands `identify`, `eliminate` and `detect`: write the results, print a table."""
 
 from __future__ import annotations
 
@@ -53,18 +53,15 @@ def identify_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`identify_log`, writing its results into `out`.
+    """Identify the load of a log, write the results into `out`, return the summary.
 
-    Files: identification.json; summary.json; report.html; fit.png and knowledge.png, its
-    pictures; report.png, both on one page.
+    Files: identification.json; summary.json (names: `logs.figures`); report.html; fit.png and
+    knowledge.png; report.png with both.
 
     Args:
         method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
-        gripper: identification.json of the gripper alone; then the object's object.json, of the
-            same format, is written too (see `drake_teleop.load.gripper`).
-
-    Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+        gripper: identification.json of the gripper alone; then object.json of the object is
+            written, too, see `drake_teleop.load.gripper`.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
@@ -123,15 +120,12 @@ def eliminate_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`eliminate_log`, writing contact_wrench.parquet, contact_wrench.png and summary.json.
+    """Write contact_wrench.parquet, contact_wrench.png and summary.json; return the summary.
 
-    The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
-    `non_contact_f_x` and `measured_f_x` (offsets removed); with `causal` (see `eliminate_log`) also
-    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact,
-    `edge` which samples are not judged (see `EliminatedLog`).
-
-    Returns:
-        the summary; its names are explained at the top of `logs.figures`.
+    The table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
+    `non_contact_f_x` and `measured_f_x` (without offsets); with `causal` (see `eliminate_log`) also
+    `causal_contact_f_x` and `causal_scaled_f_x`. `in_contact` flags contact, `edge` samples without
+    a decision.
     """
     load_file = Identification.load(load)
     found = eliminate_log(
@@ -211,13 +205,10 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`detect_log`, writing detection.parquet, detection.png and summary.json.
+    """Write detection.parquet, detection.png and summary.json; return the summary.
 
-    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and
-    `edge` for samples that are not judged.
-
-    Returns:
-        the summary; its names are explained in `drake_teleop.logs.detection`.
+    The table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and `edge` for
+    samples without a decision. The names of the summary: `drake_teleop.logs.detection`.
     """
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated

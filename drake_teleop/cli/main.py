@@ -1,4 +1,4 @@
-"""The command line (long: all commands and their options). It imports heavy things when needed."""
+"""Command line (long: all commands and their options). It imports large packages on demand."""
 
 from __future__ import annotations
 
@@ -803,26 +803,23 @@ def new(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs the command line and exits: 0, 2 for unusable input, 130 for Ctrl-C or `kill`.
+    """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
 
-    A drive that the user ends so has status 0.
-
-    Also 1, if `reproduce` finds a number that is not as accepted.
+    A drive that the user ends has status 0. Status 1: `reproduce` finds an unaccepted number, or
+    `calibrate` ends before all tolerances are reached.
     """
     signal.signal(signal.SIGTERM, _terminate)
-    atexit.register(gc.freeze)  # the last search for garbage takes a second with Drake's objects
+    atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects
     with warnings.catch_warnings():
-        # They are for those who write programs. What a user has to know of a result this package
-        # never says so: it stands in the summary, and is printed from there.
+        # Warnings are for programmers; those for users are in the summary and printed from there.
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
-            os.environ["PYTHONWARNINGS"] = "ignore"  # of the processes of a study
+            os.environ["PYTHONWARNINGS"] = "ignore"  # for the processes of a study
         status = _run(arguments)
     sys.exit(status if isinstance(status, int) else 0)
 
 
 def _run(arguments: list[str] | None) -> Any:
-    """What the command returns, or the exit status of what it ended with."""
     try:
         return cli.main(arguments, prog_name="drake-teleop", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -833,7 +830,7 @@ def _run(arguments: list[str] | None) -> Any:
     except DrakeTeleopError as error:
         return _fail(str(error))
     except (click.Abort, KeyboardInterrupt) as interrupt:
-        # click makes an Abort of a KeyboardInterrupt; what was kept is told by its cause.
+        # click raises Abort from a KeyboardInterrupt, which contains the message.
         click.echo(f"interrupted: {interrupt.__cause__ or ''}".removesuffix(": "), err=True)
         return 130
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The kinds of values and the options that commands have in common."""
+"""Parameter types and options that commands have in common."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from drake_teleop.common.resources import scenarios_dir, studies_dir
 
 
 class Named(click.Path):
-    """A path that all libraries can say: its name is UTF-8."""
+    """Path whose name is UTF-8, which all libraries accept."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the path, or fail with one line."""
         path = super().convert(value, param, ctx)
         try:
             str(path).encode()
@@ -32,7 +32,7 @@ class Named(click.Path):
 
 
 class Shipped(Named):
-    """What is shipped by name, or a file; a shell that is asked to completes both."""
+    """Name of a shipped file, or a path; the shell completes both."""
 
     def __init__(self, folder: Path, path_type: type) -> None:
         super().__init__(path_type=path_type)
@@ -41,7 +41,7 @@ class Shipped(Named):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """What the shell offers for a word that is begun."""
+        """Return the completions of an incomplete word."""
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
@@ -58,7 +58,7 @@ def _check_range(
     param: click.Parameter | None,
     ctx: click.Context | None,
 ) -> None:
-    """Refuses what is outside, in words: click's own would be `x>=0`."""
+    """Fail with words for a number out of range; click writes `x>=0`."""
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
         text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
@@ -69,14 +69,14 @@ def _check_range(
 
 
 class Number(click.FloatRange):
-    """A finite number in a range: click's own lets "nan" and "inf" through."""
+    """Finite number in a range; click's type accepts nan and inf."""
 
     name = "number"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number, or fail with one line."""
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -85,12 +85,12 @@ class Number(click.FloatRange):
 
 
 class Whole(click.IntRange):
-    """A whole number in a range."""
+    """Integer in a range."""
 
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number, or fail with one line."""
         number: int = click.INT.convert(value, param, ctx)
         _check_range(self, number, param, ctx)
         return number
@@ -104,12 +104,12 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number or "auto", or fail with one line."""
         return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
 def out(command: str) -> Callable[[Any], Any]:
-    """`--out DIR`, by default out/COMMAND. A command that fails leaves no empty folder there."""
+    """Return the option `--out DIR`; a command that fails leaves no empty folder there."""
     return click.option(
         "--out",
         type=PATH,
@@ -128,14 +128,14 @@ def _not_left_empty(ctx: click.Context, _: click.Parameter, folder: Path) -> Pat
 
 
 def _remove_empty(new: list[Path]) -> None:
-    """Removes the folders as far as there is nothing in them but empty folders; innermost first."""
+    """Remove the folders if they contain only empty folders, innermost first."""
     inner = sorted(new[0].rglob("*"), reverse=True)
     for folder in (*inner, *new):
         if folder.is_symlink() or not folder.is_dir():
             return
         try:
             folder.rmdir()
-        except OSError:  # there is something in it
+        except OSError:  # it is not empty
             return
 
 
@@ -250,7 +250,7 @@ free = click.option(
 
 
 def ask(question: str) -> bool:
-    """The answer of somebody at a terminal; nobody there says no."""
+    """Return the answer of a user at a terminal; False without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
@@ -258,28 +258,28 @@ yes = click.option("--yes", is_flag=True, help="Begin, also if there are more th
 
 
 class Names(click.ParamType):
-    """Names with commas between them."""
+    """Names separated by commas."""
 
     name = "NAME,..."
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the names."""
         if isinstance(value, tuple):
             return value
         return tuple(name.strip() for name in value.split(","))
 
 
 class PositiveNumbers(click.ParamType):
-    """Positive numbers with commas between them."""
+    """Positive numbers separated by commas."""
 
     name = "number,..."
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the numbers, or fail with one line."""
         if isinstance(value, tuple):
             return value
         number = Number(0, 1e5, min_open=True)
