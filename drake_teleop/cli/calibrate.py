@@ -36,7 +36,6 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.robots.calibrate import DEFAULT, calibrate
 from drake_teleop.robots.calibration import Look
-from drake_teleop.robots.joints import SensorPoseOfJoints
 from drake_teleop.robots.sources_and_sinks import recorded
 
 _BAR, _DECADES = 24, 3.0  # cells of a bar, and decades of the half-width over the tolerance
@@ -49,23 +48,21 @@ def calibrate_command(
     until: str = DEFAULT,
     largest: tuple[float, float] | None = None,
     seconds: float = 120.0,
-    real_time: bool = False,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
     quiet: bool = False,
+    **stream_options: Any,
 ) -> dict[str, Any]:
     """Run `calibrate` and return its summary.
 
     Args:
-        source, real_time, motion, sensor_pose, arm: see `source_of`.
+        source: see `source_of`.
         out: folder.
         until: see `read_tolerance`.
         largest: range of the sensor [N], [N m].
         seconds, cutoff_hz, delay: see `calibrate`.
         quiet: no table.
+        stream_options: real_time, motion, sensor_pose and arm, see `source_of`.
 
     Raises:
         DrakeTeleopError: if an argument is invalid, or the record contains no load.
@@ -73,23 +70,23 @@ def calibrate_command(
     tolerance = read_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
-    stream, recorder = recorded(
-        source, limits, real_time=real_time, motion=motion, sensor_pose=sensor_pose, arm=arm
-    )
+    stream, recorder = recorded(source, limits, **stream_options)
+    path = out / recorder.file
     console = Console(stderr=True, quiet=quiet)
-    options = {"cutoff_hz": cutoff_hz, "delay": delay, "seconds": seconds}
+    processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
         with Live(console=console, auto_refresh=False) as live:
 
             def show(at: Look) -> None:
                 live.update(shown(at, tolerance), refresh=True)
 
-            path = out / recorder.file
-            looks = calibrate(stream, recorder, path, tolerance, show=show, **options)  # type: ignore[arg-type]
+            looks = calibrate(
+                stream, recorder, path, tolerance, seconds=seconds, show=show, **processing
+            )
     finally:
         stream.close()
     last = looks[-1]
-    summary = identify_command(path, out, cutoff_hz=cutoff_hz, delay=delay, quiet=True)
+    summary = identify_command(path, out, quiet=True, **processing)
     write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
@@ -104,10 +101,8 @@ def calibrate_command(
         "began_anew": recorder.began_anew,
     }
     write_json(out / "summary.json", summary)
-    if summary["all_known"]:
-        console.print(f"known after {last.t:.1f} s: {tolerance}", highlight=False)
-    else:
-        console.print(f"[bold red]not known[/] after {last.t:.1f} s: {tolerance}", highlight=False)
+    verdict = "known" if summary["all_known"] else "[bold red]not known[/]"
+    console.print(f"{verdict} after {last.t:.1f} s: {tolerance}", highlight=False)
     console.print(f"written to {out}", highlight=False, markup=False)
     return summary
 
@@ -116,7 +111,7 @@ def shown(at: Look, tolerance: Tolerance) -> Group:
     """Return the table of an intermediate result, and the advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
-    for heading in ("value", "+- (95 %)", "asked", "unit"):
+    for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
     table.add_column("settled", width=_BAR)
     table.add_column("verdict")
@@ -149,7 +144,7 @@ def _verdict(at: Look, k: int) -> str:
     if at.known[k]:
         return "known"
     if not np.isfinite(at.half[k]):
-        return "not known: nothing tells it yet"
+        return "not known: no information yet"
     if at.doubts:
         return "not known: see below"
     return "almost" if at.half[k] <= 1.0 else "not known"
@@ -178,7 +173,7 @@ def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
                 )
                 last = at.advice
         axes.set(
-            title="Half of the 95 % interval over what is asked",
+            title="Half-width of the 95 % interval over the tolerance",
             xlabel="length of the record [s]",
             yscale="log",
         )

@@ -1,18 +1,22 @@
-"""`drake-teleop excite`: an excitation trajectory for the scenario's slave or any other arm.
+"""`drake-teleop excite`: an excitation trajectory for the station's slave, or for any other arm.
+
+Writes into the folder
 
 =================== ============================================================================
 trajectory.csv      one period at 1 kHz: t [s], then by joint q_NAME, qd_NAME, qdd_NAME [rad, s]
-excitation.yaml     coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
-excitation.png      joint angles, wrench against the sensor's range, history of the criterion
-excitation.html     3D replay of the motion, to check before a robot runs it
-session.json        design_s, CPU time of the optimiser [s]
-summary.json        criteria, use of every limit as checked by Drake at 1 kHz, predicted standard
-                    deviations for the heaviest load after one period, and assumptions; with
-                    `until` also the share of each tolerance that is `reached` with `reliable`
+excitation.yaml     the coefficients of Eqs. (9)-(10), for `FourierTrajectory.load`
+excitation.png      joint angles, wrench against the sensor's range, how the criterion fell
+excitation.html     the motion as a film in 3D, to be watched before a robot runs it
+session.json        design_s, the optimiser's CPU time [s]
+summary.json        the figures; it and all above but session.json are the same bytes every time
 =================== ============================================================================
 
-All files but session.json have the same bytes every time. Without a trajectory that respects all
-limits nothing is written.
+`summary.json` holds the criterion that was minimised and the value of every criterion (what each
+is: `excitation/criteria.py`), the use of every limit as checked by Drake at 1 kHz, the predicted
+standard deviation of each parameter of the heaviest load after one period, from the noise of the
+sensor (`excitation/prediction.py`), and what was assumed. With `until` also that, and how much of
+each tolerance is `reached` in the share `reliable` of the records.
+Nothing is written if no trajectory respects all limits.
 """
 
 from __future__ import annotations
@@ -46,7 +50,7 @@ from drake_teleop.station.scenario import LoadScenario
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Meaning of each criterion.
+#: What each printed criterion is.
 WORDS = {
     "kappa_w10": "condition number, ten columns, rows whitened, columns scaled by L = {L:.3g} m",
     "kappa10": "condition number, ten columns, plain V in SI units",
@@ -77,27 +81,30 @@ def excite_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Design, check and write an excitation trajectory; return summary and session.json.
+    """Designs, checks and writes an excitation trajectory; see the top of this module.
 
     Args:
-        scenario: with the slave and the wrist sensor.
-        out: folder.
-        model: another arm that moves instead, with
-        sensor_frame: frame or link of the sensor on it.
+        scenario: its slave moves, and its wrist sensor measures.
+        out: the folder.
+        model: another arm that moves instead, with the scenario's sensor; and then
+        sensor_frame: the frame or link at which it measures, needed with `model`.
         package_paths, acceleration, payload: see `RobotFromModel`.
-        until: tolerance of the `shortest` motion, see `read_tolerance`; criterion, period and
-            seconds are then unused.
-        criterion, period, harmonics, seconds, seed: see `excite`; default: 5 harmonics, 3 with
+        until: a tolerance, see `read_tolerance`: then the shortest motion that reaches it, see
+            `shortest`, whatever criterion, period and seconds are.
+        criterion, period, harmonics, seconds, seed: see `excite`; by default 5 harmonics, 3 with
             `until`.
         quiet: no progress bars and no tables.
-        progress: False for no progress bars.
+        progress: False for no progress bars alone.
+
+    Returns:
+        The summary, and what is in session.json.
 
     Raises:
-        DrakeTeleopError: if the input is invalid, or no motion respects all limits.
+        DrakeTeleopError: if the input cannot be used, or nothing respects all limits.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
-    make_folder(out)  # first, so that an invalid path fails at once
+    make_folder(out)  # before the work: a bad path costs no time
     with show_progress(progress and not quiet) as stage:
         opened = stage("Read the robot")
         if model is None:
@@ -167,7 +174,7 @@ def _refuse(*options: object) -> None:
 
 
 def summarise(found: Excitation) -> dict[str, Any]:
-    """Return the figures of summary.json."""
+    """The figures of summary.json."""
     robot, trajectory = found.robot, found.trajectory
     names = (*_OFFSETS, *_PHI)
     return {
@@ -195,7 +202,7 @@ def _words(name: str, robot: Robot) -> str:
 
 
 def table(found: Excitation) -> pl.DataFrame:
-    """Return one period at 1 kHz, both ends included."""
+    """One period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}
@@ -207,7 +214,7 @@ def table(found: Excitation) -> pl.DataFrame:
 
 
 def draw(found: Excitation) -> Figure:
-    """Draw joint angles, wrench of the heaviest load with its limit, and the criterion."""
+    """Joint angles, wrench of the heaviest load against the limit, the criterion's fall."""
     with house_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))

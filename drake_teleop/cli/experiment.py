@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
@@ -22,9 +22,7 @@ def experiment_command(
     *,
     participant: int | None = None,
     simulated: int = 0,
-    port: int = 0,
-    browser: bool = True,
-    device: str | None = None,
+    **page: Any,
 ) -> pl.DataFrame:
     """Continue an experiment and return the table of `write_results`.
 
@@ -33,7 +31,7 @@ def experiment_command(
         out: folder of the results.
         participant: number; default: the first with trials left, or the next number.
         simulated: total number of simulated participants; 0 for people in the page.
-        port, browser, device: as of `drive`.
+        page: port, browser and device, see `drive`.
 
     Raises:
         DrakeTeleopError: for an invalid file, or a folder with other contents.
@@ -48,8 +46,7 @@ def experiment_command(
                 from drake_teleop.live.experiment.server import serve_experiment
 
                 number = whose_turn(store, len(trials_of(experiment, 1)), participant)
-                setup = (experiment, scenarios, store, number)
-                serve_experiment(*setup, port=port, browser=browser, device=device)
+                serve_experiment(experiment, scenarios, store, number, **page)
         finally:
             table = write_results(experiment, store)
             print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)
@@ -66,7 +63,9 @@ def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
             return number
     number = max(known, default=0) + 1
     if number > MOST:
-        raise DrakeTeleopError(f"{MOST} participants are many", where=str(store.folder))
+        raise DrakeTeleopError(
+            f"there are {MOST} participants already (the largest number)", where=str(store.folder)
+        )
     return number
 
 

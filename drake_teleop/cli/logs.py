@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.cli.printing import (
-    print_detection,
-    print_elimination,
-    print_identification,
-)
+from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
 from drake_teleop.common.writing import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
@@ -128,14 +124,12 @@ def eliminate_command(
     a decision.
     """
     load_file = Identification.load(load)
+    scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
     found = eliminate_log(
         log,
         load_file,
+        **scales,
         gripper=gripper,
-        sigma=sigma,
-        sigma_object=sigma_object,
-        gamma=gamma,
-        eta=eta,
         causal=causal,
         causal_tare_s=causal_tare_s,
         free=free,
@@ -145,10 +139,7 @@ def eliminate_command(
     summary = common_figures(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
-        "sigma": sigma,
-        "sigma_object": sigma_object,
-        "gamma": gamma,
-        "eta": eta,
+        **scales,
         "free": None if free is None else str(free),
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
@@ -239,8 +230,6 @@ def detect_command(
 
 def _detection_table(found: DetectedLog) -> pl.DataFrame:
     import polars as pl
-
-    from drake_teleop.logs.read.canonical import WRENCH
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}

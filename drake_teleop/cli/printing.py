@@ -89,7 +89,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
         figures += "; no contact found"
     causal = summary["causal"]
     if causal is not None:
-        late = "late" if causal["mode"] == "delayed" else "made up for by prediction"
+        late = "late" if causal["mode"] == "delayed" else "compensated by prediction"
         figures += (
             f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
             f" rms of |F| {causal['residual_rms']:.4g} N,"
