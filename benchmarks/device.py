@@ -30,11 +30,11 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
-from drake_teleop.live.external_master import with_device
 from drake_teleop.live.haply import read_message
 from drake_teleop.live.live import Live
 from drake_teleop.live.pace import without_collections
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.scenarios import live_scenario, with_device
+from drake_teleop.live.session import Session
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.operator.operator import GRIPS

@@ -36,7 +36,7 @@ from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
 from drake_teleop.live.inputs import RANGES, Inputs, header, read_inputs
 from drake_teleop.live.inputs import row as inputs_row
-from drake_teleop.live.messages import SLOWEST, parse
+from drake_teleop.live.live import SLOWEST, parse
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench

@@ -28,12 +28,12 @@ import numpy as np
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.choice_names import NETWORKS
-from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.inputs import NETWORKS, SLICE_MS
 from drake_teleop.live.live import FRAME, Live
 from drake_teleop.live.pace import without_collections
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
+from drake_teleop.live.scenarios import live_scenario
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import LoadScenario
@@ -147,7 +147,7 @@ def main() -> None:
             figures = driven(options.seconds, Path(folder) / "drive")
         drive = read_drive(Path(folder) / "drive")
         cpu = time.process_time()
-        repeat(drive, silent(""), Path(folder) / "again")
+        drive.repeat(silent(""), Path(folder) / "again")
         seconds = drive.scenario.simulation.duration
         figures["core_share_of_repeat"] = (time.process_time() - cpu) / seconds
         parts = sorted((Path(folder) / "drive" / "log.parquet").iterdir())

@@ -20,9 +20,9 @@ import numpy as np
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.choice_names import NAMES
-from drake_teleop.live.choices import chosen, filled_after
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.inputs import NAMES
+from drake_teleop.live.scenarios import chosen, filled_after, live_scenario
+from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 

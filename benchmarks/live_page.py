@@ -26,8 +26,9 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.hand import BEHIND
 from drake_teleop.live.live import TOUCH, Live
+from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.server import LiveDrive, drive
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import forward_kinematics
 

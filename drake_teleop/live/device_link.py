@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ipaddress
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -22,8 +24,9 @@ from drake_teleop.live.device_packets import (
     unpacked_state,
 )
 from drake_teleop.live.inputs import ANGLE, LENGTH
-from drake_teleop.robots.udp import endpoint, listening
+from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
 
+_ENDS = 2.0  # s
 _MOST = 256  # packets per poll
 _REMEMBERED = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
@@ -184,3 +187,41 @@ def _is_here(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+class DrivenBy:
+    """Link to a haptic device, and the client process if this program starts it.
+
+    Args:
+        address: udp://127.0.0.1:PORT of a device client, or haply://HOST:PORT of an Inverse3.
+
+    Raises:
+        DrakeTeleopError: for another address, or if the port is in use.
+    """
+
+    def __init__(self, address: str) -> None:
+        kind = address.partition("://")[0]
+        if kind not in ("udp", "haply"):
+            raise DrakeTeleopError(
+                "is no haptic device",
+                where=address,
+                remedy="give udp://127.0.0.1:PORT or haply://localhost:10001",
+            )
+        self.link = DeviceLink(address if kind == "udp" else f"udp://{THIS_MACHINE}:0")
+        self._client: subprocess.Popen[bytes] | None = None
+        if kind == "haply":
+            station = f"udp://{THIS_MACHINE}:{self.link.port}"
+            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
+            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
+
+    def close(self) -> None:
+        """Close the link and end the client, which releases the device."""
+        self.link.close()
+        if self._client is None:
+            return
+        self._client.terminate()
+        try:
+            self._client.wait(_ENDS)
+        except subprocess.TimeoutExpired:
+            self._client.kill()
+            self._client.wait()

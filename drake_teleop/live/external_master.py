@@ -22,14 +22,13 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.fault import Fault, sound
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.live.handing_on import GoesOver
-from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
+from drake_teleop.live.station_swap import GoesOver
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD
 from drake_teleop.station.operator.operator import HandImpedance
 from drake_teleop.station.passivity.packet import limit
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
-from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.plant import start_pose
 from drake_teleop.station.wiring import export
 
@@ -184,13 +183,6 @@ class ExternalMaster(LeafSystem):
             context.get_discrete_state_vector().value(),
             discrete_state.get_mutable_value(0),
         )
-
-
-def with_device(scenario: Scenario) -> Scenario:
-    """Return the scenario with a task-space device in place of a serial arm."""
-    if scenario.master.model not in (PHANTOM, LEADER):
-        return scenario
-    return replace(scenario, master=Master(model="haply_inverse3"))
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:

@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
-from drake_teleop.live.handing_on import GoesOver
+from drake_teleop.live.station_swap import GoesOver
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (
     HandImpedance,
@@ -32,8 +32,8 @@ from drake_teleop.station.scenario import Scenario
 Array = NDArray[np.float64]
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
-# for rotation. With a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers half
-# the distance in 46 ms. After a change of the grip the path is slower.
+# for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
+# half the distance in 46 ms. After a change of the grip the path is slower.
 _SPEED, _GENTLY, _TURNING = 2 * math.pi * 16.0, 2 * math.pi * 5.0, 2 * math.pi * 5.0
 #: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
 #: stop the error is at most the distance of 5 ms.

@@ -20,12 +20,19 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.quaternions import exponential, logarithm
 from drake_teleop.common.texts import read_text
 from drake_teleop.common.version import __version__
-from drake_teleop.live.choice_names import NAMES, NETWORKS, SENSORS, first_choices
+from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
 Array = NDArray[np.float64]
+
+OWN = "as in the scenario"
+NETWORKS = (OWN, *NETWORK_PRESETS, "custom")
+SENSORS = (OWN, *SENSOR_PRESETS)
+#: Names of each choice; a choice is the index of its name.
+NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
 
 #: File of a drive's inputs.
 INPUTS = "inputs.csv"
@@ -34,6 +41,18 @@ SLICE_MS = 5
 LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SHARE, _SCALE = 1e-2, 1e-5
 _LONGEST = 36_000_000  # ms; ten hours, as of a scenario
+
+
+def first_choices(scenario: Scenario) -> dict[str, int]:
+    """Return the choices that leave a scenario unchanged."""
+    return {
+        "network": 0,
+        "method": METHODS.index(scenario.passivity.method),
+        "grip": list(GRIPS).index(scenario.operator.grip),
+        "object": int(scenario.slave.payload.mass > 0.0),
+        "detection": int(scenario.contact_detection is not None),
+        "sensor": 0,
+    }
 
 
 @dataclass(frozen=True)

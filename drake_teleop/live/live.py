@@ -7,6 +7,8 @@ clutch opens; a quarter of a second later the simulation stops, with a complete 
 from __future__ import annotations
 
 import itertools
+import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,15 +19,13 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.writing import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
-from drake_teleop.live.following import Follower, Steering
-from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS, Inputs
-from drake_teleop.live.messages import parse
+from drake_teleop.live.inputs import CHOICES, NAMES, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.motion_limits import Follower, Steering
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.scenes import SCENES
+from drake_teleop.live.scenarios import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
@@ -44,6 +44,11 @@ _LONGEST_MS = 36_000_000
 _LIMP = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
+
+#: Largest message [bytes]; a longer one closes the connection.
+LONGEST = 4096
+#: Largest clock time per simulated time.
+SLOWEST = 20.0
 
 
 class Live:
@@ -354,3 +359,39 @@ def _free(folder: Path) -> Path:
         return folder
     names = (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2))
     return next(name for name in names if not name.exists())
+
+
+def parse(text: Any) -> dict[str, Any] | None:
+    """Return the valid requests of a message; None without any.
+
+    Returns:
+        Any of "set" and "rates" (numbers by input), "pause" (bool), "slow" (1 to 20), "scene" (of
+        `SCENES`), "reset" and "drive" (True).
+    """
+    if not isinstance(text, str) or len(text) > LONGEST:
+        return None
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(said, dict):
+        return None
+    found: dict[str, Any] = {}
+    for kind in ("set", "rates"):
+        values = said.get(kind)
+        if isinstance(values, dict):
+            found[kind] = {name: value for name, value in values.items() if _is_number(value)}
+    if isinstance(said.get("pause"), bool):
+        found["pause"] = said["pause"]
+    if _is_number(said.get("slow")):
+        found["slow"] = min(max(float(said["slow"]), 1.0), SLOWEST)
+    if isinstance(said.get("scene"), str) and said["scene"] in SCENES:
+        found["scene"] = said["scene"]
+    found |= {name: True for name in ("reset", "drive") if said.get(name) is True}
+    return found or None
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 1e15 and math.isfinite(value)

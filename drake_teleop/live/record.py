@@ -1,21 +1,27 @@
-"""Folder of a recorded drive during the drive."""
+"""Folder of a recorded drive during the drive: scenario, load, inputs and log."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 
+from pydrake.systems.analysis import Simulator
+
 from drake_teleop.common.version import __version__
 from drake_teleop.common.writing import make_folder, naming, write_text
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
 from drake_teleop.live.inputs import INPUTS, Inputs, header, row
+from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.simulation import LogOnDisk
 
 LOAD, SCENARIO = "load.npz", "scenario.yaml"
 #: Marker file: the positions in the inputs are those of a haptic device.
@@ -94,3 +100,35 @@ class Record:
             for name in (INPUTS, SCENARIO, LOAD, DEVICE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()
+
+
+class LogBeside(LogOnDisk):
+    """`LogOnDisk` that waits for the disk only in `finish` and before the next part."""
+
+    def __init__(
+        self,
+        folder: Path,
+        simulator: Simulator,
+        start: float,
+        form: Callable[[SimulationResult], SimulationResult],
+    ) -> None:
+        super().__init__(folder, simulator, start, form)
+        self._thread = ThreadPoolExecutor(1, "log of a drive")
+        self._writing: Future[None] = self._thread.submit(_load)
+
+    def finish(self) -> None:
+        """Wait until all rows taken so far are on the disk.
+
+        Raises:
+            DrakeTeleopError: if they cannot be written.
+        """
+        self._writing.result()
+
+    def _write(self, part: SimulationResult) -> None:
+        self.finish()
+        self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
+
+
+def _load() -> None:
+    """Import polars on the thread, which takes 0.1 s."""
+    import polars  # noqa: F401

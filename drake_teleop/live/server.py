@@ -39,14 +39,12 @@ from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.writing import make_folder
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
-from drake_teleop.live.device import DrivenBy
-from drake_teleop.live.external_master import with_device
-from drake_teleop.live.live import Live
-from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.device_link import DrivenBy
+from drake_teleop.live.live import LONGEST, Live
 from drake_teleop.live.pace import without_collections
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenes import SCENES, scene
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.scenarios import SCENES, live_scenario, scene, with_device
+from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 

@@ -1,6 +1,6 @@
 """A station that runs in slices and takes its inputs between them; without clock and page.
 
-The motion depends on the inputs alone: `repeat` gives the same log, for any division into slices.
+The motion depends on the inputs alone: `Drive.repeat` gives the same log for any slices.
 A recorded drive is a folder with `scenario.yaml`, `load.npz`, `inputs.csv` and `log.parquet`.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,20 +16,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.systems.analysis import InitializeParams
-from pydrake.systems.framework import Context
+from pydrake.systems.analysis import InitializeParams, Simulator
+from pydrake.systems.framework import Context, EventStatus
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import Progress
 from drake_teleop.lab.identified_load import IdentifiedLoad, read_load
-from drake_teleop.live.choices import BLEND, chosen, filled_after, known_estimate
 from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
-from drake_teleop.live.handing_on import hand_on
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
-from drake_teleop.live.log_beside import LogBeside
-from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, Record, made_by
-from drake_teleop.live.steps import take_short_steps_in_contact
+from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, LogBeside, Record, made_by
+from drake_teleop.live.scenarios import BLEND, chosen, filled_after, known_estimate
+from drake_teleop.live.station_swap import hand_on
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import LOG, SIGNALS, signal_of
@@ -47,18 +46,44 @@ _SHORTEST_STEP = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
 _MOST_RISE = 0.9
 
+# Duration of short steps after a rejected one [s].
+_STAYS_SHORT = 4e-3
 
-def live_scenario(scenario: Scenario) -> Scenario:
-    """Return a scenario without intent, task and settling, with error-controlled steps."""
-    return replace(
-        scenario,
-        operator__intent=[],
-        operator__task=None,
-        simulation__settle=0.0,
-        simulation__end_with_task=False,
-        simulation__on_fault="continue",
-        simulation__integrator="runge_kutta3",
-    )
+
+def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
+    """Bound the steps of error control from below, and keep them short after a rejection.
+
+    A bouncing tool makes error control reject two of five steps, which takes time. It resumes 4 ms
+    after a rejection.
+
+    Args:
+        simulator: of a station, whose integrator has error control.
+        shortest: step of error control [s]; at most the integrator's longest.
+    """
+    integrator = simulator.get_mutable_integrator()
+    longest = integrator.get_maximum_step_size()
+    shortest = min(shortest, longest)
+    integrator.set_requested_minimum_step_size(shortest)
+    integrator.set_throw_on_minimum_step_size_violation(False)
+    # The monitor must not keep the simulator alive.
+    station: Any = weakref.ref(simulator)
+    rejected, until = 0, math.inf
+
+    def after_step(context: Context) -> EventStatus:
+        nonlocal rejected, until
+        integrator = station().get_mutable_integrator()
+        number = integrator.get_num_step_shrinkages_from_error_control()
+        if number != rejected:
+            rejected, until = number, context.get_time() + _STAYS_SHORT
+            integrator.set_maximum_step_size(shortest)
+            integrator.set_fixed_step_mode(True)
+        elif context.get_time() >= until:
+            until = math.inf
+            integrator.set_maximum_step_size(longest)
+            integrator.set_fixed_step_mode(False)
+        return EventStatus.DidNothing()
+
+    simulator.set_monitor(after_step)
 
 
 def with_all_signals(log: SimulationResult) -> SimulationResult:
@@ -345,9 +370,25 @@ class Drive:
     device: bool = False
     folder: Path = Path()
 
-    def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
-        """Simulate the drive again, see the function `repeat`."""
-        return repeat(self, progress, log)
+    def repeat(
+        self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
+    ) -> SimulationResult:
+        """Simulate the drive again and return its log, which is the same, bit by bit.
+
+        Args:
+            progress: called with the fraction done.
+            log: folder of the log; None for one in memory.
+            slice_ms: longest step between changes [ms].
+        """
+        session = Session(self.scenario, self.load, log=log, device=self.device)
+        end = self.changes[-1][0]
+        for ms, inputs in self.changes:
+            while session.ms < ms:
+                session.advance(min(slice_ms, ms - session.ms))
+                progress(session.ms / end)
+            session.apply(inputs)
+        session.close()
+        return session.log() if log is None else SimulationResult.scan_parquet(log)
 
 
 def read_drive(folder: str | Path) -> Drive:
@@ -365,25 +406,3 @@ def read_drive(folder: str | Path) -> Drive:
         raise DrakeTeleopError("is damaged, or no load of a drive", where=str(folder / LOAD))
     driven = replace(scenario, simulation__duration=1e-3 * changes[-1][0])
     return Drive(driven, load, changes, (folder / DEVICE).exists(), folder)
-
-
-def repeat(
-    drive: Drive, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
-) -> SimulationResult:
-    """Simulate a recorded drive again; the log is the same, bit by bit.
-
-    Args:
-        drive: from `read_drive`.
-        progress: called with the fraction done.
-        log: folder of the log; None for one in memory.
-        slice_ms: longest step between changes [ms].
-    """
-    session = Session(drive.scenario, drive.load, log=log, device=drive.device)
-    end = drive.changes[-1][0]
-    for ms, inputs in drive.changes:
-        while session.ms < ms:
-            session.advance(min(slice_ms, ms - session.ms))
-            progress(session.ms / end)
-        session.apply(inputs)
-    session.close()
-    return session.log() if log is None else SimulationResult.scan_parquet(log)

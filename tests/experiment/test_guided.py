@@ -6,16 +6,16 @@ import json
 
 import numpy as np
 import pytest
+from drake_teleop.live.experiment.messages import HAND, parse_study
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
 from drake_teleop.live.experiment.guided import Guided
-from drake_teleop.live.experiment.messages import HAND, parse_study
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.session import read_drive, repeat
+from drake_teleop.live.session import read_drive
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
@@ -92,7 +92,7 @@ def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
     person.guided.close()
     drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
     assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
-    assert repeat(drive, silent).t[-1] == pytest.approx(0.5, abs=0.03)
+    assert drive.repeat(silent).t[-1] == pytest.approx(0.5, abs=0.03)
     told = json.dumps(person.frames) + json.dumps(person.guided.hello())
     assert "secret" not in told
     assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)

@@ -9,7 +9,7 @@ import pytest
 
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live import server
-from drake_teleop.live.session import live_scenario
+from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave

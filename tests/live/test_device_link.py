@@ -14,10 +14,9 @@ from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
-from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.device_client import Client
 from drake_teleop.live.device_guard import DeviceGuard, Limits
-from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.device_link import DeviceLink, DrivenBy
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
     DeviceState,
@@ -28,11 +27,11 @@ from drake_teleop.live.device_packets import (
     unpacked_force,
     unpacked_state,
 )
-from drake_teleop.live.external_master import with_device
 from drake_teleop.live.haply import HaplyDevice, read_message, written_force
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.station.result import SimulationResult
 
@@ -345,7 +344,7 @@ def test_a_drive_by_a_device_is_repeated_to_the_same_bytes(scenario, load, tmp_p
     session.close()
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     drive = read_drive(tmp_path)
-    again = repeat(drive, silent(""))
+    again = drive.repeat(silent(""))
     assert all(np.array_equal(log[name], again[name], equal_nan=True) for name in ("t", *log))
     assert max(felt) > 0.3
     assert max(felt[80:101]) > 0.3

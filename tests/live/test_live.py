@@ -13,10 +13,9 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.common.writing import CannotWrite
-from drake_teleop.live.live import FRAME, Live
-from drake_teleop.live.messages import LONGEST, parse
+from drake_teleop.live.live import FRAME, LONGEST, Live, parse
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
 
 
@@ -77,7 +76,7 @@ def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
     pull = log["hand_wrench_E"][gone:, :3] + 20.0 * log["twist_master"][gone:, :3]
     np.testing.assert_allclose(pull, 0.0, atol=1e-12)
     assert np.ptp(log["pose_command"][gone + 10 :, 4:], axis=0).max() == 0.0
-    again = repeat(read_drive(folder), silent(""))
+    again = read_drive(folder).repeat(silent(""))
     assert len(again.t) == len(log.t)
     np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
 

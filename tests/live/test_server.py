@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import server
-from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.live import LONGEST
 from drake_teleop.station.scenario import Scenario, replace
 
 LEARNING = replace(Scenario(), load_estimator__enabled=True)  # identifies nothing beforehand

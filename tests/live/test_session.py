@@ -15,9 +15,9 @@ from drake_teleop.common.progress import silent
 from drake_teleop.common.resources import models_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import BEHIND
-from drake_teleop.live.handing_on import GoesOver
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
-from drake_teleop.live.session import Drive, Session, read_drive, repeat
+from drake_teleop.live.session import Drive, Session, read_drive
+from drake_teleop.live.station_swap import GoesOver
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -71,11 +71,11 @@ def test_a_drive_is_recorded_and_repeats_itself_however_it_is_sliced(driven, sce
     assert drive.scenario == replace(scenario, simulation__duration=1e-3 * END)
     assert dict(drive.changes).items() >= dict(script(scenario)).items()
     for slice_ms in (1, 7, END):
-        assert same(repeat(drive, silent(""), slice_ms=slice_ms), log)
+        assert same(drive.repeat(silent(""), slice_ms=slice_ms), log)
     assert len(log.t) == END + 1 and np.abs(log["true_contact_wrench_W"][:, 2]).max() > 5.0
     # One input one slice late is another drive.
     late = [(ms + 5 * (ms == 100), inputs) for ms, inputs in script(scenario)]
-    assert not same(repeat(Drive(scenario, load, late), silent("")), log)
+    assert not same(Drive(scenario, load, late).repeat(silent("")), log)
 
 
 @pytest.mark.slow

@@ -7,8 +7,7 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_teleop.live.inputs import SLICE_MS
-from drake_teleop.live.session import Session
-from drake_teleop.live.steps import take_short_steps_in_contact
+from drake_teleop.live.session import Session, take_short_steps_in_contact
 
 SHORTEST, TICK = 2.5e-4, 5e-4
 

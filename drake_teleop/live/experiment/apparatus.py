@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.choice_names import OWN
-from drake_teleop.live.choices import chosen, known_estimate
 from drake_teleop.live.experiment.design import (
     ApparentMass,
     Condition,
@@ -24,8 +22,8 @@ from drake_teleop.live.experiment.design import (
     Task,
 )
 from drake_teleop.live.experiment.procedure import Felt
-from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.session import live_scenario
+from drake_teleop.live.inputs import OWN, RANGES, Inputs
+from drake_teleop.live.scenarios import chosen, known_estimate, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace

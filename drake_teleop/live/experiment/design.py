@@ -12,7 +12,7 @@ from drake_teleop.common.errors import DrakeTeleopError, expect, meant
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import check_ranges, check_structure, choice, plain, quantity
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.live.choice_names import NETWORKS, OWN
+from drake_teleop.live.inputs import NETWORKS, OWN
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioNames

@@ -18,12 +18,11 @@ from drake_teleop.common.writing import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, Rows
 from drake_teleop.live.experiment.design import PegInSlot
-from drake_teleop.live.experiment.messages import HAND, parse_study
 from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import seeded
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME, Live, Show
+from drake_teleop.live.live import FRAME, Live, Show, parse
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
@@ -34,6 +33,9 @@ _KNOWN = (
     *("speed", "slow", "view", "no_view", "moves"),
 )
 _HIDDEN = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+
+#: Inputs of a drive that move the hand.
+HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def unseen(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -261,3 +263,28 @@ class Guided:
         self._live.close()
         if self._link is not None:
             self._link.close()
+
+
+def parse_study(text: Any) -> dict[str, Any] | None:
+    """Return the valid requests of a message; None without any.
+
+    Returns:
+        Any of "set" and "rates" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).
+    """
+    said = parse(text) or {}
+    found: dict[str, Any] = {}
+    for kind in said.keys() & {"set", "rates"}:
+        found[kind] = {name: value for name, value in said[kind].items() if name in HAND}
+    if "drive" in said:
+        found["drive"] = True
+    try:
+        whole = json.loads(text) if isinstance(text, str) and len(text) < 100 else None
+    except (ValueError, RecursionError):
+        whole = None
+    if isinstance(whole, dict):
+        if whole.get("go") is True:
+            found["go"] = True
+        answer = whole.get("answer")
+        if isinstance(answer, int) and not isinstance(answer, bool) and answer in (1, 2):
+            found["answer"] = answer
+    return found or None

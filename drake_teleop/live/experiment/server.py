@@ -14,8 +14,8 @@ from drake_teleop.live.experiment.guided import Guided
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.simulated import all_apparatus
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.external_master import with_device
 from drake_teleop.live.page_scene import PageScene
+from drake_teleop.live.scenarios import with_device
 from drake_teleop.live.server import LiveDrive, waits, warm_up
 from drake_teleop.station.scenario import Scenario
 

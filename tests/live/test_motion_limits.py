@@ -10,10 +10,10 @@ import pytest
 
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state
-from drake_teleop.live.external_master import with_device
-from drake_teleop.live.following import Follower, Steering
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
+from drake_teleop.live.motion_limits import Follower, Steering
+from drake_teleop.live.scenarios import with_device
 from drake_teleop.station.scenario import Scenario, replace
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")

@@ -1,4 +1,4 @@
-"""Scenario that follows from the driver's choices: network, method, grip, object, sensor."""
+"""Scenarios of a drive: as driven, scenes of the page, and the result of the driver's choices."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.choice_names import NETWORKS, OWN, SENSORS
-from drake_teleop.live.inputs import Inputs
+from drake_teleop.live.inputs import NETWORKS, OWN, SENSORS, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
+from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.passivity.safe_state import RESUME
-from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.payload import Payload
 from drake_teleop.station.slave.plant import NominalSlave
@@ -31,6 +32,47 @@ BLEND = 0.25
 # ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
 _TURNING = 0.5
 _TENTH_OF_MS, _PERCENT, _PER_MILLE = 1e-4, 1e-2, 1e-3
+
+#: Shipped scenario of each scene; "own" is the scenario of the drive.
+_SHIPPED = {
+    "leaf": "touch",
+    "slot": "peg_in_slot",
+    "wall": "touch",
+    "block": "push_block",
+}
+SCENES = ("own", *_SHIPPED)
+
+
+def live_scenario(scenario: Scenario) -> Scenario:
+    """Return a scenario without intent, task and settling, with error-controlled steps."""
+    return replace(
+        scenario,
+        operator__intent=[],
+        operator__task=None,
+        simulation__settle=0.0,
+        simulation__end_with_task=False,
+        simulation__on_fault="continue",
+        simulation__integrator="runge_kutta3",
+    )
+
+
+def with_device(scenario: Scenario) -> Scenario:
+    """Return the scenario with a task-space device in place of a serial arm."""
+    if scenario.master.model not in (PHANTOM, LEADER):
+        return scenario
+    return replace(scenario, master=Master(model="haply_inverse3"))
+
+
+def scene(name: str, own: Scenario) -> Scenario:
+    """Return the scenario of one of `SCENES`; "own" is the drive's first scenario."""
+    if name == "own":
+        return own
+    scenario = LoadScenario(_SHIPPED[name])
+    if name == "wall":
+        wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
+        changes = {"sheet_spring": None, "environment": [wall], "description": "a wall to press on"}
+        scenario = replace(scenario, **changes)
+    return live_scenario(scenario)
 
 
 def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
