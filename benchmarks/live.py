@@ -30,7 +30,7 @@ from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.inputs import NETWORKS, SLICE_MS
 from drake_teleop.live.live import FRAME, Live
-from drake_teleop.live.pace import without_collections
+from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.session import Session, read_drive
@@ -64,8 +64,8 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         now = clock()
         if now >= next_message:
             next_message += FRAME
-            live.hear(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.still and live.pace.wait(now) <= 0:
+            live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
+        if not live.is_idle and live.pace.wait(now) <= 0:
             late.append(-live.pace.wait(now))
         frame = live.tick(clock)
         if frame is not None:
@@ -119,7 +119,7 @@ def spent(session: Session, choice: dict[str, int], seconds: float) -> list[floa
         session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
         session.advance()
         taken.append(1e3 * (time.thread_time() - start))
-        session.news()  # a page asks for them, too
+        session.new_rows()  # a page asks for them, too
     return taken[1000 // SLICE_MS :]
 
 
@@ -139,11 +139,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     if options.slices:
-        with without_collections():
+        with without_garbage_collection():
             finish(slices(options.seconds), options.json)
         return
     with tempfile.TemporaryDirectory() as folder:
-        with without_collections():
+        with without_garbage_collection():
             figures = driven(options.seconds, Path(folder) / "drive")
         drive = read_drive(Path(folder) / "drive")
         cpu = time.process_time()

@@ -72,7 +72,7 @@ def driven(seconds: float, folder: Path) -> None:
         session.apply(wanted(session.inputs, session.ms, end))
         session.advance()
         if session.ms % (3 * SLICE_MS) == 0:
-            session.news()
+            session.new_rows()
     session.close()
 
 

@@ -9,7 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
 from drake_teleop.live.experiment.procedure import trials_of
 from drake_teleop.live.experiment.results import write_results
-from drake_teleop.live.experiment.store import MOST, Store, open_results
+from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_results
 from drake_teleop.station.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -62,9 +62,10 @@ def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
         if len(store.rows(number)) < trials:
             return number
     number = max(known, default=0) + 1
-    if number > MOST:
+    if number > MAX_PARTICIPANT:
         raise DrakeTeleopError(
-            f"there are {MOST} participants already (the largest number)", where=str(store.folder)
+            f"there are {MAX_PARTICIPANT} participants already (the largest number)",
+            where=str(store.folder),
         )
     return number
 

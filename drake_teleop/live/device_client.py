@@ -23,10 +23,10 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_packets import (
-    LONGEST,
+    MAX_PACKET_BYTES,
+    DevicePose,
     DeviceState,
     ForceCommand,
-    Place,
     packed_state,
     unpacked_force,
 )
@@ -35,8 +35,8 @@ from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.robots.udp import endpoint
 from drake_teleop.station.operator.operator import GRIPS
 
-_PERIOD, _LATE = 1e-3, 0.1  # s
-_REMEMBERED = 100_000  # ticks
+_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
+_MAX_AGES = 100_000  # ticks
 
 
 class Device(Protocol):
@@ -46,7 +46,7 @@ class Device(Protocol):
     def limits(self) -> Limits:
         """Largest force and torque, and their slew rates."""
 
-    def read(self) -> Place | None:
+    def read(self) -> DevicePose | None:
         """Wait for the next pose; return None after half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
@@ -71,36 +71,40 @@ class Client:
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.behind: deque[float] = deque(maxlen=_REMEMBERED)
+        self.behind: deque[float] = deque(maxlen=_MAX_AGES)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(endpoint(address))
         self._socket.setblocking(False)
         self._command: ForceCommand | None = None
-        self._last: float | None = None
+        self._last_tick: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
         """Exchange one pose and force; return the displayed wrench, None without a pose."""
         place = self._device.read()
         now = clock()
-        self._listen()
+        self._receive()
         if place is None:
             self._device.set((0.0,) * 6)
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
-        period = _PERIOD if self._last is None else min(max(now - self._last, 1e-5), _LATE)
-        self._last = now
-        asked = (0.0,) * 6 if command is None else command.wrench
-        wrench = self.guard.tick(place.position, asked, age, period)
+        period = (
+            _PERIOD_S
+            if self._last_tick is None
+            else min(max(now - self._last_tick, 1e-5), _MAX_LATENESS_S)
+        )
+        self._last_tick = now
+        commanded = (0.0,) * 6 if command is None else command.wrench
+        wrench = self.guard.tick(place.position, commanded, age, period)
         self._device.set(wrench)
         self._send(place, now, age)
         return wrench
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         while True:
             try:
-                packet = self._socket.recv(LONGEST + 1)
+                packet = self._socket.recv(MAX_PACKET_BYTES + 1)
             except BlockingIOError:
                 return
             except ConnectionError:  # the station is not started yet
@@ -111,7 +115,7 @@ class Client:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send(self, place: Place, now: float, age: float) -> None:
+    def _send(self, place: DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
@@ -130,7 +134,7 @@ class Client:
         self._socket.close()
 
 
-class Simulated:
+class RealTimeDevice:
     """Virtual device in real time."""
 
     limits = Limits(force=10.0)
@@ -138,20 +142,20 @@ class Simulated:
     def __init__(self, virtual: VirtualDevice) -> None:
         self.virtual = virtual
         self._wrench: Sequence[float] = (0.0,) * 6
-        self._due = self._moved = time.perf_counter()
+        self._due = self._simulated_until = time.perf_counter()
 
-    def read(self) -> Place:
+    def read(self) -> DevicePose:
         """See `Device.read`."""
-        self._due += _PERIOD
+        self._due += _PERIOD_S
         now = time.perf_counter()
         if self._due > now:
             time.sleep(self._due - now)
         now = time.perf_counter()
-        if now - self._due > _LATE:  # missed ticks are not made up for
-            self._due = self._moved = now
-        self.virtual.move(self._wrench[:3], max(now - self._moved, 1e-6))
-        self._moved = now
-        return Place(self.virtual.position)
+        if now - self._due > _MAX_LATENESS_S:  # missed ticks are not made up for
+            self._due = self._simulated_until = now
+        self.virtual.move(self._wrench[:3], max(now - self._simulated_until, 1e-6))
+        self._simulated_until = now
+        return DevicePose(self.virtual.position)
 
     def set(self, wrench: Sequence[float]) -> None:
         """See `Device.set`."""
@@ -161,10 +165,10 @@ class Simulated:
         """See `Device.close`."""
 
 
-def made(address: str, grip: str, depth: float) -> Device:
+def open_device(address: str, grip: str, depth: float) -> Device:
     """Return the device of an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
-        return Simulated(VirtualDevice(tapping(depth), grip))
+        return RealTimeDevice(VirtualDevice(tapping(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
     raise DrakeTeleopError("is no device", where=address, remedy="virtual, or haply://HOST:PORT")
@@ -181,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--no-observer", action="store_true")
     parser.add_argument("--json", type=Path, help="figures, at the end")
     options = parser.parse_args(arguments)
-    device = made(options.device, options.grip, options.depth)
+    device = open_device(options.device, options.grip, options.depth)
     client = Client(device, options.station, observe=not options.no_observer)
     end, largest = time.perf_counter() + options.seconds, 0.0
     try:

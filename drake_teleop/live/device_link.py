@@ -13,10 +13,10 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.quaternions import conjugate, logarithm, multiply
-from drake_teleop.live.device_guard import SILENT
+from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
-    LONGEST,
+    MAX_PACKET_BYTES,
     DeviceState,
     ForceCommand,
     packed_force,
@@ -26,11 +26,11 @@ from drake_teleop.live.device_packets import (
 from drake_teleop.live.inputs import ANGLE, LENGTH
 from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
 
-_ENDS = 2.0  # s
-_MOST = 256  # packets per poll
-_REMEMBERED = 2000  # packets in the statistics of lateness
+_CLIENT_TIMEOUT_S = 2.0  # s
+_MAX_PACKETS = 256  # packets per poll
+_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
 # Duration of the open clutch after silence, while the hand moves to the device's pose [s].
-_SETTLES = 0.05
+_CLUTCH_OPEN_S = 0.05
 
 
 class DeviceLink:
@@ -53,7 +53,7 @@ class DeviceLink:
 
     def __init__(self, address: str) -> None:
         host, port = endpoint(address)
-        if not _is_here(host):
+        if not _is_loopback(host):
             raise DrakeTeleopError(
                 "is not this machine: whoever can send there moves the arm",
                 where=address,
@@ -66,45 +66,45 @@ class DeviceLink:
         self.refusal = ""
         self._peer: Any = None
         self._state: DeviceState | None = None
-        self._heard, self._since, self._now = -np.inf, np.inf, 0.0
+        self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
         # Arrival minus the device's time; the minimum is the clock offset.
-        self._waited: deque[float] = deque(maxlen=_REMEMBERED)
-        self._behind: deque[float] = deque(maxlen=_REMEMBERED)
+        self._latencies: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
     def poll(self, now: float) -> DeviceState | None:
         """Receive waiting packets; return the newest state, None if the device is silent."""
-        self._now = now
-        for _ in range(_MOST):
+        self._polled_at = now
+        for _ in range(_MAX_PACKETS):
             try:
-                packet, peer = self._socket.recvfrom(LONGEST + 1)
+                packet, peer = self._socket.recvfrom(MAX_PACKET_BYTES + 1)
             except (BlockingIOError, ConnectionError):
                 break
-            self._take(packet, peer, now)
+            self._handle_packet(packet, peer, now)
         return None if self.silent(now) else self._state
 
-    def _take(self, packet: bytes, peer: Any, now: float) -> None:
+    def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
         state, silent = unpacked_state(packet), self.silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
             self.refusal = refusal(packet) if state is None else "is from a second device"
             return
         if silent:  # a new device, or the same one after a pause
-            self._peer, self._since, self._state = peer, now, None
-            self._waited.clear()
+            self._peer, self._connected_at, self._state = peer, now, None
+            self._latencies.clear()
         elif self._state is not None:
             if state.number <= self._state.number:  # already counted as lost
                 self.lost -= state.number < self._state.number
                 return
             self.lost += state.number - self._state.number - 1
-        self._state, self._heard = state, now
+        self._state, self._last_arrival = state, now
         self._origin = self._origin or state
-        self._waited.append(now - state.t)
-        self._behind.append(state.behind)
+        self._latencies.append(now - state.t)
+        self._force_ages.append(state.behind)
 
     def silent(self, now: float) -> bool:
         """Return whether no valid packet has come for 50 ms."""
-        return now - self._heard > SILENT
+        return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:
         """Answer the newest state with the wrench (6,) [N, N m]."""
@@ -116,11 +116,11 @@ class DeviceLink:
         except OSError:  # a later attempt would send an old force
             return
 
-    def begin_anew(self, now: float) -> None:
+    def reset_origin(self, now: float) -> None:
         """Make the device's present pose correspond to the station's start pose."""
-        self._origin, self._since = self._state, now
+        self._origin, self._connected_at = self._state, now
 
-    def lead(self, now: float) -> Mapping[str, float]:
+    def hand_inputs(self, now: float) -> Mapping[str, float]:
         """Return the `Inputs` of the device's pose; a silent device releases the hand.
 
         The clutch is contained only if it is open.
@@ -134,26 +134,30 @@ class DeviceLink:
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / LENGTH
             values["r" + name] = turn[k] / ANGLE
-        if state.flags & CLUTCH_OPEN or now - self._since < _SETTLES:
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_S:
             values["clutch"] = 0
         return values
 
     def figures(self, now: float) -> dict[str, float]:
         """Return packets per second, lateness of packets and force [ms], and losses."""
-        late = np.array(self._waited or [0.0])
-        behind = np.array(self._behind or [0.0])
-        spent = min(now - self._since, 1e-3 * _REMEMBERED) if len(self._waited) > 1 else np.inf
+        late = np.array(self._latencies or [0.0])
+        behind = np.array(self._force_ages or [0.0])
+        elapsed = (
+            min(now - self._connected_at, 1e-3 * _STATISTICS_PACKETS)
+            if len(self._latencies) > 1
+            else np.inf
+        )
         return {
-            "rate_hz": float(len(late) / max(spent, 1e-3)),
+            "rate_hz": float(len(late) / max(elapsed, 1e-3)),
             "late_p99_ms": float(1e3 * (np.percentile(late, 99) - late.min())),
             "behind_p50_ms": float(1e3 * np.median(behind)),
             "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),
             "lost": float(max(self.lost, 0)),
         }
 
-    def text(self) -> str:
+    def status_text(self) -> str:
         """Return the state of the link at the last `poll` in words."""
-        return self._heard_text() + self.refused_text()
+        return self._lateness_text() + self.refused_text()
 
     def refused_text(self) -> str:
         """Return the number of refused packets and the last reason, or ""."""
@@ -161,26 +165,26 @@ class DeviceLink:
             return ""
         return f". Refused packets: {self.refused}; the last one {self.refusal}"
 
-    def _heard_text(self) -> str:
-        now = self._now
+    def _lateness_text(self) -> str:
+        now = self._polled_at
         if self.silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
-        found = self.figures(now)
-        said = f"Device: packets arrive up to {found['late_p99_ms']:.1f} ms late (99 of 100)"
-        if found["behind_p99_ms"] > 0.0:
-            said += (
-                f"; its force belongs to its position {found['behind_p50_ms']:.1f} ms ago"
-                f" (99 of 100: up to {found['behind_p99_ms']:.1f} ms)"
+        figures = self.figures(now)
+        text = f"Device: packets arrive up to {figures['late_p99_ms']:.1f} ms late (99 of 100)"
+        if figures["behind_p99_ms"] > 0.0:
+            text += (
+                f"; its force belongs to its position {figures['behind_p50_ms']:.1f} ms ago"
+                f" (99 of 100: up to {figures['behind_p99_ms']:.1f} ms)"
             )
-        return said + (f"; {found['lost']:.0f} packets lost" if found["lost"] else "")
+        return text + (f"; {figures['lost']:.0f} packets lost" if figures["lost"] else "")
 
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
 
 
-def _is_here(host: str) -> bool:
+def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
@@ -189,7 +193,7 @@ def _is_here(host: str) -> bool:
         return False
 
 
-class DrivenBy:
+class DeviceConnection:
     """Link to a haptic device, and the client process if this program starts it.
 
     Args:
@@ -221,7 +225,7 @@ class DrivenBy:
             return
         self._client.terminate()
         try:
-            self._client.wait(_ENDS)
+            self._client.wait(_CLIENT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._client.kill()
             self._client.wait()

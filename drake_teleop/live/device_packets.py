@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 _STATE, _FORCE = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6d")
 _FROM_DEVICE, _TO_DEVICE = b"DTD1", b"DTF1"
-LONGEST = _STATE.size  #: of both packets [bytes]
-_FARTHEST, _LARGEST = 10.0, 1e3  # m; N, N m
+MAX_PACKET_BYTES = _STATE.size  #: of both packets [bytes]
+_MAX_POSITION_M, _MAX_WRENCH = 10.0, 1e3  # m; N, N m
 
 
 #: Flag of the device: its motion is not transmitted to the slave.
@@ -43,7 +43,7 @@ class DeviceState(NamedTuple):
     behind: float = 0.0
 
 
-class Place(NamedTuple):
+class DevicePose(NamedTuple):
     """Pose of a device: p_BE [m], R_BE as [w, x, y, z], flags of `DeviceState`."""
 
     position: Sequence[float]
@@ -70,18 +70,20 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return believable(number, t, flags, numbers)
+    return plausible_state(number, t, flags, numbers)
 
 
-def believable(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
+def plausible_state(
+    number: int, t: float, flags: int, numbers: Sequence[float]
+) -> DeviceState | None:
     """Return the state of position, orientation and `behind` (8,); None if implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
     if not (
-        -_FARTHEST <= x <= _FARTHEST
-        and -_FARTHEST <= y <= _FARTHEST
-        and -_FARTHEST <= z <= _FARTHEST
+        -_MAX_POSITION_M <= x <= _MAX_POSITION_M
+        and -_MAX_POSITION_M <= y <= _MAX_POSITION_M
+        and -_MAX_POSITION_M <= z <= _MAX_POSITION_M
         and 0.5 < length < 2.0
         and -1e12 <= t <= 1e12
         and math.isfinite(behind)
@@ -114,6 +116,6 @@ def unpacked_force(packet: bytes) -> ForceCommand | None:
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None
     _, _, number, t, *wrench = _FORCE.unpack(packet)
-    if not (math.isfinite(t) and all(abs(f) < _LARGEST for f in wrench)):  # refuses nan, too
+    if not (math.isfinite(t) and all(abs(f) < _MAX_WRENCH for f in wrench)):  # refuses nan, too
         return None
     return ForceCommand(number, t, tuple(wrench))

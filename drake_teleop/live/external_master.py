@@ -22,7 +22,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.fault import Fault, sound
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.live.station_swap import GoesOver
+from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD
 from drake_teleop.station.operator.operator import HandImpedance
@@ -38,48 +38,48 @@ Array = NDArray[np.float64]
 TICK, TICK_MS = 2e-3, 2
 # Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
 # largest slew rate [1/s].
-_FADE, _RETURN, _SLEW = 0.05, 4.0, 150.0
+_FADE_S, _RETURN, _SLEW = 0.05, 4.0, 150.0
 # Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
-_HELD, _START, _FROM, _WAY, _TURN, _PATH = 0, 1, 2, 9, 12, 15
+_HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
 # Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
 _WRENCH = float(Fault.WRENCH)
 
 
 @njit(cache=True)
-def _on_way(path, time, out):
+def _pose_on_path(path, time, out):
     """Write pose (7,) and twist (6,) at `time` into `out` (13,)."""
-    share = min(max((time - path[_START]) / TICK, 0.0), 1.0)
-    r = (share * path[_TURN], share * path[_TURN + 1], share * path[_TURN + 2])
-    start = (path[_FROM], path[_FROM + 1], path[_FROM + 2], path[_FROM + 3])
+    share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
+    r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
+    start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
     turned = multiply(exponential(r), start)
     moves = 1.0 / TICK if share < 1.0 else 0.0
     for k in range(4):
         out[k] = turned[k]
     for k in range(3):
-        out[4 + k] = path[_FROM + 4 + k] + share * path[_WAY + k]
-        out[7 + k] = moves * path[_WAY + k]
-        out[10 + k] = moves * path[_TURN + k]
+        out[4 + k] = path[_START_POSE + 4 + k] + share * path[_DISPLACEMENT + k]
+        out[7 + k] = moves * path[_DISPLACEMENT + k]
+        out[10 + k] = moves * path[_ROTATION + k]
 
 
 @njit(cache=True)
-def _display(wrench, held, period, most, last, now):
-    """Write the displayed wrench after one period to `now` (8,); `most` (2,) [N, N m]."""
+def _display_step(wrench, held, period, limits, last, now):
+    """Write the displayed wrench after one period to `now` (8,); `limits` (2,) [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
-    wanted = held and fault == 0.0
-    change = _RETURN if wanted else -1.0 / _FADE
+    enabled = held and fault == 0.0
+    change = _RETURN if enabled else -1.0 / _FADE_S
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
-    if wanted:
+    if enabled:
         target[:] = wrench
     for g in range(2):
-        limit(target, g, allowed * most[g])
+        limit(target, g, allowed * limits[g])
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit(step, g, _SLEW * period * most[g])
+        limit(step, g, _SLEW * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
     now[_FAULT], now[_ALLOWED] = fault, allowed
@@ -108,17 +108,17 @@ class ExternalMaster(LeafSystem):
     Args:
         start: (7,) X_BE.
         period: of the hand [s].
-        most: (2,) largest force and torque [N, N m].
+        limits: (2,) largest force and torque [N, N m].
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, start: Array, period: float, most: Array) -> None:
+    def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
         path = np.zeros(_PATH)
-        path[_HELD], path[_START], path[_FROM:_WAY] = 1.0, -TICK, start
+        path[_HELD], path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = 1.0, -TICK, start
         self._path = self.DeclareNumericParameter(BasicVector(path))
-        self._period, self._most, self._now = period, most, np.zeros(13)
+        self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self.DeclareDiscreteState(np.zeros(_DISPLAY))
         moves = {self.all_parameters_ticket(), self.time_ticket()}
@@ -134,30 +134,34 @@ class ExternalMaster(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def Lead(self, context: Context, target: Array | None) -> None:
+    def SetTarget(self, context: Context, target: Array | None) -> None:
         """Move the device towards `target` (7,) X_BE; None releases it."""
-        now, path = self._at(context), np.zeros(_PATH)
-        path[_START], path[_FROM:_WAY] = context.get_time(), now[:7]
+        now, path = self._present(context), np.zeros(_PATH)
+        path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
-            path[_HELD], path[_WAY:_TURN] = 1.0, target[4:] - now[4:7]
-            path[_TURN:] = logarithm(multiply(tuple(target[:4]), conjugate(tuple(now[:4]))))
+            path[_HELD], path[_DISPLACEMENT:_ROTATION] = 1.0, target[4:] - now[4:7]
+            path[_ROTATION:] = logarithm(multiply(tuple(target[:4]), conjugate(tuple(now[:4]))))
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
         """Do nothing: a real hand has no impedance setting."""
 
-    def _at(self, context: Context) -> Array:
-        _on_way(context.get_numeric_parameter(self._path).value(), context.get_time(), self._now)
-        return self._now
+    def _present(self, context: Context) -> Array:
+        _pose_on_path(
+            context.get_numeric_parameter(self._path).value(),
+            context.get_time(),
+            self._pose_and_twist,
+        )
+        return self._pose_and_twist
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._at(context)[:7])
+        output.SetFromVector(self._present(context)[:7])
 
     def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._at(context)[7:])
+        output.SetFromVector(self._present(context)[7:])
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        pose = self._at(context)
+        pose = self._present(context)
         turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
         turns = (turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle())
         output.SetFromVector([*pose[4:7], *turns, *([0.0] * 6)])
@@ -175,24 +179,24 @@ class ExternalMaster(LeafSystem):
         output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        _display(
+        _display_step(
             self._command.Eval(context),
             context.get_numeric_parameter(self._path).value()[_HELD] > 0.5,
             self._period,
-            self._most,
+            self._limits,
             context.get_discrete_state_vector().value(),
             discrete_state.get_mutable_value(0),
         )
 
 
-def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
+def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
     """Return a master side (docs/station.md) of a real device and `kinematic_scaling`.
 
-    Names and `goes_over` are those of `MakeLiveMasterSide`.
+    Names and `cross_fade` are those of `MakeLiveMasterSide`.
     """
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    most = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+    limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
     builder, inner = DiagramBuilder(), DiagramBuilder()
     scaling = inner.AddNamedSystem(
         "kinematic_scaling",
@@ -201,19 +205,19 @@ def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Di
     for name in ("pose_master", "clutch"):
         inner.ExportInput(scaling.GetInputPort(name), name)
     export(inner, scaling, "pose_command")
-    led = builder.AddNamedSystem("led", inner.Build())
+    inner_side = builder.AddNamedSystem("inner_side", inner.Build())
     master = builder.AddNamedSystem(
-        "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, most)
+        "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
     )
-    builder.Connect(master.GetOutputPort("pose_master"), led.GetInputPort("pose_master"))
+    builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
     felt = master.GetInputPort("wrench_command")
-    if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
+    if cross_fade:
+        block = builder.AddNamedSystem("cross_fade", CrossFade(1 / scenario.rates.hand_hz))
         builder.Connect(block.get_output_port(), felt)
         felt = block.get_input_port()
     builder.ExportInput(felt, "wrench_command")
-    builder.ExportInput(led.GetInputPort("clutch"), "clutch")
-    export(builder, led, "pose_command")
+    builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
+    export(builder, inner_side, "pose_command")
     for index in range(master.num_output_ports()):
         export(builder, master, master.get_output_port(index).get_name())
     return builder.Build()

@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
-from drake_teleop.live.station_swap import GoesOver
+from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (
     HandImpedance,
@@ -34,18 +34,22 @@ Array = NDArray[np.float64]
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
 # half the distance in 46 ms. After a change of the grip the path is slower.
-_SPEED, _GENTLY, _TURNING = 2 * math.pi * 16.0, 2 * math.pi * 5.0, 2 * math.pi * 5.0
+_TRANSLATION_POLE, _SLOW_POLE, _ROTATION_POLE = (
+    2 * math.pi * 16.0,
+    2 * math.pi * 5.0,
+    2 * math.pi * 5.0,
+)
 #: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
 #: stop the error is at most the distance of 5 ms.
-BEHIND = 2.5 / _SPEED
+LEAD_TIME_S = 2.5 / _TRANSLATION_POLE
 # Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
 # target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
-_HELD, _START, _POLES, _TARGET, _AWAY, _TURNED, _PATH = 0, 1, 2, 3, 10, 19, 25
-_WANTED = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
+_HELD, _START_TIME, _POLES, _TARGET, _OFFSET, _ROTATION, _PATH = 0, 1, 2, 3, 10, 19, 25
+_INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
 @njit(cache=True)
-def _wanted_into(path, time, pose, out):
+def _intention_into(path, time, pose, out):
     """Write the intended X_BE (7,), twist [v; omega] (6,) and acceleration (3,) to `out`.
 
     (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, which are independent of the
@@ -55,23 +59,23 @@ def _wanted_into(path, time, pose, out):
         out[:7] = pose
         out[7:] = 0.0
         return
-    t = time - path[_START]
+    t = time - path[_START_TIME]
     w = path[_POLES]
-    decay, turning_decay = math.exp(-w * t), math.exp(-_TURNING * t)
+    decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE * t)
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
         # x = (a + b t + c t^2) e^(-w t), and its derivatives
-        a, v = path[_AWAY + k], path[_AWAY + 3 + k]
+        a, v = path[_OFFSET + k], path[_OFFSET + 3 + k]
         b = v + w * a
-        c = 0.5 * (path[_AWAY + 6 + k] + w * (b + v))
+        c = 0.5 * (path[_OFFSET + 6 + k] + w * (b + v))
         x = a + t * (b + t * c)
         slope = b + 2.0 * c * t
         out[4 + k] = path[_TARGET + 4 + k] + x * decay
         out[7 + k] = (slope - w * x) * decay
         out[13 + k] = (2.0 * c - w * (2.0 * slope - w * x)) * decay
-        turning = path[_TURNED + 3 + k] + _TURNING * path[_TURNED + k]
-        r[k] = (path[_TURNED + k] + turning * t) * turning_decay
-        rate[k] = (path[_TURNED + 3 + k] - _TURNING * turning * t) * turning_decay
+        turning = path[_ROTATION + 3 + k] + _ROTATION_POLE * path[_ROTATION + k]
+        r[k] = (path[_ROTATION + k] + turning * t) * turning_decay
+        rate[k] = (path[_ROTATION + 3 + k] - _ROTATION_POLE * turning * t) * turning_decay
     target = (path[_TARGET], path[_TARGET + 1], path[_TARGET + 2], path[_TARGET + 3])
     orientation = multiply(exponential((r[0], r[1], r[2])), target)
     for k in range(4):
@@ -91,7 +95,7 @@ def _wanted_into(path, time, pose, out):
 
 
 @njit(cache=True)
-def _rate_of(r, omega):
+def _rotation_vector_rate(r, omega):
     """Return the rate of a rotation vector r [rad] from omega [rad/s]."""
     square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     c = 1.0 / 12.0 + square / 720.0
@@ -103,28 +107,28 @@ def _rate_of(r, omega):
 
 
 @njit(cache=True)
-def _led_into(path, time, now, target, poles):
+def _path_into(path, time, now, target, poles):
     """Write the path to `target` (7,) that starts from the intention `now` (16,)."""
-    path[_HELD], path[_START], path[_POLES] = 1.0, time, poles
+    path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
     turned = logarithm(multiply(now, conjugate(target)))
-    rate = _rate_of(turned, three(now, 10))
+    rate = _rotation_vector_rate(turned, three(now, 10))
     for k in range(3):
-        path[_AWAY + k], path[_AWAY + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
-        path[_AWAY + 6 + k] = now[13 + k]
-        path[_TURNED + k], path[_TURNED + 3 + k] = turned[k], rate[k]
+        path[_OFFSET + k], path[_OFFSET + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
+        path[_OFFSET + 6 + k] = now[13 + k]
+        path[_ROTATION + k], path[_ROTATION + 3 + k] = turned[k], rate[k]
 
 
 @njit(cache=True, borrows=True)
-def _wrench_into(path, time, impedance, mass, pose, twist, wanted, wrench):
-    """Write the wrench (6,) of the hand on the stylus; `wanted` (16,) is scratch.
+def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
+    """Write the wrench (6,) of the hand on the stylus; `intention` (16,) is scratch.
 
     An additional spring displacement accelerates the hand's own mass [kg].
     """
-    _wanted_into(path, time, pose, wanted)
+    _intention_into(path, time, pose, intention)
     for k in range(3):
-        wanted[4 + k] += mass / impedance[0] * wanted[13 + k]
-    hand_wrench_into(impedance, wanted[:7], wanted[7:13], pose, twist, wrench)
+        intention[4 + k] += mass / impedance[0] * intention[13 + k]
+    hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
 
 
 class LiveHand(Operator):
@@ -145,25 +149,31 @@ class LiveHand(Operator):
 
     def __init__(self, config: OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
-        self._now, self._mass = np.empty(_WANTED), config.hand.mass
+        self._scratch, self._mass = np.empty(_INTENTION_SIZE), config.hand.mass
 
     def _declare_intention(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH)
-        path[_HELD], path[_POLES], path[_TARGET:_AWAY] = 1.0, _SPEED, self._intent[1]
+        path[_HELD], path[_POLES], path[_TARGET:_OFFSET] = 1.0, _TRANSLATION_POLE, self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
-    def Lead(self, context: Context, target: Array | None) -> None:
+    def SetTarget(self, context: Context, target: Array | None) -> None:
         """Start a path to `target` (7,) X_BE from the present pose and speed.
 
         None releases the stylus: only the hand's damping remains.
         """
         path = np.zeros(_PATH)
         if target is not None:
-            _led_into(path, context.get_time(), self._wants(context), target, _SPEED)
+            _path_into(
+                path,
+                context.get_time(),
+                self._present_intention(context),
+                target,
+                _TRANSLATION_POLE,
+            )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
         """Change the hand's impedance without a step of its wrench.
 
         The intention scales with stiffness, damping and mass, and returns slowly to the target.
@@ -172,25 +182,25 @@ class LiveHand(Operator):
         if path[_HELD] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        wanted = self._wants(context)
-        turn = np.array(logarithm(multiply(tuple(wanted[:4]), conjugate(tuple(pose[:4])))))
+        intention = self._present_intention(context)
+        turn = np.array(logarithm(multiply(tuple(intention[:4]), conjugate(tuple(pose[:4])))))
         turn *= before.rotational_stiffness / after.rotational_stiffness
-        way = before.stiffness / after.stiffness * (wanted[4:7] - pose[4:])
+        way = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         damping = np.repeat(
             [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
             3,
         )
-        wanted[:4] = multiply(exponential(tuple(turn)), tuple(pose[:4]))
-        wanted[4:7] = pose[4:] + way
-        wanted[7:13] = twist + damping * (wanted[7:13] - twist)
-        wanted[13:] *= before.mass / after.mass
-        _led_into(path, context.get_time(), wanted, path[_TARGET:_AWAY].copy(), _GENTLY)
+        intention[:4] = multiply(exponential(tuple(turn)), tuple(pose[:4]))
+        intention[4:7] = pose[4:] + way
+        intention[7:13] = twist + damping * (intention[7:13] - twist)
+        intention[13:] *= before.mass / after.mass
+        _path_into(path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _wants(self, context: Context) -> Array:
+    def _present_intention(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
-        _wanted_into(path, context.get_time(), self._pose.Eval(context), self._now)
-        return self._now
+        _intention_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
+        return self._scratch
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_into(
@@ -200,27 +210,27 @@ class LiveHand(Operator):
             self._mass,
             self._pose.Eval(context),
             self._twist.Eval(context),
-            self._now,
+            self._scratch,
             output.get_mutable_value(),
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._wants(context)[:7])
+        output.SetFromVector(self._present_intention(context)[:7])
 
 
-def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
+def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
     """Return `MakeMasterSide` with a `LiveHand`.
 
-    Only the grip of the scenario's operator is used. With `goes_over` the rendered wrench
+    Only the grip of the scenario's operator is used. With `cross_fade` the rendered wrench
     cross-fades from that of the previous station.
     """
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
-    side = builder.AddNamedSystem("led", MakeMasterSide(scenario, hand))
+    side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
     felt = side.GetInputPort("wrench_command")
-    if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
+    if cross_fade:
+        block = builder.AddNamedSystem("cross_fade", CrossFade(1 / scenario.rates.hand_hz))
         builder.Connect(block.get_output_port(), felt)
         felt = block.get_input_port()
     builder.ExportInput(felt, "wrench_command")

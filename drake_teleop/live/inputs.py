@@ -39,11 +39,11 @@ INPUTS = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
 LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
-_SHARE, _SCALE = 1e-2, 1e-5
-_LONGEST = 36_000_000  # ms; ten hours, as of a scenario
+_SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
+MAX_DURATION_MS = 36_000_000  # ms; ten hours, as of a scenario
 
 
-def first_choices(scenario: Scenario) -> dict[str, int]:
+def initial_choices(scenario: Scenario) -> dict[str, int]:
     """Return the choices that leave a scenario unchanged."""
     return {
         "network": 0,
@@ -99,10 +99,12 @@ class Inputs:
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
         """Return the inputs at the start of a scenario."""
-        sigma, sigma_object, gamma = (round(s / _SHARE) for s in scenario.force_scaling.scales())
-        scale = round(scenario.force_scaling.force_scale / _SCALE)
+        sigma, sigma_object, gamma = (
+            round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()
+        )
+        scale = round(scenario.force_scaling.force_scale / _SCALE_UNIT)
         started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
-        return started.changed(first_choices(scenario))
+        return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
         """Return inputs with new values, clipped to their ranges, without non-finite ones."""
@@ -137,7 +139,7 @@ class Inputs:
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
-    def held_at(self, pose: Array, start: Array) -> Inputs:
+    def holding(self, pose: Array, start: Array) -> Inputs:
         """Return inputs of a hand that holds the stylus at `pose` (7,) X_BE."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
@@ -148,14 +150,14 @@ class Inputs:
     def scales(self) -> dict[str, float]:
         """Arguments of `ForceScaling.SetScales`."""
         return {
-            "sigma_gripper": _SHARE * self.sigma,
-            "sigma_object": _SHARE * self.sigma_object,
-            "gamma": _SHARE * self.gamma,
-            "force_scale": _SCALE * self.force_scale,
+            "sigma_gripper": _SHARE_UNIT * self.sigma,
+            "sigma_object": _SHARE_UNIT * self.sigma_object,
+            "gamma": _SHARE_UNIT * self.gamma,
+            "force_scale": _SCALE_UNIT * self.force_scale,
         }
 
 
-_CHOICES = {
+_CHOICE_RANGES = {
     "network": (0, len(NETWORKS) - 1),
     "delay": (0, 20_000),
     "jitter": (0, 100),
@@ -166,7 +168,7 @@ _CHOICES = {
     "sensor": (0, len(SENSORS) - 1),
 }
 #: Inputs whose change requires another station.
-CHOICES = frozenset(_CHOICES)
+CHOICES = frozenset(_CHOICE_RANGES)
 #: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
 RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
@@ -174,7 +176,7 @@ RANGES = {
     **dict.fromkeys(("held", "clutch"), (0, 1)),
     **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
-    **_CHOICES,
+    **_CHOICE_RANGES,
 }
 _COLUMNS = ("ms", *RANGES)
 _VERSION = {"drake_teleop": __version__}
@@ -211,14 +213,14 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             where=str(path),
             remedy=f"its columns are {', '.join(_COLUMNS)}",
         )
-    before = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
+    recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
-        if before.get(name) != value:
-            found = before.get(name, "unknown")
+        if recorded_with.get(name) != value:
+            found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
             raise _cannot_repeat(changed if name == "files" else what, path)
-    changes = list(_checked(lines[2:], path))
+    changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
         raise DrakeTeleopError("ends when it begins", where=str(path))
     return changes
@@ -229,7 +231,7 @@ def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 
-def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
+def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
     earlier = -1
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
@@ -244,7 +246,7 @@ def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]
             ms, *values = map(int, line)
         except ValueError:
             raise DrakeTeleopError("has something other than whole numbers", where=where) from None
-        if not max(earlier, 0) <= ms <= _LONGEST or (earlier < 0 and ms):
+        if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
                 f"{ms} ms is no time here",
                 where=where,

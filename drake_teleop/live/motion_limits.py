@@ -9,24 +9,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from drake_teleop.live.hand import BEHIND
+from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import ANGLE, LENGTH, RANGES, Inputs
 
-_REPEATED = 1.0  # s
+_RATE_TIMEOUT_S = 1.0  # s
 # Lead time of the target, which compensates the lag of the hand at constant speed [s].
-_LEAD = dict.fromkeys(("x", "y", "z"), BEHIND) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
+_LEAD_TIMES = dict.fromkeys(("x", "y", "z"), LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
 # Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
 # limited only for a device; the path of a page's hand is smooth.
-_PLACE, _TURN = (0.8, 20.0), (8.0, 250.0)
+_TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
-class Steering:
+class RateInputs:
     """Integrator of rates per simulated second."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
         self._at: dict[str, float] = {}
-        self._until = 0.0
+        self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
         """Return the inputs when new rates begin; they end 1 s after their last repetition.
@@ -37,26 +37,26 @@ class Steering:
             now: the clock [s].
         """
         if not self._rates:
-            self._at = {name: float(getattr(inputs, name)) for name in _LEAD}
-        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD}
-        self._until = now + _REPEATED
+            self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
+        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
+        self._end_time = now + _RATE_TIMEOUT_S
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
         """Return the inputs of the next slice."""
         if not self._rates:
             return inputs
-        if now > self._until:
+        if now > self._end_time:
             return self.begin({}, inputs, now)
         values = dict(self._at)
         for name, rate in self._rates.items():
             low, high = RANGES[name]
             self._at[name] = min(max(self._at[name] + slice_s * rate, low), high)
-            values[name] = self._at[name] + _LEAD[name] * rate
+            values[name] = self._at[name] + _LEAD_TIMES[name] * rate
         return inputs.changed(values)
 
 
-class Follower:
+class MotionLimiter:
     """Speed limit of each coordinate of the target; slower motions pass unchanged.
 
     Args:
@@ -67,7 +67,10 @@ class Follower:
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _Axis] = {}
-        limits = (("x", "y", "z"), LENGTH, _PLACE), (("rx", "ry", "rz"), ANGLE, _TURN)
+        limits = (
+            (("x", "y", "z"), LENGTH, _TRANSLATION_LIMITS),
+            (("rx", "ry", "rz"), ANGLE, _ROTATION_LIMITS),
+        )
         for (names, unit, (speed, acceleration)), scale in zip(limits, scales, strict=True):
             units = slice_s / (unit * max(scale, 1e-3))
             change = slice_s * units * acceleration if device else math.inf

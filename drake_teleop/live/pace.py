@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 #: Lateness above which lost time is not caught up [s].
-_GIVE_UP = 0.1
-_REMEMBERED = 400  # slices
+_MAX_LATENESS_S = 0.1
+_STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
@@ -23,14 +23,14 @@ class Pace:
     def __init__(self, slice_s: float, now: float) -> None:
         self.slow, self.given_up = 1.0, 0.0
         self._slice = slice_s
-        self._late: deque[float] = deque(maxlen=_REMEMBERED)
-        self._begun: deque[float] = deque(maxlen=_REMEMBERED)
+        self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
+        self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self.start(now)
 
     def start(self, now: float) -> None:
         """Make the next slice due now."""
         self._due = now
-        self._begun.clear()
+        self._starts.clear()
 
     def wait(self, now: float) -> float:
         """Return the time until the next slice [s]; at most 0 if it is due."""
@@ -39,27 +39,29 @@ class Pace:
     def begin(self, now: float) -> None:
         """Record the start of the due slice."""
         late = now - self._due
-        if late > _GIVE_UP:
+        if late > _MAX_LATENESS_S:
             self.given_up += late
             self._due = now
-        self._late.append(late)
-        self._begun.append(now)
+        self._lateness.append(late)
+        self._starts.append(now)
         self._due += self._slice * self.slow
 
     @property
     def factor(self) -> float:
         """Simulated over elapsed time of the last 400 slices; 0 at first."""
-        if len(self._begun) < 2 or self._begun[-1] <= self._begun[0]:
+        if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
-        return (len(self._begun) - 1) * self._slice / (self._begun[-1] - self._begun[0])
+        return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
     def lateness(self) -> float:
         """Return the 99 % quantile of their lateness [s]."""
-        return sorted(self._late)[(99 * len(self._late) - 1) // 100] if self._late else 0.0
+        return (
+            sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0
+        )
 
 
 @contextmanager
-def without_collections() -> Iterator[None]:
+def without_garbage_collection() -> Iterator[None]:
     """Disable the garbage collector, which takes as long as ten slices."""
     gc.collect()
     gc.freeze()

@@ -114,7 +114,7 @@ class LogBeside(LogOnDisk):
     ) -> None:
         super().__init__(folder, simulator, start, form)
         self._thread = ThreadPoolExecutor(1, "log of a drive")
-        self._writing: Future[None] = self._thread.submit(_load)
+        self._writing: Future[None] = self._thread.submit(_import_polars)
 
     def finish(self) -> None:
         """Wait until all rows taken so far are on the disk.
@@ -129,6 +129,6 @@ class LogBeside(LogOnDisk):
         self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
 
 
-def _load() -> None:
+def _import_polars() -> None:
     """Import polars on the thread, which takes 0.1 s."""
     import polars  # noqa: F401

@@ -25,13 +25,13 @@ from drake_teleop.station.slave.plant import NominalSlave
 Array = NDArray[np.float64]
 
 #: Gripped object, if the scenario has no payload.
-OBJECT = Payload(mass=0.8)
+DEFAULT_OBJECT = Payload(mass=0.8)
 #: Duration of the cross-fade to the rendered wrench of a new station [s].
-BLEND = 0.25
+CROSS_FADE_S = 0.25
 # Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
 # ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
-_TURNING = 0.5
-_TENTH_OF_MS, _PERCENT, _PER_MILLE = 1e-4, 1e-2, 1e-3
+_MIN_ROTATIONAL_IMPEDANCE = 0.5
+_DELAY_UNIT_S, _JITTER_UNIT, _LOSS_UNIT = 1e-4, 1e-2, 1e-3
 
 #: Shipped scenario of each scene; "own" is the scenario of the drive.
 _SHIPPED = {
@@ -75,7 +75,7 @@ def scene(name: str, own: Scenario) -> Scenario:
     return live_scenario(scenario)
 
 
-def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
+def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
     """Return the scenario with all choices of the driver.
 
     Contact detection needs the scenario's own sensor and a load with a noise floor.
@@ -87,48 +87,48 @@ def chosen(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> S
     if METHODS[inputs.method] == "wave" != scenario.passivity.method:
         along, turning = scenario.passivity.wave.impedance
         wave = dataclasses.replace(
-            scenario.passivity.wave, impedance=[along, max(turning, _TURNING)]
+            scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_IMPEDANCE)]
         )
         changes["passivity__wave"] = wave
     name = NETWORKS[inputs.network]
     if name == "custom":
         changes["channel"] = Channel(
-            delay=_TENTH_OF_MS * inputs.delay,
-            jitter=_PERCENT * inputs.jitter,
+            delay=_DELAY_UNIT_S * inputs.delay,
+            jitter=_JITTER_UNIT * inputs.jitter,
             distribution="gamma",
-            loss=_PER_MILLE * inputs.loss,
+            loss=_LOSS_UNIT * inputs.loss,
         )
     elif name != OWN:
         changes["channel"] = Channel(network=name)
     if inputs.sensor:
         changes["wrist_sensor"] = SENSOR_PRESETS[SENSORS[inputs.sensor]]
-    if not (inputs.detection and _noise_is_known(load, inputs)):
+    if not (inputs.detection and _has_noise_floor(load, inputs)):
         changes["contact_detection"] = None
     elif scenario.contact_detection is None:
         changes["contact_detection"] = ContactDetectionConfig()
-    holds = scenario.slave.payload.mass > 0.0
-    if inputs.object != holds:
-        held = OBJECT if inputs.object else dataclasses.replace(OBJECT, mass=0.0)
-        changes["slave__payload"] = held
+    has_payload = scenario.slave.payload.mass > 0.0
+    if inputs.object != has_payload:
+        payload = DEFAULT_OBJECT if inputs.object else dataclasses.replace(DEFAULT_OBJECT, mass=0.0)
+        changes["slave__payload"] = payload
     changed = replace(scenario, **changes)
     if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
-        gripper = load.identification.phi - holds * _object_phi(changed)
+        gripper = load.identification.phi - has_payload * _object_phi(changed)
         changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
     return changed
 
 
-def _noise_is_known(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
+def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
     return load is not None and load.noise_floor is not None and inputs.sensor == 0
 
 
 def _object_phi(scenario: Scenario) -> Array:
     """Return phi (10,) of the object alone, about So in S."""
-    held = NominalSlave(scenario.slave).arm.phi_load
+    payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
-    return held - NominalSlave(empty.slave).arm.phi_load
+    return payload - NominalSlave(empty.slave).arm.phi_load
 
 
-def known_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
+def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
     """Return the load estimate (16,) [offsets, phi] for scenario `now`; None without a load.
 
     Mass parameters change with the arm model; offsets change as if the new sensor were tared.
@@ -136,18 +136,18 @@ def known_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario)
     if load is None:
         return None
     estimate = load.estimate.copy()
-    estimate[:6] += _offset(now) - _offset(before)
+    estimate[:6] += _sensor_offset(now) - _sensor_offset(before)
     arms = (NominalSlave(scenario.slave).arm for scenario in (now, before))
     estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
     return estimate
 
 
-def _offset(scenario: Scenario) -> Array:
+def _sensor_offset(scenario: Scenario) -> Array:
     sensor = scenario.wrist_sensor
     return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
 
 
-def filled_after(scenario: Scenario) -> float:
+def fill_time(scenario: Scenario) -> float:
     """Return the time until a new channel delivers all packets [s]."""
     if scenario.is_direct:
         return 0.0

@@ -39,9 +39,9 @@ from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.writing import make_folder
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
-from drake_teleop.live.device_link import DrivenBy
-from drake_teleop.live.live import LONGEST, Live
-from drake_teleop.live.pace import without_collections
+from drake_teleop.live.device_link import DeviceConnection
+from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
+from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import SCENES, live_scenario, scene, with_device
 from drake_teleop.live.session import Session
@@ -49,12 +49,12 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
 _HOST = "127.0.0.1"
-_MOST_CLIENTS = 8
+_MAX_PAGES = 8
 # Iterations of asyncio's loop from a readable socket to a handled message.
-_STEPS_OF_A_MESSAGE = 3
-_BEHIND = 2**18  # unsent bytes above which a slow page misses frames
+_LOOP_ITERATIONS = 3
+_MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
 # Timeouts of the clients and of the drive's thread [s].
-_CLOSES, _ENDS = 1.0, 4.0
+_CLOSE_TIMEOUT_S, _END_TIMEOUT_S = 1.0, 4.0
 _OR_DEVICE = ("", " or until the device sends")
 # All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
@@ -84,10 +84,10 @@ class LiveDrive:
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
-        self._device = None if device is None else DrivenBy(device)
+        self._device = None if device is None else DeviceConnection(device)
         self._failed: BaseException | None = None
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
-        self._numbers = itertools.count(1)  # of pages
+        self._page_numbers = itertools.count(1)  # of pages
         self._threads: list[threading.Thread] = []
         self._start(self._run, setup, record)
         try:
@@ -106,15 +106,17 @@ class LiveDrive:
             self._load = _load_of(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
 
-    def _make_scenes(self, scenario: Scenario, device: bool, told: Progress) -> None:
-        self._offered = {name: scene(name, scenario) for name in SCENES}
+    def _make_scenes(self, scenario: Scenario, device: bool, progress: Progress) -> None:
+        self._scene_scenarios = {name: scene(name, scenario) for name in SCENES}
         if device:
-            self._offered = {name: with_device(each) for name, each in self._offered.items()}
-        for name, each in self._offered.items():
+            self._scene_scenarios = {
+                name: with_device(each) for name, each in self._scene_scenarios.items()
+            }
+        for name, each in self._scene_scenarios.items():
             self._views[name] = PageScene(name, each)
-            told(len(self._views) / (1 + len(SCENES)))
+            progress(len(self._views) / (1 + len(SCENES)))
         warm_up(scenario, self._load, device)
-        told(1.0)
+        progress(1.0)
 
     def wait(self) -> None:
         """Wait for the end of the drive, by `stop` or Ctrl-C.
@@ -158,14 +160,14 @@ class LiveDrive:
         Compiled code on another thread cannot be ended, and Python may crash at its exit then.
         """
         self._stop.set()
-        end = time.monotonic() + _ENDS
+        end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:
             while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
                 with contextlib.suppress(KeyboardInterrupt):
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            print(f"error: drive: does not end within {_ENDS:g} s{lost}", file=sys.stderr)
+            print(f"error: drive: does not end within {_END_TIMEOUT_S:g} s{lost}", file=sys.stderr)
             sys.stdout.flush()
             os._exit(2)
 
@@ -194,16 +196,16 @@ class LiveDrive:
     async def _serve(self) -> None:
         try:
             server = await serve(
-                self._meet,
+                self._serve_page,
                 _HOST,
                 self._port,
                 process_request=self._request,
-                max_size=LONGEST,
+                max_size=MAX_MESSAGE_BYTES,
                 max_queue=8,
                 compression=None,
                 ping_interval=5,
                 ping_timeout=5,
-                close_timeout=_CLOSES,
+                close_timeout=_CLOSE_TIMEOUT_S,
                 logger=_LOGGER,
             )
         except OSError as error:
@@ -222,25 +224,25 @@ class LiveDrive:
             finally:
                 server.close()
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSES)
+                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
 
     async def _drive(self, server: Server) -> None:
         refusal = ""
-        with without_collections():
+        with without_garbage_collection():
             while not self._stop.is_set():
-                if self._live.asked:
+                if self._live.requested_scene:
                     await self._change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
                     ready = [
                         c
                         for c in server.connections
-                        if c.transport.get_write_buffer_size() < _BEHIND
+                        if c.transport.get_write_buffer_size() < _MAX_UNSENT_BYTES
                     ]
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
-                    _tell(f"a packet of the device was refused: it {refusal}")
+                    _print_note(f"a packet of the device was refused: it {refusal}")
                 await self._sleep()
 
     async def _sleep(self) -> None:
@@ -249,13 +251,16 @@ class LiveDrive:
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.wait(time.perf_counter()))
-        for _ in range(_STEPS_OF_A_MESSAGE):
+        for _ in range(_LOOP_ITERATIONS):
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
-        scenario, show = self._offered[live.asked], self._views[live.asked].show
+        scenario, show = (
+            self._scene_scenarios[live.requested_scene],
+            self._views[live.requested_scene].show,
+        )
 
         def identify() -> None:
             try:
@@ -269,9 +274,9 @@ class LiveDrive:
                 return
             await asyncio.sleep(0.05)
         try:
-            live.change(scenario, found.result(), show, time.perf_counter())
+            live.change_scene(scenario, found.result(), show, time.perf_counter())
         except DrakeTeleopError as error:
-            live.refuse(str(error), time.perf_counter())
+            live.reject_scene(str(error), time.perf_counter())
             return
         for page in tuple(self._pages):
             with contextlib.suppress(ConnectionClosed):
@@ -305,8 +310,10 @@ class LiveDrive:
             return None
         if path == "/":
             page = self._page()
-            own = policy(page, host)
-            return _response(HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), own)
+            content_policy = policy(page, host)
+            return _response(
+                HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
+            )
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
             return _response(HTTPStatus.OK, "application/json", view.objects)
         if path == "/meshcat.js":
@@ -314,24 +321,24 @@ class LiveDrive:
             return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
         return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
 
-    async def _meet(self, connection: ServerConnection) -> None:
+    async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
-        if len(connection.server.connections) > _MOST_CLIENTS:
+        if len(connection.server.connections) > _MAX_PAGES:
             await connection.close(1013, "too many pages")
             return
-        you = self._pages[connection] = next(self._numbers)
-        live.join(you, time.perf_counter())
+        number = self._pages[connection] = next(self._page_numbers)
+        live.join(number, time.perf_counter())
         try:
             await connection.send(self._hello(connection))
             async for text in connection:
-                live.hear(you, text, time.perf_counter())
+                live.handle_message(number, text, time.perf_counter())
         except ConnectionClosed:
             pass
         finally:
             del self._pages[connection]
-            live.leave(you, time.perf_counter())
+            live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _tell("no page is open: nothing runs" + _OR_DEVICE[self._device is not None])
+                _print_note("no page is open: nothing runs" + _OR_DEVICE[self._device is not None])
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
@@ -346,13 +353,13 @@ def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> No
     """Compile the functions of the first slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
-        cockpit.frame(session.news(), session.inputs)
+        cockpit.frame(session.new_rows(), session.inputs)
         session.apply(session.inputs.changed({"z": z}))
         session.advance()
-    session.stylus()
+    session.inputs_at_stylus()
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes, own: str = "") -> Response:
+def _response(status: HTTPStatus, kind: str, body: bytes, content_policy: str = "") -> Response:
     headers = Headers(
         {
             "Content-Type": kind,
@@ -361,7 +368,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes, own: str = "") -> Resp
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
             "Connection": "close",
-            "Content-Security-Policy": own or "default-src 'none'",
+            "Content-Security-Policy": content_policy or "default-src 'none'",
         }
     )
     return Response(status.value, status.phrase, headers, body)
@@ -409,7 +416,7 @@ def drive_command(
         DrakeTeleopError: as `drive`, or if the drive had stopped or its record is not complete.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
     reason = live.until_signal()
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
@@ -418,11 +425,11 @@ def drive_command(
         raise DrakeTeleopError(f"had stopped: {live.ended}", where="drive")
 
 
-def waits(device: str | None) -> str:
+def start_condition(device: str | None) -> str:
     """Return for which event a drive waits."""
     return "nothing runs until that page is open" + _OR_DEVICE[device is not None]
 
 
-def _tell(text: str) -> None:
+def _print_note(text: str) -> None:
     """Print on stderr, which no page shows."""
     print(text, file=sys.stderr, flush=True)

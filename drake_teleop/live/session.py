@@ -26,8 +26,8 @@ from drake_teleop.live.external_master import MakeExternalMasterSide
 from drake_teleop.live.hand import MakeLiveMasterSide
 from drake_teleop.live.inputs import INPUTS, SLICE_MS, Inputs, read_inputs
 from drake_teleop.live.record import DEVICE, LOAD, SCENARIO, LogBeside, Record, made_by
-from drake_teleop.live.scenarios import BLEND, chosen, filled_after, known_estimate
-from drake_teleop.live.station_swap import hand_on
+from drake_teleop.live.scenarios import CROSS_FADE_S, adapted_estimate, chosen_scenario, fill_time
+from drake_teleop.live.station_swap import copy_state
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import LOG, SIGNALS, signal_of
@@ -39,15 +39,15 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 _PART_ROWS = 2000
 # Duration of a change of scales [s]. A moving slider starts a ramp 60 times a second, and ramps
 # start slowly: longer ones would not progress until the slider rests.
-_RAMP = 0.05
+_SCALE_RAMP_S = 0.05
 # Shortest step of error control [s], for real time in contact. A third-order step is stable for
 # vibrations up to 1.7 / step = 1.1 kHz; the ball on a leaf vibrates at up to 700 Hz.
-_SHORTEST_STEP = 2.5e-4
+_MIN_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
-_MOST_RISE = 0.9
+_MAX_FORCE_RISE_N = 0.9
 
 # Duration of short steps after a rejected one [s].
-_STAYS_SHORT = 4e-3
+_SHORT_STEPS_S = 4e-3
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
@@ -74,7 +74,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
         integrator = station().get_mutable_integrator()
         number = integrator.get_num_step_shrinkages_from_error_control()
         if number != rejected:
-            rejected, until = number, context.get_time() + _STAYS_SHORT
+            rejected, until = number, context.get_time() + _SHORT_STEPS_S
             integrator.set_maximum_step_size(shortest)
             integrator.set_fixed_step_mode(True)
         elif context.get_time() >= until:
@@ -127,18 +127,18 @@ class _Station:
             scenario,
             load_estimate=estimate,
             noise_floor=None if load is None else load.noise_floor,
-            master=make_master(scenario, goes_over=number > 0),
+            master=make_master(scenario, cross_fade=number > 0),
         )
         seeded = dataclasses.replace(scenario.simulation, seed=scenario.simulation.seed + number)
         self.simulator = MakeSimulator(self.station, seeded)
         if scenario.simulation.integrator == "runge_kutta3":  # has error control
-            take_short_steps_in_contact(self.simulator, _SHORTEST_STEP)
+            take_short_steps_in_contact(self.simulator, _MIN_STEP_S)
         self.context = self.simulator.get_mutable_context()
         self.sink = self.station.GetSubsystemByName(LOG).FindMutableLog(self.context)
         self.columns = columns(self.station)
 
     def block(self, name: str) -> tuple[Any, Context]:
-        led = self.station.GetSubsystemByName("master_side").GetSubsystemByName("led")
+        led = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
         inside = led.HasSubsystemNamed(name)
         found = led.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
         return found, found.GetMyMutableContextFromRoot(self.context)
@@ -155,20 +155,20 @@ class _Station:
         anew = {"channel"} if channel_anew else set()
         if not self.scenario.load_estimator.enabled:
             anew.add("load_estimator")  # its configured load differs
-        hand_on(other.station, other.context, self.station, self.context, anew)
+        copy_state(other.station, other.context, self.station, self.context, anew)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block("wrist_sensor")
             sensor.bring_up_to_date(context)
-        wait = filled_after(self.scenario) if channel_anew else 0.0
-        over, context = self.block("goes_over")
+        wait = fill_time(self.scenario) if channel_anew else 0.0
+        over, context = self.block("cross_fade")
         felt = other.value("force_to_master")
-        over.Begin(context, self.context.get_time() + wait, BLEND, felt)
+        over.Begin(context, self.context.get_time() + wait, CROSS_FADE_S, felt)
         if channel_anew:
-            over.Limit(context, _MOST_RISE + float(np.linalg.norm(felt[:3])))
+            over.Limit(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(felt[:3])))
         grips = other.scenario.operator.hand, self.scenario.operator.hand
         if grips[0] != grips[1]:
             hand, context = self.block("live_hand")
-            hand.Hold(context, *grips)
+            hand.SetImpedance(context, *grips)
         if not channel_anew:
             return 0.0
         name = "pose_command" if other.scenario.is_direct else "pose_received"
@@ -180,7 +180,7 @@ class _Station:
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
             channel.Begin(context, command, pose, wait)
-        return wait + BLEND
+        return wait + CROSS_FADE_S
 
 
 class Session:
@@ -194,7 +194,7 @@ class Session:
     Args:
         scenario: to drive.
         load: identified load; None if it is estimated online.
-        log: folder of the log; None keeps it in memory until `news` returns it.
+        log: folder of the log; None keeps it in memory until `new_rows` returns it.
         record: folder of scenario, load and inputs; None for none.
         device: whether positions are those of a haptic device.
     """
@@ -211,17 +211,17 @@ class Session:
         self.scenario, self._load, self._device = scenario, load, device
         self.inputs, self.ms = Inputs.of(scenario), 0
         self._start = np.array(scenario.master.position)
-        self._stations, self._seen, self._fills_ms = 1, 0, 0
+        self._station_count, self._rows_read, self._filled_at_ms = 1, 0, 0
         estimate = None if load is None else load.estimate
-        self._now = _Station(scenario, estimate, load, 0, device=device)
+        self._station = _Station(scenario, estimate, load, 0, device=device)
         self._record: Record | None = None
         if record is not None:
             self._record = Record(record, scenario, load, self.inputs, device=device)
         self._on_disk: LogBeside | None = None
         if log is not None:
-            self._on_disk = LogBeside(log, self._now.simulator, 0.0, with_all_signals)
-        self._earlier: list[SimulationResult] = []
-        self._now.simulator.Initialize()
+            self._on_disk = LogBeside(log, self._station.simulator, 0.0, with_all_signals)
+        self._earlier_rows: list[SimulationResult] = []
+        self._station.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
         """Set the inputs from now on; record a change.
@@ -233,97 +233,97 @@ class Session:
         if inputs == before:
             return
         if inputs.station != before.station:
-            self._change(inputs)
+            self._swap_station(inputs)
         self.inputs = inputs
         if inputs.target != before.target:
-            hand, context = self._now.block("live_hand")
-            hand.Lead(context, inputs.pose(self._start))
+            hand, context = self._station.block("live_hand")
+            hand.SetTarget(context, inputs.pose(self._start))
         if inputs.clutch != before.clutch or inputs.station != before.station:
-            self._now.open(bool(inputs.clutch) and self.ms >= self._fills_ms)
+            self._station.open(bool(inputs.clutch) and self.ms >= self._filled_at_ms)
         if inputs.scales != before.scales:
-            scaling, context = self._now.block("force_scaling")
-            scaling.SetScales(context, **inputs.scales, duration=_RAMP)
+            scaling, context = self._station.block("force_scaling")
+            scaling.SetScales(context, **inputs.scales, duration=_SCALE_RAMP_S)
         if self._record is not None:
             self._record.write(self.ms, inputs)
 
-    def _change(self, inputs: Inputs) -> None:
-        scenario = chosen(self.scenario, self._load, inputs)
+    def _swap_station(self, inputs: Inputs) -> None:
+        scenario = chosen_scenario(self.scenario, self._load, inputs)
         scenario.check()
-        estimate = known_estimate(self.scenario, self._load, scenario)
-        station = _Station(scenario, estimate, self._load, self._stations, device=self._device)
-        filled = station.follow(self._now, inputs.channel != self.inputs.channel)
+        estimate = adapted_estimate(self.scenario, self._load, scenario)
+        station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
+        filled = station.follow(self._station, inputs.channel != self.inputs.channel)
         if filled:
-            self._fills_ms = self.ms + math.ceil(1e3 * filled)
+            self._filled_at_ms = self.ms + math.ceil(1e3 * filled)
         if self._on_disk is not None:
             self._on_disk.take()
             self._on_disk.follow(station.simulator)
         else:
-            self._earlier.append(self._rows())
+            self._earlier_rows.append(self._rows())
         station.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         station.sink.Clear()  # the previous station has recorded this row
-        self._now, self._seen, self._stations = station, 0, self._stations + 1
+        self._station, self._rows_read, self._station_count = station, 0, self._station_count + 1
 
     @property
     def filling(self) -> bool:
         """Whether the clutch is open because a new channel delivers no packets yet."""
-        return self.ms < self._fills_ms
+        return self.ms < self._filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
         """Simulate the next `ms` milliseconds."""
         end = self.ms + ms
-        if self.ms < self._fills_ms <= end:
-            self._advance_to(self._fills_ms)
-            self._now.open(bool(self.inputs.clutch))
+        if self.ms < self._filled_at_ms <= end:
+            self._advance_to(self._filled_at_ms)
+            self._station.open(bool(self.inputs.clutch))
         self._advance_to(end)
         if self._on_disk is not None and self._on_disk.waiting() >= _PART_ROWS:
             self._on_disk.take()
-            self._seen = 0
+            self._rows_read = 0
 
     def _advance_to(self, ms: int) -> None:
         self.ms = ms
         # The same product as Drake's event times, see `simulate`.
-        advance(self._now.simulator, 1e-3 * ms)
+        advance(self._station.simulator, 1e-3 * ms)
 
-    def news(self) -> dict[str, NDArray[np.float64]]:
+    def new_rows(self) -> dict[str, NDArray[np.float64]]:
         """Return the rows since the last call: (n, k) by signal, and "t" (n,) [s].
 
         Without a recorded log they are then discarded. Call it at least once a second.
         """
-        sink, seen = self._now.sink, self._seen
+        sink, seen = self._station.sink, self._rows_read
         data, times = sink.data()[:, seen:].T.copy(), sink.sample_times()[seen:]
-        found = {name: data[:, part] for name, part in self._now.columns.items()}
+        found = {name: data[:, part] for name, part in self._station.columns.items()}
         found["t"] = times.copy()
-        self._seen += len(times)
+        self._rows_read += len(times)
         if self._on_disk is None:
             sink.Clear()
-            self._seen = 0
-            self._earlier.clear()
+            self._rows_read = 0
+            self._earlier_rows.clear()
         return found
 
-    def pressed(self) -> float:
+    def contact_force(self) -> float:
         """Return the last contact force at the hand's scale [N]; 0 if unknown."""
-        part, sink = self._now.columns.get("contact_wrench_S"), self._now.sink
+        part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
         force = sink.data()[part.start : part.start + 3, -1]
         return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
 
-    def stylus(self) -> Inputs:
+    def inputs_at_stylus(self) -> Inputs:
         """Return inputs of a hand that takes the stylus at its pose."""
-        return self.inputs.held_at(self._now.value("pose_master"), self._start)
+        return self.inputs.holding(self._station.value("pose_master"), self._start)
 
     def force(self) -> NDArray[np.float64]:
         """Return the wrench (6,) for the device [N, N m]."""
-        return self._now.value("force_to_master")
+        return self._station.value("force_to_master")
 
-    def kept_back(self) -> float:
+    def removed_force(self) -> float:
         """Return the force that the limit of a new channel removes [N]."""
-        if self._stations == 1:
+        if self._station_count == 1:
             return 0.0
-        over, context = self._now.block("goes_over")
-        return float(over.kept_back(context))
+        over, context = self._station.block("cross_fade")
+        return float(over.removed_force(context))
 
-    def keep(self) -> None:
+    def flush(self) -> None:
         """Write all rows and inputs until now; the session may continue."""
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
@@ -332,11 +332,11 @@ class Session:
             self._on_disk.finish()
 
     def _rows(self) -> SimulationResult:
-        return with_all_signals(read_log(self._now.simulator, 0.0))
+        return with_all_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
         """Return the rows of the log that are in memory."""
-        parts = [*self._earlier, self._rows()]
+        parts = [*self._earlier_rows, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
         return SimulationResult(t, values, parts[0].specs)
@@ -349,7 +349,7 @@ class Session:
                 record.close(self.ms, self.inputs)
         finally:
             if record is None or self.ms:
-                self.keep()
+                self.flush()
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,29 +25,29 @@ from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 Array = NDArray[np.float64]
 
 #: Blocks whose parameters change during a drive.
-_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
+_BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
-def hand_on(
-    before: Diagram, then: Context, station: Diagram, context: Context, anew: set[str]
+def copy_state(
+    before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
     """Copy states and changeable parameters from station `before` to `station`.
 
     Args:
         before, then: source and its context.
         station, context: target and its context.
-        anew: names of blocks that are not copied.
+        excluded: names of blocks that are not copied.
     """
     context.SetTime(then.get_time())
     others = dict(_blocks(before))
     for path, block in _blocks(station):
         other = others.get(path)
-        if other is None or type(other) is not type(block) or anew & set(path.split("/")):
+        if other is None or type(other) is not type(block) or excluded & set(path.split("/")):
             continue
         _copy(
             other.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
-            path.rpartition("/")[2] in _WITH_PARAMETERS,
+            path.rpartition("/")[2] in _BLOCKS_WITH_PARAMETERS,
         )
 
 
@@ -78,14 +78,14 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 
 @njit(cache=True)
-def _share(change, time):
-    """Return the weight of the new wrench, 0 to 1; `change` as declared in `GoesOver`."""
+def _weight(change, time):
+    """Return the weight of the new wrench, 0 to 1; `change` as declared in `CrossFade`."""
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 @njit(cache=True)
-def _felt_into(wrench, before, share, most, out):
+def _cross_fade_into(wrench, before, share, most, out):
     """Write the cross-fade (6,) with a force of at most `most` [N]."""
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
@@ -100,12 +100,12 @@ def _force(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
-class GoesOver(LeafSystem):
+class CrossFade(LeafSystem):
     """Cross-fade of the rendered wrench from a previous station.
 
     .. pydrake_system::
 
-        name: GoesOver
+        name: CrossFade
         input_ports:
         - wrench: (6,) F_E_B of the new station [N, N m]
         output_ports:
@@ -122,8 +122,8 @@ class GoesOver(LeafSystem):
         # would evaluate a function of time several times in each step.
         self._state = int(self.DeclareDiscreteState([1.0, math.inf]))
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
-        asked = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
-        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), asked)
+        inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
+        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
@@ -136,7 +136,7 @@ class GoesOver(LeafSystem):
         """Limit the force to `most` [N] until the wrench was once below it."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
-    def kept_back(self, context: Context) -> float:
+    def removed_force(self, context: Context) -> float:
         """Return the force that the limit removes now [N]."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
@@ -145,7 +145,7 @@ class GoesOver(LeafSystem):
         share, most = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
-            state.get_mutable_value(self._state)[0] = _share(change, context.get_time())
+            state.get_mutable_value(self._state)[0] = _weight(change, context.get_time())
         elif most < math.inf and _force(self._wrench.Eval(context)) <= most:
             state.get_mutable_value(self._state)[1] = math.inf
 
@@ -156,4 +156,4 @@ class GoesOver(LeafSystem):
             output.SetFromVector(wrench)
             return
         before = context.get_numeric_parameter(self._change).value()[2:]
-        _felt_into(wrench, before, share, most, output.get_mutable_value())
+        _cross_fade_into(wrench, before, share, most, output.get_mutable_value())

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from drake_teleop.station.operator.operator import GRIPS
 
-_STEPS = 10  # per ms
+_STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
@@ -43,7 +43,7 @@ class VirtualDevice:
 
     def move(self, force: Sequence[float], seconds: float) -> None:
         """Simulate `seconds` under a constant force on the hand [N]."""
-        steps = max(math.ceil(seconds * 1e3 * _STEPS - 1e-9), 1)
+        steps = max(math.ceil(seconds * 1e3 * _STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):
             self._t += h

@@ -55,7 +55,7 @@ class Person:
         self.guided.join(1, self.now)
 
     def say(self, client: int = 1, **message) -> None:
-        self.guided.hear(client, json.dumps(message), self.now)
+        self.guided.handle_message(client, json.dumps(message), self.now)
 
     def wait(self, phase: str, seconds: float = 3.0) -> None:
         """Until the procedure has come there; time goes by as fast as it is simulated."""

@@ -19,7 +19,7 @@ from drake_teleop.live.experiment.design import (
     LoadExperiment,
     PegInSlot,
 )
-from drake_teleop.live.experiment.procedure import Felt, Procedure, trials_of
+from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, trials_of
 from drake_teleop.live.experiment.psychometrics import correct_probability
 from drake_teleop.live.experiment.store import Store, open_results
 
@@ -42,10 +42,10 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
     """A participant whose answers come from the level; or until a number of trials is done."""
     while procedure.phase != "end" and procedure.number < most:
         if procedure.phase == "interval":
-            felt = Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0)
-            procedure.finished(felt)
+            felt = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+            procedure.finish_interval(felt)
         elif procedure.phase == "gap":
-            procedure.second()
+            procedure.start_second_interval()
         elif procedure.phase == "answer":
             p = correct_probability(procedure.level, threshold, 1.5, 0.0)
             signal = procedure.trial.signal
@@ -74,7 +74,7 @@ def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
     first = Procedure(SMALL, 3, cut)
     go_through(first, rng, 2.0, most=17)
     first.go()
-    first.finished(Felt(first.shown))
+    first.finish_interval(IntervalResult(first.shown))
     again = Procedure(SMALL, 3, cut)
     assert (again.phase, again.number) == ("consent", 17)
     go_through(again, rng, 2.0)
@@ -93,9 +93,11 @@ def goes_through(folder: str) -> None:
                 procedure.answer(signal if right else 3 - signal, 0.5)
                 print(procedure.number, flush=True)
             elif procedure.phase == "interval":
-                procedure.finished(Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0))
+                procedure.finish_interval(
+                    IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+                )
             elif procedure.phase == "gap":
-                procedure.second()
+                procedure.start_second_interval()
             else:
                 procedure.go()
 
@@ -124,7 +126,7 @@ def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path
     procedure.go(), procedure.go(), procedure.go()
     assert procedure.phase == "interval"
     procedure.answer(1, 0.1)  # nobody was asked
-    procedure.finished(Felt(valid=False))
+    procedure.finish_interval(IntervalResult(valid=False))
     assert (procedure.phase, procedure.again, procedure.number) == ("ready", True, before)
     go_through(procedure, np.random.default_rng(0), 2.0)
     counted = [row for row in Store(tmp_path).rows(1) if not row.practice]
@@ -142,9 +144,9 @@ def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
         while procedure.phase != "end" and procedure.number < 12:
             seen.append(procedure.view())
             if procedure.phase == "interval":
-                procedure.finished(Felt(procedure.shown))
+                procedure.finish_interval(IntervalResult(procedure.present_level))
             elif procedure.phase == "gap":
-                procedure.second()
+                procedure.start_second_interval()
             elif procedure.phase == "answer":
                 procedure.answer(procedure.trial.signal, 0.5)
             else:

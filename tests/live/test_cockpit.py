@@ -20,7 +20,7 @@ def rows(scenario, load):
     """Of a station at rest, with nothing to say about it."""
     session = Session(scenario, load)
     session.advance()
-    rows = session.news()
+    rows = session.new_rows()
     assert Cockpit(scenario).frame(rows, Inputs())["words"] == []
     return rows
 

@@ -16,12 +16,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.live.device_client import Client
 from drake_teleop.live.device_guard import DeviceGuard, Limits
-from drake_teleop.live.device_link import DeviceLink, DrivenBy
+from drake_teleop.live.device_link import DeviceConnection, DeviceLink
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
+    DevicePose,
     DeviceState,
     ForceCommand,
-    Place,
     packed_force,
     packed_state,
     unpacked_force,
@@ -58,9 +58,9 @@ class Sender:
 
 @pytest.fixture
 def link():
-    made = DeviceLink("udp://127.0.0.1:0")
-    yield made
-    made.close()
+    opened = DeviceLink("udp://127.0.0.1:0")
+    yield opened
+    opened.close()
 
 
 def test_packets_are_as_the_header_says():
@@ -99,7 +99,7 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
     for k, packet in enumerate(odd):
         sender.raw(packet)
         if k % 40 == 0:
-            led = link.lead(1e-4 * k)
+            led = link.hand_inputs(1e-4 * k)
             assert all(np.isfinite(value) for value in led.values())
             assert np.isfinite(Inputs().changed(led).pose(np.zeros(3))[0] if led["held"] else 0.0)
     assert link.refused > 40
@@ -157,37 +157,37 @@ def test_a_packet_that_is_refused_is_counted_with_the_reason(link, packet, reaso
     for _ in range(3):
         sender.raw(packet)
     link.poll(0.0)
-    assert link.text().startswith("No device yet (udp://127.0.0.1:")
-    assert f". Refused packets: 3; the last one {reason}" in link.text()
+    assert link.status_text().startswith("No device yet (udp://127.0.0.1:")
+    assert f". Refused packets: 3; the last one {reason}" in link.status_text()
 
 
 def test_one_device_leads_until_it_is_silent_and_late_packets_do_not(link):
     one, other = Sender(link.port), Sender(link.port)
     one.send(1, (0.1, 0.0, 0.0))
-    assert link.lead(0.0) == {"held": 1, "clutch": 0} | dict.fromkeys(
+    assert link.hand_inputs(0.0) == {"held": 1, "clutch": 0} | dict.fromkeys(
         ("x", "y", "z", "rx", "ry", "rz"), 0.0
     )
     one.send(4, (0.11, 0.0, 0.0))
     one.send(3, (0.2, 0.0, 0.0))
     one.send(4, (0.2, 0.0, 0.0))
     other.send(9, (0.3, 0.0, 0.0))
-    led = link.lead(0.049)
+    led = link.hand_inputs(0.049)
     assert led["x"] == pytest.approx(1000.0)
     assert (link.lost, link.refused) == (1, 1)
-    assert ". Refused packets: 1; the last one is from a second device" in link.text()
+    assert ". Refused packets: 1; the last one is from a second device" in link.status_text()
     link.send(np.arange(6.0))
     assert one.force() == ForceCommand(4, 0.004, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
-    assert link.lead(0.0991) == {"held": 0, "clutch": 0}
-    assert "silent" in link.text()
+    assert link.hand_inputs(0.0991) == {"held": 0, "clutch": 0}
+    assert "silent" in link.status_text()
     other.send(1, (0.1, 0.02, 0.0))
-    assert link.lead(0.2)["clutch"] == 0
+    assert link.hand_inputs(0.2)["clutch"] == 0
     other.send(2, (0.1, 0.02, 0.0))
-    led = link.lead(0.2401)
+    led = link.hand_inputs(0.2401)
     assert led["y"] == pytest.approx(2000.0)
     other.send(3, (0.1, 0.02, 0.0))
-    assert "clutch" not in link.lead(0.2801)
+    assert "clutch" not in link.hand_inputs(0.2801)
     other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
-    assert link.lead(0.29)["clutch"] == 0
+    assert link.hand_inputs(0.29)["clutch"] == 0
 
 
 def test_whatever_is_commanded_a_hand_gets_no_more_than_the_limits_and_nothing_in_silence():
@@ -250,7 +250,7 @@ class Still:
         self.was_set = []
 
     def read(self):
-        return Place((0.0, 0.0, 0.0))
+        return DevicePose((0.0, 0.0, 0.0))
 
     def set(self, wrench):
         self.was_set.append(wrench)
@@ -266,7 +266,7 @@ def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(l
         now = MS * k
         client.tick(lambda now=now: now)
         if k < 100:
-            link.lead(now)
+            link.hand_inputs(now)
             link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
         if k == 120:  # of a client that was here before
             late = packed_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
@@ -301,8 +301,8 @@ def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
         server.shutdown()
     assert places == [
         None,
-        Place((-0.2, 0.1, 0.3)),
-        Place((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
+        DevicePose((-0.2, 0.1, 0.3)),
+        DevicePose((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
     ]
     values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
     assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]
@@ -312,7 +312,7 @@ def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
 def test_a_device_elsewhere_or_of_another_kind_is_one_error(address):
     with pytest.raises(DrakeTeleopError, match=re.escape(address)):
-        DrivenBy(address)
+        DeviceConnection(address)
 
 
 def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, load, link):

@@ -30,11 +30,11 @@ class Led:
     def wants(self, time: float) -> list[np.ndarray]:
         """Quaternion (4,), place (3,) [m], twist [v; omega] (6,) and acceleration (3,) then."""
         self.context.SetTime(time)
-        return np.split(self.hand._wants(self.context).copy(), [4, 7, 13])
+        return np.split(self.hand._present_intention(self.context).copy(), [4, 7, 13])
 
     def lead(self, time: float, orientation: tuple[float, ...], place: tuple[float, ...]) -> None:
         self.context.SetTime(time)
-        self.hand.Lead(self.context, np.array([*orientation, *place]))
+        self.hand.SetTarget(self.context, np.array([*orientation, *place]))
 
 
 def turned(to: np.ndarray, since: np.ndarray) -> np.ndarray:

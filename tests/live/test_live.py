@@ -13,7 +13,7 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.common.writing import CannotWrite
-from drake_teleop.live.live import FRAME, LONGEST, Live, parse
+from drake_teleop.live.live import FRAME, MAX_MESSAGE_BYTES, Live, parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
@@ -58,7 +58,7 @@ def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
     live.join(1, clock())
     frames = []
     for z in range(-1000, -5001, -1000):
-        live.hear(1, json.dumps({"set": {"z": z}}), clock())
+        live.handle_message(1, json.dumps({"set": {"z": z}}), clock())
         frames += pass_time(live, clock, 0.05)
     assert frames[-1]["contact"] and frames[-1]["f"][1][1] > 0.2
     assert not frames[1]["contact"] and frames[-1]["state"] == "running"
@@ -94,19 +94,19 @@ def test_one_drives_and_others_watch_until_they_ask(scenario, load, clock):
     live = make(scenario, load, clock)
     live.join(1, clock())
     live.join(2, clock())
-    live.hear(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
+    live.handle_message(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
     (frame, *_) = pass_time(live, clock, FRAME)
     assert (frame["driver"], frame["inputs"]["x"], frame["drive"]) == (1, 0, 1)
-    live.hear(2, '{"drive": true, "set": {"x": 100}}', clock())
-    live.hear(1, '{"set": {"x": 500}}', clock())
+    live.handle_message(2, '{"drive": true, "set": {"x": 100}}', clock())
+    live.handle_message(1, '{"set": {"x": 500}}', clock())
     frame = pass_time(live, clock, FRAME)[-1]
     assert (frame["driver"], frame["inputs"]["x"]) == (2, 100)
-    live.hear(2, '{"pause": true}', clock())
+    live.handle_message(2, '{"pause": true}', clock())
     frames = pass_time(live, clock, 0.1)
     assert frames[-1]["state"] == "paused" and frames[-1]["t"] == frames[0]["t"]
-    live.hear(2, '{"pause": false, "slow": 10}', clock())
+    live.handle_message(2, '{"pause": false, "slow": 10}', clock())
     assert pass_time(live, clock, 0.2)[-1]["t"] - frames[-1]["t"] == pytest.approx(0.02, abs=6e-3)
-    live.hear(2, '{"reset": true}', clock())
+    live.handle_message(2, '{"reset": true}', clock())
     frame = pass_time(live, clock, FRAME)[-1]
     assert (frame["drive"], frame["inputs"]["x"]) == (2, 0) and frame["t"] < 0.02
 
@@ -120,8 +120,8 @@ def test_a_station_that_there_is_not_is_refused_and_the_drive_goes_on(
     def no_such(*_):
         raise DrakeTeleopError("there is no such station")
 
-    monkeypatch.setattr("drake_teleop.live.session.chosen", no_such)
-    live.hear(1, '{"set": {"network": 3, "x": 100}}', clock())
+    monkeypatch.setattr("drake_teleop.live.session.chosen_scenario", no_such)
+    live.handle_message(1, '{"set": {"network": 3, "x": 100}}', clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["inputs"]["network"], frame["inputs"]["x"]) == ("running", 0, 100)
     assert frame["words"] == ["there is no such station"]
@@ -131,7 +131,7 @@ def test_what_is_kept_from_the_hand_is_said(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
     assert pass_time(live, clock, FRAME)[-1]["words"] == []
-    monkeypatch.setattr(Session, "kept_back", lambda session: 1.234)
+    monkeypatch.setattr(Session, "removed_force", lambda session: 1.234)
     said = "1.2 N are not rendered until the hand presses less"
     assert pass_time(live, clock, FRAME)[-1]["words"] == [said]
 
@@ -143,10 +143,10 @@ def test_another_scene_is_another_drive_and_its_record_another_folder(
     (tmp_path / "drive-2").mkdir()
     live.join(1, clock())
     pass_time(live, clock, 0.03)
-    live.hear(1, '{"scene": "wall"}', clock())
+    live.handle_message(1, '{"scene": "wall"}', clock())
     frame = pass_time(live, clock, 0.05)[-1]  # time stands still until its load is known
-    assert (frame["state"], frame["scene"], live.asked) == ("preparing", "wall", "wall")
-    live.change(scenario, load, lambda rows: {}, clock())
+    assert (frame["state"], frame["scene"], live.requested_scene) == ("preparing", "wall", "wall")
+    live.change_scene(scenario, load, lambda rows: {}, clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["scene"], frame["drive"]) == ("running", "wall", 2)
     assert frame["record"] == str(tmp_path / "drive-3")
@@ -165,7 +165,7 @@ def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, 
         live = make(scenario, load, clock, Path(name))
         live.join(1, clock())
         assert pass_time(live, clock, 0.02)[-1]["record"] == first
-        live.hear(1, '{"reset": true}', clock())
+        live.handle_message(1, '{"reset": true}', clock())
         pass_time(live, clock, 0.02)
         live.close()
         assert live.recorded[0] == first and len(set(live.recorded)) == 2
@@ -195,14 +195,14 @@ def test_a_full_disk_is_an_error_of_the_drive(scenario, load, clock, tmp_path, r
         live = make(scenario, load, clock, tmp_path / "drive")
         live.join(1, clock())
         for k in range(6000):
-            live.hear(1, json.dumps({"set": {"x": k % 2000}}), clock())
+            live.handle_message(1, json.dumps({"set": {"x": k % 2000}}), clock())
             frames = pass_time(live, clock, 0.005)
             if frames and frames[-1]["state"] == "stopped":
                 break
         else:
             pytest.fail("the disk was never full")
         assert "cannot be written" in frames[-1]["stopped"]
-        live.hear(1, '{"reset": true}', clock())
+        live.handle_message(1, '{"reset": true}', clock())
         live.frame()
         with pytest.raises(CannotWrite, match=r"cannot be written .*(No space left|large)"):
             live.close()
@@ -214,7 +214,7 @@ def test_what_is_done_is_shown_at_once(scenario, load, clock):
     live = make(scenario, load, clock)
     live.join(1, clock())
     pass_time(live, clock, 0.1)
-    live.hear(1, '{"set": {"x": 100}}', clock())
+    live.handle_message(1, '{"set": {"x": 100}}', clock())
     start = clock.now
     frame = None
     while frame is None or frame["inputs"]["x"] != 100:
@@ -224,7 +224,7 @@ def test_what_is_done_is_shown_at_once(scenario, load, clock):
     assert len(pass_time(live, clock, 0.2)) <= 13
     frames = []
     for x in range(101, 121):  # who goes on is shown each slice
-        live.hear(1, json.dumps({"set": {"x": x}}), clock())
+        live.handle_message(1, json.dumps({"set": {"x": x}}), clock())
         frames += pass_time(live, clock, 0.005)
     assert len(frames) >= 15
 
@@ -240,7 +240,7 @@ def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clo
         patch.setattr(Session, "advance", fail)
         frame = pass_time(live, clock, 0.05)[-1]
         assert (frame["state"], frame["stopped"]) == ("stopped", "joint 2 leaves its range")
-    live.hear(1, '{"reset": true}', clock())
+    live.handle_message(1, '{"reset": true}', clock())
     assert pass_time(live, clock, 0.02)[-1]["state"] == "running"
 
 
@@ -258,11 +258,11 @@ def test_a_reset_that_fails_is_said_and_another_one_begins_again(
     for owner, name, state in ((Session, "close", "running"), (Session, "__init__", "stopped")):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, fail)
-            live.hear(1, '{"reset": true}', clock())
+            live.handle_message(1, '{"reset": true}', clock())
         frame = pass_time(live, clock, 0.03)[-1]
         assert frame["state"] == state
         assert "no space left on device" in [frame["stopped"], *frame["words"]]
-    live.hear(1, '{"reset": true}', clock())
+    live.handle_message(1, '{"reset": true}', clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["words"]) == ("running", []) and frame["t"] > 0.0
     with pytest.raises(CannotWrite, match="no space left"):  # the record of the first is lost
@@ -302,7 +302,7 @@ def nonsense(rng: np.random.Generator) -> object:
         place = rng.integers(len(good))
         return good[:place] + chr(rng.integers(1, 0x2000)) + good[place + 1 :]
     if kind == 3:
-        return "[" * int(rng.integers(1, LONGEST + 9))
+        return "[" * int(rng.integers(1, MAX_MESSAGE_BYTES + 9))
     wild = ["NaN", "Infinity", "-1e308", "1e999", "9" * 400, "null", "true", '"7"', "[1]", "{}"]
     names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
     names += ["network", "method", "sensor", "object"]
@@ -315,15 +315,17 @@ def nonsense(rng: np.random.Generator) -> object:
 def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, load, clock):
     live, rng = make(scenario, load, clock), np.random.default_rng(0)
     live.join(1, clock())
-    live._begin = lambda now: None  # a reset builds a station, and is asked for a thousand times
+    live._start_drive = lambda now: (
+        None
+    )  # a reset builds a station, and is asked for a thousand times
     for k in range(10_000):
-        live.hear(1, nonsense(rng), clock())
+        live.handle_message(1, nonsense(rng), clock())
         if k % 1000 == 0:
-            live.hear(1, '{"pause": false, "slow": 1}', clock())
-            live.asked = ""  # so is another scene
-            live._session.apply(live._wanted)
+            live.handle_message(1, '{"pause": false, "slow": 1}', clock())
+            live.requested_scene = ""  # so is another scene
+            live._session.apply(live._requested)
             live._session.advance()
-    live.asked = ""
+    live.requested_scene = ""
     frame = live.frame()
     assert live.refused > 3000
     assert frame["state"] == "running" and math.isfinite(sum(frame["inputs"].values()))
@@ -344,7 +346,7 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
         ("[]", None),
         ("{}", None),
         (b'{"reset": true}', None),
-        ('{"reset": true}' + " " * LONGEST, None),
+        ('{"reset": true}' + " " * MAX_MESSAGE_BYTES, None),
     ],
 )
 def test_nothing_is_taken_from_a_message_that_is_not_expected(text, found):

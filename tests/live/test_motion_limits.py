@@ -12,7 +12,7 @@ from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.live.motion_limits import Follower, Steering
+from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.scenarios import with_device
 from drake_teleop.station.scenario import Scenario, replace
 
@@ -33,7 +33,7 @@ def at(values: np.ndarray) -> Inputs:
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
     """Up to 13 m/s^2 and 50 rad/s^2; steps of 10 um in 2 ms are 2.5 m/s^2."""
-    follower = Follower(slice_s, (1.0, 1.0), device=device)
+    follower = MotionLimiter(slice_s, (1.0, 1.0), device=device)
     for k in range(400):
         t = k * slice_s
         begun = min(t / 0.2, 1.0)
@@ -45,7 +45,7 @@ def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
 @pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, device, scale):
-    follower = Follower(slice_s, (scale, scale), device=device)
+    follower = MotionLimiter(slice_s, (scale, scale), device=device)
     rng, wanted, path = np.random.default_rng(0), Inputs(), []
     for k in range(4000):
         if k % 40 == 0 and k < 3000:
@@ -63,7 +63,7 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
 
 
 def test_it_stops_without_overshoot():
-    follower, path = Follower(2e-3, (1.0, 1.0), device=True), []
+    follower, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
         path.append(follower.step(at(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
     assert max(each.x for each in path) <= 5000 * 1.01 and path[-1].x == 5000
@@ -72,7 +72,7 @@ def test_it_stops_without_overshoot():
 
 
 def test_what_does_not_move_the_arm_may_jump():
-    follower, far = Follower(2e-3, (1.0, 1.0), device=True), at(np.full(6, 0.1))
+    follower, far = MotionLimiter(2e-3, (1.0, 1.0), device=True), at(np.full(6, 0.1))
     assert follower.step(far, free=True) == far
     assert follower.step(far, free=False) == far
 
@@ -84,12 +84,12 @@ def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load
     """Whatever the clock does meanwhile, as long as the page repeats them."""
     now, live = 0.0, Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, now)
-    live.hear(1, json.dumps({"slow": slow, "rates": rates}), now)
+    live.handle_message(1, json.dumps({"slow": slow, "rates": rates}), now)
     while live.ms < 300:
         now += max(live.wait(now), 1e-3)
         live.tick(lambda now=now: now)
-        live.hear(1, json.dumps({"rates": rates}), now)
-    live.hear(1, json.dumps({"rates": {}}), now)
+        live.handle_message(1, json.dumps({"rates": rates}), now)
+    live.handle_message(1, json.dumps({"rates": {}}), now)
     found = live.frame()["inputs"]
     for name in NAMES:
         assert found[name] == pytest.approx(1e-3 * live.ms * rates.get(name, 0), abs=0.51)
@@ -98,7 +98,7 @@ def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load
 
 
 def test_what_a_page_does_not_repeat_ends_after_a_second():
-    steering, inputs = Steering(), Inputs()
+    steering, inputs = RateInputs(), Inputs()
     inputs = steering.begin({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
     for k in range(400):
         inputs = steering.step(inputs, 5e-3, 5e-3 * k)
@@ -112,9 +112,9 @@ def test_a_target_that_is_set_ends_a_rate(scenario, load):
     live = Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, 0.0)
     for text in ({"rates": {"x": 5000}}, {"set": {"x": 300}}):
-        live.hear(1, json.dumps(text), 0.0)
+        live.handle_message(1, json.dumps(text), 0.0)
         for _ in range(4):
-            live._slice(0.0)
+            live._simulate_slice(0.0)
     assert live.frame()["inputs"]["x"] == 300
 
 
@@ -132,11 +132,11 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
     now, felt = 0.0, []
     live = Live(noisy, load, None, lambda rows: {}, now)
     live.join(1, now)
-    live.hear(1, json.dumps({"slow": slow}), now)
+    live.handle_message(1, json.dumps({"slow": slow}), now)
     while live.ms < 500:
         sine = math.sin(2.0 * math.pi * now)
         far = 6000.0 * (math.copysign(1.0, sine) if jumps else sine)
-        live.hear(1, json.dumps({"set": {"x": far, "z": 0.5 * far}}), now)
+        live.handle_message(1, json.dumps({"set": {"x": far, "z": 0.5 * far}}), now)
         frame = live.tick(lambda now=now: now)
         felt += [frame["f"][2][1]] if frame and "f" in frame else []
         now += max(live.wait(now), 1e-3)
@@ -156,10 +156,10 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
         now, number = now + 1e-3, number + 1
         up = 0.045 * max(-1.0, min(3.0 * math.sin(2.0 * math.pi * now), 1.0))
         packet = packed_state(DeviceState(number, now, (up, 0.0, up)))
-        link._take(packet, ("127.0.0.1", 9), now)
+        link._handle_packet(packet, ("127.0.0.1", 9), now)
         if now >= due:
             for _ in range(burst):
-                live._slice(now)
+                live._simulate_slice(now)
             due += burst * 2e-3 / rate
             felt.append(live.frame()["f"][2][1])
     live.close()

@@ -27,7 +27,7 @@ def rows(scenario, load) -> dict[str, np.ndarray]:
     session = Session(scenario, load)
     session.apply(session.inputs.changed({"z": -3000, "rx": 1000}))
     session.advance(200)
-    return session.news()
+    return session.new_rows()
 
 
 def test_everything_that_moves_is_an_object_and_is_where_the_station_has_it(scenario, view, rows):

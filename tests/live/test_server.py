@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import server
-from drake_teleop.live.live import LONGEST
+from drake_teleop.live.live import MAX_MESSAGE_BYTES
 from drake_teleop.station.scenario import Scenario, replace
 
 LEARNING = replace(Scenario(), load_estimator__enabled=True)  # identifies nothing beforehand
@@ -82,7 +82,7 @@ def test_the_socket_takes_orders_from_our_own_page_alone(live):
         with open_socket(live) as other:
             other.send('{"drive": true}')
             assert until(page, lambda frame: frame["driver"] != hello["you"])
-        page.send("x" * (LONGEST + 1))
+        page.send("x" * (MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed):
             until(page, lambda frame: False)
 
@@ -158,7 +158,7 @@ def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch,
                 if request.endswith(b"\r\n\r\n"):
                     assert b" 200 " not in client.recv(65536).partition(b"\r\n")[0]
     with contextlib.ExitStack() as stack:
-        for text in ("[]", b"\xc1", "x" * 4096, "", b"", "x" * (LONGEST + 1)):
+        for text in ("[]", b"\xc1", "x" * 4096, "", b"", "x" * (MAX_MESSAGE_BYTES + 1)):
             with open_socket(drive) as page:
                 page.send(text)
         silent = [socket.create_connection(address) for _ in range(5)]

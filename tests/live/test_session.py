@@ -14,10 +14,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.common.resources import models_dir
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.live.hand import BEHIND
+from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
 from drake_teleop.live.session import Drive, Session, read_drive
-from drake_teleop.live.station_swap import GoesOver
+from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -58,8 +58,8 @@ def driven(scenario, load, tmp_path_factory):
         session.apply(changes.get(session.ms, session.inputs))
         session.advance()
         if session.ms % 50 == 0:
-            session.news()
-            session.keep()
+            session.new_rows()
+            session.flush()
     session.close()
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 
@@ -112,7 +112,7 @@ def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
         np.testing.assert_allclose(felt[k : k + 6], felt[k], atol=1e-3)
         assert np.abs(np.diff(felt[k:])).max() < 0.02
     # Error control may not cut a slice into more than it has time for.
-    assert session._now.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
+    assert session._station.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
     # The clutch is closed again at last, and the channel passes on what it gets.
     assert np.ptp(command[260:1000], axis=0).max() < 1e-15
     assert not session.filling and session.apply(now.changed({"z": -1000})) is None
@@ -121,7 +121,7 @@ def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
 
 
 def test_what_is_felt_goes_over_though_the_wrench_stays():
-    simulator = Simulator(GoesOver(1e-3))
+    simulator = Simulator(CrossFade(1e-3))
     over, context = simulator.get_system(), simulator.get_mutable_context()
     wrench = np.array([3.0, 0.0, 4.0, 0.1, 0.2, 0.3])
     over.get_input_port().FixValue(context, wrench)
@@ -149,7 +149,7 @@ def test_what_a_method_had_hidden_comes_back_to_a_hand_that_has_eased_off(scenar
         session.apply(session.inputs.changed(changes))
         session.advance(ms)
         felt.append(float(np.linalg.norm(session.force()[:3])))
-        return session.kept_back()
+        return session.removed_force()
 
     assert go(500, z=-4000) == 0.0
     assert go(1000, network=2, method=METHODS.index("force_limit")) == 0.0
@@ -170,7 +170,7 @@ def test_a_hand_that_is_led_moves_the_tool_at_once_and_stops_where_it_is_led(sce
     session.apply(session.inputs.changed({"z": 1000}))
     session.advance(50)
     for ms in range(200):
-        session.apply(session.inputs.changed({"x": round(1e5 * speed * (1e-3 * ms + BEHIND))}))
+        session.apply(session.inputs.changed({"x": round(1e5 * speed * (1e-3 * ms + LEAD_TIME_S))}))
         session.advance(1)
     session.apply(session.inputs.changed({"x": round(1e5 * speed * 0.2)}))
     session.advance(200)

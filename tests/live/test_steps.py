@@ -69,14 +69,14 @@ def test_a_simulator_that_nobody_holds_is_let_go():
 
 def test_a_slice_in_contact_takes_two_steps_a_tick_and_few_in_vain(scenario, load):
     session = Session(scenario, load)
-    integrator = session._now.simulator.get_integrator()
+    integrator = session._station.simulator.get_integrator()
     pressed, counts = [], []
     while session.ms < 1500:
         down = 0.5 - 0.5 * np.cos(2e-3 * np.pi * session.ms)
         session.apply(session.inputs.changed({"z": round(-4000 * down)}))
         session.advance()
-        pressed.append(session.pressed())
-        session.news()
+        pressed.append(session.contact_force())
+        session.new_rows()
         counts.append(integrator.get_num_derivative_evaluations())
     evaluations = np.diff(counts)[20:]
     ticks_of_slice = SLICE_MS * 1e-3 / TICK

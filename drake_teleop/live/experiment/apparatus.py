@@ -21,9 +21,9 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
     Task,
 )
-from drake_teleop.live.experiment.procedure import Felt
+from drake_teleop.live.experiment.procedure import IntervalResult
 from drake_teleop.live.inputs import OWN, RANGES, Inputs
-from drake_teleop.live.scenarios import chosen, known_estimate, live_scenario
+from drake_teleop.live.scenarios import adapted_estimate, chosen_scenario, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -32,14 +32,14 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_MOST = RANGES["gamma"][1]  # %
+_MAX_SCALE = RANGES["gamma"][1]  # %
 # Averaging time of a contact force [s], and smallest force of a touch [N].
-_LASTS, _TOUCHED = 0.02, 0.5
+_AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
 # The tip is on the floor of the slot within this distance [m] for this time [s].
-_NEAR, _STANDS = 2e-3, 0.2
+_FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def load_of(scenario: Scenario) -> IdentifiedLoad | None:
+def load_for(scenario: Scenario) -> IdentifiedLoad | None:
     """Return the identified load; None if the station estimates it online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
@@ -78,9 +78,9 @@ class Apparatus:
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MOST) for name, value in values.items()}
+        return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
-    def felt(self, shown: float, inputs: dict[str, int], rows: Rows) -> Felt:
+    def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
         """Return the result of an interval.
 
         Args:
@@ -90,13 +90,15 @@ class Apparatus:
         """
         force = rows.force()
         if isinstance(self.task, PegInSlot):
-            return Felt(force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time)
+            return IntervalResult(
+                force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
+            )
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
-            return Felt(level if shown else 0.0, force, valid=force > _TOUCHED)
+            return IntervalResult(level if shown else 0.0, force, valid=force > _TOUCH_FORCE_N)
         before = self.condition.sigma if self.condition.eta is None else self.condition.eta
         level = self.mass * (inputs["sigma_object"] / 100.0 - before)
-        return Felt(level if shown else 0.0, force)
+        return IntervalResult(level if shown else 0.0, force)
 
 
 def make_apparatus(
@@ -123,8 +125,8 @@ def make_apparatus(
     setup = replace(setup, contact_detection=None, **changes)
     empty = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        held = chosen(setup, load, Inputs.of(setup).changed({"object": 1}))
-        estimate = known_estimate(setup, load, held)
+        held = chosen_scenario(setup, load, Inputs.of(setup).changed({"object": 1}))
+        estimate = adapted_estimate(setup, load, held)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
@@ -137,7 +139,7 @@ def make_apparatus(
     return Apparatus(task, condition, setup, load, float(mass) * at_hand)
 
 
-class Rows:
+class IntervalLog:
     """Measures of an interval's log, row by row.
 
     Attributes:
@@ -154,7 +156,7 @@ class Rows:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows, from `Session.news`."""
+        """Add the newest rows, from `Session.new_rows`."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -162,22 +164,22 @@ class Rows:
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
         self._felt.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
-            self._look(self._insert, rows)
+            self._detect_floor(self._insert, rows)
 
-    def _look(self, insert: Insert, rows: dict[str, Array]) -> None:
+    def _detect_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
-        if tip[2] - insert.translation[2] + insert.depth > _NEAR:
+        if tip[2] - insert.translation[2] + insert.depth > _FLOOR_DISTANCE_M:
             self._on_floor = None
         elif self._on_floor is None:
             self._on_floor = self.time
-        elif self.time - self._on_floor >= _STANDS:
+        elif self.time - self._on_floor >= _FLOOR_TIME_S:
             self.done_at = self._on_floor
 
     def force(self) -> float:
         """Return the largest 20 ms mean of the contact force at the tool [N]."""
-        return _largest(np.concatenate([np.zeros(1), *self._forces]), self._dt)
+        return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
         """Return the largest change of the rendered force [N] after the time `after` [s].
@@ -187,11 +189,11 @@ class Rows:
         felt = np.concatenate(self._felt)
         begin = round(after / self._dt)
         rest = felt[round((after - 0.1) / self._dt) : begin].mean(axis=0)
-        return _largest(np.linalg.norm(felt[begin:] - rest, axis=1), self._dt)
+        return _largest_mean(np.linalg.norm(felt[begin:] - rest, axis=1), self._dt)
 
 
-def _largest(values: Array, dt: float) -> float:
-    n = max(1, round(_LASTS / dt))
+def _largest_mean(values: Array, dt: float) -> float:
+    n = max(1, round(_AVERAGING_S / dt))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[n:] - sums[:-n]) / n
     return float(means.max()) if len(means) else float(values.max())

@@ -16,7 +16,7 @@ from drake_teleop.live.experiment.psychometrics import Psi
 from drake_teleop.live.experiment.store import Row, Store
 
 #: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
-CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, TOLD, BREAK, END = (
+CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
     *("consent", "task", "ready", "interval", "gap", "answer"),
     *("told", "break", "end"),
 )
@@ -39,7 +39,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Felt:
+class IntervalResult:
     """Result of an interval.
 
     Attributes:
@@ -84,7 +84,7 @@ class Procedure:
         phase: `CONSENT` to `END`.
         interval: 1 or 2 of the trial; 1 for peg in slot.
         level: intended level of the trial's stimulus.
-        prepared: number of intervals prepared so far.
+        prepared_intervals: number of intervals prepared so far.
         said: whether the last answer was right, for practice.
         again: whether the trial is repeated, because the tool touched nothing.
     """
@@ -101,9 +101,9 @@ class Procedure:
         }
         self._pressed: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
-            self._learn(trial, row)
+            self._update_estimates(trial, row)
         self.phase, self.said, self.again = CONSENT, False, False
-        self.prepared = 0
+        self.prepared_intervals = 0
         self._new_trial()
 
     @property
@@ -122,12 +122,12 @@ class Procedure:
         return self.experiment.tasks[self.trial.task]
 
     @property
-    def shown(self) -> float:
+    def present_level(self) -> float:
         """Level of the present interval."""
         return self.level if self.trial.signal == self.interval else 0.0
 
     @property
-    def pressed(self) -> float:
+    def expected_force(self) -> float:
         """Median contact force of the participant so far [N]."""
         task = self.task
         if self._pressed:
@@ -135,8 +135,8 @@ class Procedure:
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
     def _new_trial(self) -> None:
-        self.interval, self._felt, self.level = 1, [Felt(), Felt()], 0.0
-        self.prepared += 1
+        self.interval, self._felt, self.level = 1, [IntervalResult(), IntervalResult()], 0.0
+        self.prepared_intervals += 1
         task, trial = self.task, self.trial
         if not isinstance(task, PegInSlot):
             psi = self._psi[trial.task, trial.condition]
@@ -150,28 +150,28 @@ class Procedure:
             self.phase = READY
         elif self.phase == READY:
             self.phase, self.again = INTERVAL, False
-        elif self.phase == TOLD:
-            self._go_on()
+        elif self.phase == FEEDBACK:
+            self._next_trial()
 
-    def finished(self, felt: Felt) -> None:
+    def finish_interval(self, felt: IntervalResult) -> None:
         """End the present interval with its result."""
         self._felt[self.interval - 1] = felt
         if not felt.valid:
             self._new_trial()
             self.phase, self.again = READY, True
         elif self.trial.signal == 0:
-            self._over(0, felt.done, felt.time_s)
+            self._finish_trial(0, felt.done, felt.time_s)
         elif self.interval == 1:
             self.interval, self.phase = 2, GAP
-            self.prepared += 1
+            self.prepared_intervals += 1
         else:
             self.phase = ANSWER
 
-    def second(self) -> None:
+    def start_second_interval(self) -> None:
         """Start the second interval."""
         self.phase = INTERVAL
 
-    def interrupted(self) -> None:
+    def restart_trial(self) -> None:
         """Restart the trial after the driver has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
@@ -180,9 +180,9 @@ class Procedure:
     def answer(self, interval: int, time_s: float) -> None:
         """Store the interval that the participant chose, in the phase `ANSWER`."""
         if self.phase == ANSWER:
-            self._over(interval, interval == self.trial.signal, time_s)
+            self._finish_trial(interval, interval == self.trial.signal, time_s)
 
-    def _over(self, answer: int, correct: bool, time_s: float) -> None:
+    def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
         trial, felt = self.trial, self._felt
         row = Row(
             trial=self.number,
@@ -199,22 +199,22 @@ class Procedure:
         )
         self._store.write(self.participant, [*self._rows, row])
         self._rows.append(row)
-        self._learn(trial, row)
+        self._update_estimates(trial, row)
         self.said = bool(correct)
         if trial.practice:
-            self.phase = TOLD
+            self.phase = FEEDBACK
         else:
-            self._go_on()
+            self._next_trial()
 
-    def _learn(self, trial: Trial, row: Row) -> None:
+    def _update_estimates(self, trial: Trial, row: Row) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
             self._pressed.append(row.force_N)
         if not trial.practice:
-            self._psi[trial.task, trial.condition].answered(row.level, bool(row.correct))
+            self._psi[trial.task, trial.condition].update(row.level, bool(row.correct))
 
-    def _go_on(self) -> None:
+    def _next_trial(self) -> None:
         before = self.trials[self.number - 1]
         if self.number == len(self.trials):
             self.phase = END
@@ -230,7 +230,7 @@ class Procedure:
 
     def view(self) -> dict[str, Any]:
         """Return the state that the participant may see."""
-        number = self.number - (self.phase == TOLD)  # TOLD belongs to the finished trial
+        number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
@@ -241,6 +241,6 @@ class Procedure:
             "practice": trial.practice,
             "interval": self.interval,
             "again": self.again,
-            "said": self.said if self.phase == TOLD else None,
+            "said": self.said if self.phase == FEEDBACK else None,
             "consent": self.experiment.consent if self.phase == CONSENT else "",
         }

@@ -24,7 +24,7 @@ _THRESHOLDS = 81
 _SLOPES = np.geomspace(0.7, 3.0, 7)
 _LAPSES = np.array([0.0, 0.02, 0.04, 0.08])
 # Factor of the range of thresholds beyond the range of levels.
-_BEYOND = 2.0
+_RANGE_FACTOR = 2.0
 _LEVELS = 25
 
 
@@ -52,15 +52,15 @@ class Psi:
 
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _LEVELS)
-        self._thresholds = np.geomspace(low / _BEYOND, high * _BEYOND, _THRESHOLDS)
+        self._thresholds = np.geomspace(low / _RANGE_FACTOR, high * _RANGE_FACTOR, _THRESHOLDS)
         self._grid = tuple(
             np.meshgrid(self._thresholds, _SLOPES, _LAPSES, indexing="ij", sparse=True)
         )
         shape = (_THRESHOLDS, len(_SLOPES), len(_LAPSES))
-        self._likely = np.full(shape, 1.0 / math.prod(shape))
+        self._posterior = np.full(shape, 1.0 / math.prod(shape))
         # P(correct) as (levels, thresholds, slopes and lapses).
-        self._correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
-        self._correct = self._correct.reshape(_LEVELS, _THRESHOLDS, -1)
+        self._p_correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
+        self._p_correct = self._p_correct.reshape(_LEVELS, _THRESHOLDS, -1)
 
     def _probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
@@ -70,9 +70,9 @@ class Psi:
 
         This maximises the mutual information of answer and threshold.
         """
-        likely = self._likely.reshape(_THRESHOLDS, -1)
-        right = np.einsum("ltk,tk->lt", self._correct, likely)  # P(correct and threshold)
-        wrong = likely.sum(axis=1) - right
+        posterior = self._posterior.reshape(_THRESHOLDS, -1)
+        right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
+        wrong = posterior.sum(axis=1) - right
         lost = np.zeros(_LEVELS)
         for joint in (right, wrong):
             lost -= xlogy(joint, joint).sum(axis=1)
@@ -80,15 +80,15 @@ class Psi:
             lost += xlogy(total, total)
         return float(self.levels[np.argmin(lost)])
 
-    def answered(self, level: float, correct: bool) -> None:
+    def update(self, level: float, correct: bool) -> None:
         """Update the posterior with an answer to any level >= 0."""
         p = self._probability(level)
-        self._likely = self._likely * (p if correct else 1.0 - p)
-        self._likely /= self._likely.sum()
+        self._posterior = self._posterior * (p if correct else 1.0 - p)
+        self._posterior /= self._posterior.sum()
 
     def threshold(self) -> Estimate:
         """Return the threshold in the unit of the levels."""
-        share = self._likely.sum(axis=(1, 2))
+        share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
         edges = math.log(self._thresholds[0]) + step * (np.arange(_THRESHOLDS + 1) - 0.5)
@@ -99,7 +99,7 @@ class Psi:
     def d_prime(self, level: float) -> Estimate:
         """Return d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
-        values, share = d.ravel(), self._likely.sum(axis=2).ravel()
+        values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)
         below = np.cumsum(share[order]) - 0.5 * share[order]
         found = np.interp([0.5, 0.025, 0.975], below, values[order])

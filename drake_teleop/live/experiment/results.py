@@ -58,14 +58,14 @@ def results(experiment: Experiment, store: Store) -> list[Result]:
             each: dict[str, list[Result]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
-                for quantity, estimate in _of_one(task, done).items():
+                for quantity, estimate in _participant_estimates(task, done).items():
                     values = (estimate.value, estimate.low, estimate.high)
                     result = Result(kind, condition.name, n, len(done), quantity, *values)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    over = _over_all([r.value for r in one], share=quantity == _SHARE)
+                    over = _mean_with_interval([r.value for r in one], share=quantity == _SHARE)
                     trials = sum(r.trials for r in one)
                     found.append(Result(kind, condition.name, 0, trials, quantity, *_triple(over)))
     return found
@@ -75,19 +75,19 @@ def _triple(estimate: Estimate) -> tuple[float, float, float]:
     return estimate.value, estimate.low, estimate.high
 
 
-def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
+def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
         found = {_SHARE: _wilson(len(done), len(rows))}
         if done:
-            found["time to the floor [s]"] = _over_all([row.time_s for row in done])
-            found["largest contact force [N]"] = _over_all([row.force_N for row in done])
+            found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
+            found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
         return found
     psi = Psi(task.low, task.high)
     for row in rows:
-        psi.answered(row.level, bool(row.correct))
+        psi.update(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
     mass = isinstance(task, ApparentMass)
     unit = "kg" if mass else "N"
@@ -95,7 +95,7 @@ def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.d_prime(middle)}
 
 
-def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:
     """Return the (geometric) mean with its t interval, nan for one value."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan

@@ -16,7 +16,7 @@ from drake_teleop.live.experiment.simulated import all_apparatus
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.page_scene import PageScene
 from drake_teleop.live.scenarios import with_device
-from drake_teleop.live.server import LiveDrive, waits, warm_up
+from drake_teleop.live.server import LiveDrive, start_condition, warm_up
 from drake_teleop.station.scenario import Scenario
 
 
@@ -93,7 +93,10 @@ def serve_experiment(
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)
-    print(f"participant {participant} at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    print(
+        f"participant {participant} at {live.url}\n{start_condition(device)}; Ctrl-C ends it",
+        flush=True,
+    )
     reason, (done, trials) = live.until_signal(), live.done()
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:

@@ -13,14 +13,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drake_teleop.live.experiment.apparatus import Apparatus, Rows, load_of, make_apparatus
+from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog, load_for, make_apparatus
 from drake_teleop.live.experiment.design import (
     ApparentMass,
     Experiment,
     PegInSlot,
     SimulatedParticipant,
 )
-from drake_teleop.live.experiment.procedure import ANSWER, END, GAP, INTERVAL, Felt, Procedure
+from drake_teleop.live.experiment.procedure import (
+    ANSWER,
+    END,
+    GAP,
+    INTERVAL,
+    IntervalResult,
+    Procedure,
+)
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import SLICE_MS
 from drake_teleop.live.session import Session
@@ -31,9 +38,9 @@ from drake_teleop.station.station import MakeTeleopStation
 from drake_teleop.station.task_measures import contact_force, task_measures
 
 # Start of the hand's motion [s].
-_BEGINS = 0.4
+_MOTION_START_S = 0.4
 _UNIT = 1e-5  # m, unit of the inputs
-_NEWS_MS = 200
+_ROWS_PERIOD_MS = 200
 
 
 def all_apparatus(
@@ -42,7 +49,7 @@ def all_apparatus(
     """Return the station of each task and condition; identify unknown loads."""
     found = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = load_of(scenario)
+        load = load_for(scenario)
         for c, condition in enumerate(experiment.conditions):
             found[t, c] = make_apparatus(task, condition, scenario, load)
     return found
@@ -78,22 +85,22 @@ def take_part(
         if procedure.phase == INTERVAL:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                felt = _insert(apparatus, scenarios[procedure.trial.task], procedure)
+                felt = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
             else:
-                felt, response = _interval(apparatus, procedure)
+                felt, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
-            procedure.finished(felt)
+            procedure.finish_interval(felt)
         elif procedure.phase == GAP:
-            procedure.second()
+            procedure.start_second_interval()
         elif procedure.phase == ANSWER:
             rng = np.random.default_rng([experiment.seed, participant, procedure.number, 3])
-            procedure.answer(compared(observer, responses, rng), 0.5)
+            procedure.answer(compare_responses(observer, responses, rng), 0.5)
             progress(procedure.number, len(procedure.trials))
         else:
             procedure.go()
 
 
-def compared(
+def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
     """Return the interval, 1 or 2, with the larger noisy response.
@@ -109,16 +116,16 @@ def compared(
     return 1 if noisy[0] > noisy[1] else 2
 
 
-def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
+def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
     """Return the result, and the response without noise [N]."""
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.inputs(procedure.shown, procedure.pressed)
-    rows = Rows(task, apparatus.scenario, None)
-    sways, length = isinstance(task, ApparentMass), task.interval - _BEGINS
+    stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
+    rows = IntervalLog(task, apparatus.scenario, None)
+    sways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
-        t = max(1e-3 * session.ms - _BEGINS, 0.0)
+        t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)
         if sways:
             ramp = min(t, 1.0)
             place = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
@@ -127,14 +134,14 @@ def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
         hand = {name: value / _UNIT for name, value in place.items()}
         session.apply(session.inputs.changed(stimulus | hand))
         session.advance(SLICE_MS)
-        if session.ms % _NEWS_MS == 0:
-            rows.add(session.news())
-    rows.add(session.news())
+        if session.ms % _ROWS_PERIOD_MS == 0:
+            rows.add(session.new_rows())
+    rows.add(session.new_rows())
     session.close()
-    return apparatus.felt(procedure.shown, stimulus, rows), rows.change(_BEGINS)
+    return apparatus.result(procedure.present_level, stimulus, rows), rows.change(_MOTION_START_S)
 
 
-def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
+def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
     assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
     scenario = replace(
@@ -154,4 +161,4 @@ def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
     found = task_measures(result, scenario)
     done = found["success"] > 0.0
     taken = found["task_time_s"] if done else task.timeout
-    return Felt(force_N=float(contact_force(result).max()), done=done, time_s=taken)
+    return IntervalResult(force_N=float(contact_force(result).max()), done=done, time_s=taken)

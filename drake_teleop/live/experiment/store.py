@@ -20,7 +20,7 @@ from drake_teleop.lab.studies.store import claimed
 from drake_teleop.live.experiment.design import Experiment
 
 #: Largest number of a participant.
-MOST = 9999
+MAX_PARTICIPANT = 9999
 
 
 @dataclass(frozen=True)
