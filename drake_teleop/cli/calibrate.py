@@ -53,16 +53,11 @@ def calibrate_command(
     quiet: bool = False,
     **stream_options: Any,
 ) -> dict[str, Any]:
-    """Run `calibrate` and return its summary.
+    """Run `calibrate` and return its summary; see `source_of` for the stream's options.
 
     Args:
-        source: see `source_of`.
-        out: folder.
         until: see `read_tolerance`.
         largest: range of the sensor [N], [N m].
-        seconds, cutoff_hz, delay: see `calibrate`.
-        quiet: no table.
-        stream_options: real_time, motion, sensor_pose and arm, see `source_of`.
 
     Raises:
         DrakeTeleopError: if an argument is invalid, or the record contains no load.
@@ -134,7 +129,6 @@ def shown(at: Look, tolerance: Tolerance) -> Group:
 
 
 def _bar(half: float, known: bool) -> Text:
-    """Return a bar that is full at the tolerance and empty `_DECADES` above it."""
     share = 1.0 - np.log10(max(half, 1.0)) / _DECADES if np.isfinite(half) else 0.0
     cells = int(np.clip(share, 0.0, 1.0) * _BAR)
     return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")

@@ -27,11 +27,9 @@ def experiment_command(
     """Continue an experiment and return the table of `write_results`.
 
     Args:
-        study: YAML file, or the name of a shipped experiment.
-        out: folder of the results.
-        participant: number; default: the first with trials left, or the next number.
-        simulated: total number of simulated participants; 0 for people in the page.
-        page: port, browser and device, see `drive`.
+        participant: default: the first with trials left, or a new one.
+        simulated: total number of simulated participants; 0 for people.
+        page: options of `drive`.
 
     Raises:
         DrakeTeleopError: for an invalid file, or a folder with other contents.
@@ -54,7 +52,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return the requested participant, or the first with trials left, or a new one."""
+    """Return the requested participant, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

@@ -52,12 +52,7 @@ def identify_command(
     """Identify the load of a log, write the results into `out`, return the summary.
 
     Files: identification.json; summary.json (names: `logs.figures`); report.html; fit.png and
-    knowledge.png; report.png with both.
-
-    Args:
-        method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
-        gripper: identification.json of the gripper alone; then object.json of the object is
-            written, too, see `drake_teleop.load.gripper`.
+    knowledge.png, and report.png with both; with a gripper's file also object.json.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)

@@ -99,6 +99,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
+    """Print the contacts, and shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 

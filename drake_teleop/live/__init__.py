@@ -1,1 +1,1 @@
-"""Live drives: a running station, driven from the browser or by a haptic device."""
+"""Live drives of a running station, from the browser or by a haptic device."""

@@ -44,13 +44,13 @@ class Device(Protocol):
 
     @property
     def limits(self) -> Limits:
-        """Largest force and torque, and their slew rates."""
+        """Limits of force, torque and their slew rates."""
 
     def read(self) -> DevicePose | None:
-        """Wait for the next pose; return None after half a second."""
+        """Return the next pose, None after half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
-        """Display the wrench [f; tau] in B [N, N m] until the next call."""
+        """Display [f; tau] in B [N, N m]."""
 
     def close(self) -> None:
         """Release the device without force."""
@@ -62,11 +62,6 @@ class Client:
     Attributes:
         guard: safety functions.
         behind: age of the position that each force answers [s].
-
-    Args:
-        device: hardware.
-        address: of the station, udp://127.0.0.1:PORT.
-        observe: whether the passivity observer is on.
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -80,7 +75,7 @@ class Client:
         self._last_tick: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
-        """Exchange one pose and force; return the displayed wrench, None without a pose."""
+        """Return the displayed wrench after one exchange; None without a pose."""
         place = self._device.read()
         now = clock()
         self._receive()

@@ -3,10 +3,9 @@
 * Timeout: the force fades from 20 ms after the last command and is zero at 50 ms; its limit then
   rises by 100 N/s.
 * Limits of force, torque and their slew rates.
-* Passivity observer (Hannaford and Ryu 2002) of the energy into the port,
-  E += -f_k . (x_k+1 - x_k), at most 0.3 J. The next displacement is extrapolated from the last two.
-  A force that would return more than E is reduced, by at most a damper of 100 N s/m; a reserve
-  of 30 uJ covers the extrapolation error.
+* Passivity observer (Hannaford and Ryu 2002) of the energy E += -f_k . (x_k+1 - x_k), at most
+  0.3 J. A force that would return more than E along the extrapolated displacement is reduced, by
+  at most a damper of 100 N s/m; a reserve of 30 uJ covers the extrapolation error.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ class Limits:
 
 
 class DeviceGuard:
-    """Safety functions of one device; see the module.
+    """Safety functions of one device.
 
     Attributes:
         energy: of the hand into the device since the start [J].
-        slowed: number of forces that the passivity observer has changed.
+        slowed: number of forces that the observer has changed.
     """
 
     def __init__(self, limits: Limits, *, observe: bool = True) -> None:
@@ -57,9 +56,8 @@ class DeviceGuard:
         """Return the wrench to display (6,) [N, N m].
 
         Args:
-            position: (3,) of the device [m].
-            wrench: (6,) last command [N, N m].
-            age: of the command [s].
+            position: (3,) [m].
+            wrench: (6,) last command [N, N m], with its age [s].
             period: since the last tick [s].
         """
         x = (float(position[0]), float(position[1]), float(position[2]))

@@ -1,4 +1,4 @@
-"""Station side of a haptic device: receives poses, sends forces, measures lateness."""
+"""Station side of a haptic device: receives poses and sends forces."""
 
 from __future__ import annotations
 
@@ -34,21 +34,16 @@ _CLUTCH_OPEN_S = 0.05
 
 
 class DeviceLink:
-    """UDP link to the client of one haptic device on this machine.
-
-    It accepts the first sender, until that one is silent for 50 ms.
+    """UDP link to one device client on this machine; 50 ms of silence admit another one.
 
     Attributes:
-        refused: number of invalid packets and packets of another sender.
-        refusal: reason of the last refusal.
+        refused: number of invalid packets and packets of other senders.
+        refusal: last reason.
         lost: number of missing or overtaken packets.
-        port: number of the UDP port.
-
-    Args:
-        address: udp://127.0.0.1:PORT.
+        port: UDP port.
 
     Raises:
-        DrakeTeleopError: for an address of another machine, or if the port is in use.
+        DrakeTeleopError: for an address of another machine, or a port in use.
     """
 
     def __init__(self, address: str) -> None:
@@ -73,7 +68,7 @@ class DeviceLink:
         self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
     def poll(self, now: float) -> DeviceState | None:
-        """Receive waiting packets; return the newest state, None if the device is silent."""
+        """Receive waiting packets; return the newest state, None after silence."""
         self._polled_at = now
         for _ in range(_MAX_PACKETS):
             try:
@@ -117,14 +112,11 @@ class DeviceLink:
             return
 
     def reset_origin(self, now: float) -> None:
-        """Make the device's present pose correspond to the station's start pose."""
+        """Map the device's present pose to the station's start pose."""
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose; a silent device releases the hand.
-
-        The clutch is contained only if it is open.
-        """
+        """Return the `Inputs` of the pose; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -139,7 +131,7 @@ class DeviceLink:
         return values
 
     def figures(self, now: float) -> dict[str, float]:
-        """Return packets per second, lateness of packets and force [ms], and losses."""
+        """Return packet rate, losses, and lateness of packets and force [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
@@ -156,7 +148,7 @@ class DeviceLink:
         }
 
     def status_text(self) -> str:
-        """Return the state of the link at the last `poll` in words."""
+        """Return the state at the last `poll` in words."""
         return self._lateness_text() + self.refused_text()
 
     def refused_text(self) -> str:
@@ -194,13 +186,13 @@ def _is_loopback(host: str) -> bool:
 
 
 class DeviceConnection:
-    """Link to a haptic device, and the client process if this program starts it.
+    """Link to a haptic device, and its client process if started here.
 
     Args:
-        address: udp://127.0.0.1:PORT of a device client, or haply://HOST:PORT of an Inverse3.
+        address: udp://127.0.0.1:PORT of a client, or haply://HOST:PORT of an Inverse3.
 
     Raises:
-        DrakeTeleopError: for another address, or if the port is in use.
+        DrakeTeleopError: for another address, or a port in use.
     """
 
     def __init__(self, address: str) -> None:
@@ -219,7 +211,7 @@ class DeviceConnection:
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def close(self) -> None:
-        """Close the link and end the client, which releases the device."""
+        """Close the link and end the client."""
         self.link.close()
         if self._client is None:
             return

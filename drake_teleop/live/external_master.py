@@ -1,6 +1,6 @@
 """Master side of a real haptic device, in place of operator, simulated device and force display.
 
-The pose moves to the newest one on a straight line within a tick: the slave's command has no steps.
+The pose moves to the newest one on a straight line, so that the slave's command has no steps.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _pose_on_path(path, time, out):
 
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
-    """Write the displayed wrench after one period to `now` (8,); `limits` (2,) [N, N m]."""
+    """Write the displayed wrench after a period; `limits` (2,) [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
@@ -88,27 +88,27 @@ def _display_step(wrench, held, period, limits, last, now):
 class ExternalMaster(LeafSystem):
     """Haptic device with pose input and force output.
 
-    While released, or after a non-finite command, the force fades within 50 ms. It returns over a
-    quarter of a second, and changes by at most its largest value in 7 ms.
+    The force fades within 50 ms while released or after a non-finite command, and returns within
+    0.25 s.
 
     .. pydrake_system::
 
         name: ExternalMaster
         input_ports:
-        - wrench_command: (6,) F_E_B, to be rendered [N, N m]
+        - wrench_command: (6,) F_E_B [N, N m]
         output_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - master_state: (12,) position [m], yaw, pitch, roll [rad] as in `task_space`; zero speeds
+        - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
         - force_to_master: (6,) for the device [N, N m]
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two side by side
-        - hand_wrench_E: (6,) minus the displayed force, an estimate
+        - hand_wrench_E: (6,) minus the displayed force
 
     Args:
         start: (7,) X_BE.
         period: of the hand [s].
-        limits: (2,) largest force and torque [N, N m].
+        limits: (2,) of force and torque [N, N m].
     """
 
     __slots__ = ONE_DICT
@@ -135,7 +135,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Move the device towards `target` (7,) X_BE; None releases it."""
+        """Move the device to `target` (7,) X_BE; None releases it."""
         now, path = self._present(context), np.zeros(_PATH)
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
@@ -144,7 +144,7 @@ class ExternalMaster(LeafSystem):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Do nothing: a real hand has no impedance setting."""
+        """Do nothing: a real hand has no setting."""
 
     def _present(self, context: Context) -> Array:
         _pose_on_path(
@@ -190,10 +190,7 @@ class ExternalMaster(LeafSystem):
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return a master side (docs/station.md) of a real device and `kinematic_scaling`.
-
-    Names and `cross_fade` are those of `MakeLiveMasterSide`.
-    """
+    """Return a master side of a real device, like `MakeLiveMasterSide`."""
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])

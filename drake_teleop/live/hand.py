@@ -1,4 +1,4 @@
-"""Simulated hand of a live drive, with a smooth path to the newest target."""
+"""Simulated hand of a drive, on a smooth path to the newest target."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ _INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3
 
 @njit(cache=True)
 def _intention_into(path, time, pose, out):
-    """Write the intended X_BE (7,), twist [v; omega] (6,) and acceleration (3,) to `out`.
+    """Write the intended X_BE (7,), twist [v; omega] (6,) and acceleration (3,).
 
-    (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, which are independent of the
-    slices. A released hand intends the present `pose` (7,).
+    (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, independent of the slices. A
+    released hand intends the present `pose` (7,).
     """
     if path[_HELD] < 0.5:
         out[:7] = pose
@@ -108,7 +108,7 @@ def _rotation_vector_rate(r, omega):
 
 @njit(cache=True)
 def _path_into(path, time, now, target, poles):
-    """Write the path to `target` (7,) that starts from the intention `now` (16,)."""
+    """Write the path from the intention `now` (16,) to `target` (7,)."""
     path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
     turned = logarithm(multiply(now, conjugate(target)))
@@ -121,10 +121,7 @@ def _path_into(path, time, now, target, poles):
 
 @njit(cache=True, borrows=True)
 def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
-    """Write the wrench (6,) of the hand on the stylus; `intention` (16,) is scratch.
-
-    An additional spring displacement accelerates the hand's own mass [kg].
-    """
+    """Write the wrench (6,) of the hand; an extra spring force accelerates its mass [kg]."""
     _intention_into(path, time, pose, intention)
     for k in range(3):
         intention[4 + k] += mass / impedance[0] * intention[13 + k]
@@ -132,7 +129,7 @@ def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
 
 
 class LiveHand(Operator):
-    """Hand of an operator whose intention follows targets from outside.
+    """Hand of an operator that follows external targets.
 
     .. pydrake_system::
 
@@ -158,10 +155,7 @@ class LiveHand(Operator):
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Start a path to `target` (7,) X_BE from the present pose and speed.
-
-        None releases the stylus: only the hand's damping remains.
-        """
+        """Start a path to `target` (7,) X_BE; None releases the stylus."""
         path = np.zeros(_PATH)
         if target is not None:
             _path_into(
@@ -174,10 +168,7 @@ class LiveHand(Operator):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Change the hand's impedance without a step of its wrench.
-
-        The intention scales with stiffness, damping and mass, and returns slowly to the target.
-        """
+        """Change the impedance and scale the intention, without a wrench step."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD] < 0.5:
             return
@@ -219,11 +210,7 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return `MakeMasterSide` with a `LiveHand`.
-
-    Only the grip of the scenario's operator is used. With `cross_fade` the rendered wrench
-    cross-fades from that of the previous station.
-    """
+    """Return `MakeMasterSide` with a `LiveHand`, optionally with a `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

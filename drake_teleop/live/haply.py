@@ -1,9 +1,9 @@
 """The Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
 Messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], and the grip's
-`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. The service sends the next one after
-a force, `inverse3[0].commands.set_cursor_force.values`. Its axes (x right, y forward, z up) are
-rotated into B. Button a opens the clutch. Tested only with a virtual service, not with the device.
+`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. Each is answered by
+`inverse3[0].commands.set_cursor_force.values`. Axes: x right, y forward, z up. Button a opens the
+clutch. Tested only with a virtual service, not with the device.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Message(NamedTuple):
 
 
 def read_message(text: Any) -> Message | None:
-    """Return the device of a message, None without a plausible pose. Never raises."""
+    """Return the content of a message, None without a plausible pose. Never raises."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -52,7 +52,7 @@ def read_message(text: Any) -> Message | None:
 
 
 def force_message(device: str, wrench: Sequence[float]) -> str:
-    """Return the message that displays the first three numbers of a wrench in B."""
+    """Return the message that displays the force of a wrench in B."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -67,7 +67,7 @@ def _number(value: Any) -> float:
 
 
 class HaplyDevice:
-    """An Inverse3 at haply://HOST:PORT; the default port is 10001.
+    """Inverse3 at haply://HOST:PORT.
 
     Raises:
         DrakeTeleopError: if the service does not answer.

@@ -1,7 +1,7 @@
 """Inputs of a driver as integers, so that the record is exactly the simulated input.
 
-`inputs.csv` has a row for each change, with its time since the start [ms] and every input, choices
-by name. The last row is the end. A comment contains versions on which the motion depends.
+`inputs.csv` has a row for each change, with its time [ms] and choices by name. The last row is the
+end. A comment contains versions on which the motion depends.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ def initial_choices(scenario: Scenario) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All inputs that a driver may change, as integers.
+    """Inputs that a driver may change.
 
     Attributes:
-        x, y, z: intended position of the stylus from its start, in B [10 um].
-        rx, ry, rz: intended rotation vector from the start, in B [0.1 mrad].
+        x, y, z: intended displacement of the stylus in B [10 um].
+        rx, ry, rz: intended rotation vector in B [0.1 mrad].
         held: 1 while the hand holds the stylus.
-        clutch: 1 while motion is transmitted to the slave.
-        sigma: scale of the gripper's (without one: all) non-contact wrench [%].
+        clutch: 1 while motion is transmitted.
+        sigma: scale of the gripper's (or whole) non-contact wrench [%].
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
-        force_scale: of force and torque, slave to master [1e-5].
+        force_scale: slave to master [1e-5].
         network, method, grip, sensor: index into `NAMES`.
         delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
-        object: 1 while the tool holds an object.
+        object: 1 with a gripped object.
         detection: 1 with contact detection.
     """
 
@@ -98,7 +98,7 @@ class Inputs:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
-        """Return the inputs at the start of a scenario."""
+        """Return the initial inputs of a scenario."""
         sigma, sigma_object, gamma = (
             round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()
         )
@@ -107,7 +107,7 @@ class Inputs:
         return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """Return inputs with new values, clipped to their ranges, without non-finite ones."""
+        """Return inputs with new values, clipped, without non-finite ones."""
         changes = {}
         for name in values.keys() & RANGES.keys():
             value, (low, high) = values[name], RANGES[name]
@@ -140,7 +140,7 @@ class Inputs:
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
-        """Return inputs of a hand that holds the stylus at `pose` (7,) X_BE."""
+        """Return inputs that hold the stylus at `pose` (7,) X_BE."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -183,22 +183,20 @@ _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the first lines of a file; `made_by` contains versions and digests by name."""
+    """Return the first lines, with versions and digests by name."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
-    """Return the line of the inputs from a time on [ms]."""
+    """Return the line of the inputs at a time [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
     values |= {name: names[values[name]] for name, names in NAMES.items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the changes in a file with their times [ms]; the last one is the end.
-
-    An incomplete last line is ignored. `made_by` is that of this process.
+    """Return the changes with their times [ms]; the last one is the end.
 
     Raises:
         DrakeTeleopError: with file and line; or if the drive cannot be repeated exactly.

@@ -1,7 +1,6 @@
-"""A drive with its driver and spectators, on any clock and independent of the page.
+"""A drive with its driver and spectators, independent of page and clock.
 
-After the driver leaves, the next client that asks drives. Without a driver the hand lets go and the
-clutch opens; a quarter of a second later the simulation stops, with a complete record.
+Without a driver the hand lets go, and after 0.25 s the simulation stops with a complete record.
 """
 
 from __future__ import annotations
@@ -52,25 +51,22 @@ MAX_SLOWDOWN = 20.0
 
 
 class Live:
-    """Event handler of a drive: messages of pages and ticks of the clock.
+    """Event handler of a drive: messages of pages and ticks of a clock.
 
     Attributes:
         refused: number of invalid messages.
-        stopped: failure that stops the simulation until a reset; "" without one.
-        requested_scene: of a page, "" for none; the simulation waits for `change_scene`.
+        stopped: failure that stops the simulation, or "".
+        requested_scene: of a page, or ""; the simulation waits for `change_scene`.
         scene: present scene.
         pace: timing of the slices.
-        recorded: folders of the completed drives.
+        recorded: folders of completed drives.
 
     Args:
-        scenario: from `live_scenario`.
-        load: identified load of the station.
-        record: folder, or if it is not empty the next free one beside it; None for none.
+        record: folder, or if it is not empty the next free one; None for none.
         show: returns the scene's part of a frame.
         now: the clock [s].
-        link: to a haptic device; None for the hand of a page.
-        log: whether the log is recorded in addition to the inputs.
-        begin: initial inputs that differ from the scenario's.
+        link: to a haptic device; None for a page's hand.
+        begin: initial inputs.
     """
 
     def __init__(
@@ -137,12 +133,12 @@ class Live:
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
-        """Continue the present scene, and report why the requested one is impossible."""
+        """Continue the present scene, and report why."""
         self.requested_scene, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the constants of the scenario for a page."""
+        """Return the scenario's constants for a page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
@@ -164,7 +160,7 @@ class Live:
             self._set_driver(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; the hand of the driver lets go."""
+        """Remove a page; the driver's hand lets go."""
         self._clients.remove(client)
         if client == self._driver:
             self._driver, self._alone_since = None, now
@@ -224,7 +220,7 @@ class Live:
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate at most four due slices; return a frame if one is due."""
+        """Simulate at most four due slices; return a due frame."""
         for _ in range(_SLICES_PER_TICK):
             now = clock()
             if self.is_idle or self.pace.wait(now) > 0:
@@ -255,7 +251,7 @@ class Live:
             self.pace.start(now)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Run an action; a failure stops the drive with its message."""
+        """Run an action; a failure stops the drive."""
         try:
             action()
         except _FAILURES as error:
@@ -292,7 +288,7 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for the pages."""
+        """Return the present frame for pages."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
@@ -332,10 +328,10 @@ class Live:
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Complete the record; keep the link for the next drive.
+        """Complete the record.
 
         Raises:
-            CannotWrite: if the record cannot be completed.
+            CannotWrite: if that fails.
         """
         try:
             self._session.close()
@@ -347,10 +343,10 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        """End the drive and the link to a device.
+        """End the drive and the device link.
 
         Raises:
-            CannotWrite: if the record of any of its drives is incomplete.
+            CannotWrite: if any record is incomplete.
         """
         self._try(self.end)
         if self._link is not None:
@@ -360,7 +356,7 @@ class Live:
 
 
 def _free_folder(folder: Path) -> Path:
-    """Return the folder if it is absent or empty, else the first absent of DIR-2, DIR-3, ..."""
+    """Return the folder if absent or empty, else DIR-2, DIR-3, ..."""
     folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
@@ -371,9 +367,7 @@ def _free_folder(folder: Path) -> Path:
 def parse(text: Any) -> dict[str, Any] | None:
     """Return the valid requests of a message; None without any.
 
-    Returns:
-        Any of "set" and "rates" (numbers by input), "pause" (bool), "slow" (1 to 20), "scene" (of
-        `SCENES`), "reset" and "drive" (True).
+    "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
     """
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None

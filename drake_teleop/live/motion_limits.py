@@ -1,7 +1,7 @@
 """Rate inputs of keys and sticks, and motion limits, in simulated time.
 
-In slow motion a hand moves the simulated arm faster than in real time. Without limits this
-saturates the wrist sensor and renders forces without contact.
+In slow motion a hand could otherwise saturate the wrist sensor, and be rendered forces in free
+motion.
 """
 
 from __future__ import annotations
@@ -29,13 +29,7 @@ class RateInputs:
         self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Return the inputs when new rates begin; they end 1 s after their last repetition.
-
-        Args:
-            rates: by input, per simulated second; others are 0.
-            inputs: in force now.
-            now: the clock [s].
-        """
+        """Return the inputs at new rates by name; rates end 1 s after their repetition."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
@@ -57,12 +51,11 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Speed limit of each coordinate of the target; slower motions pass unchanged.
+    """Limits of the target's speed, and for a device of its acceleration.
 
     Args:
-        slice_s: period of the steps [s].
+        slice_s: period [s].
         scales: slave over master, of translation and rotation.
-        device: whether accelerations are limited, too.
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
@@ -77,7 +70,7 @@ class MotionLimiter:
             self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
 
     def step(self, inputs: Inputs, *, free: bool) -> Inputs:
-        """Return the limited inputs; with `free` the target may jump, as the arm is still."""
+        """Return the limited inputs; with `free` the target may jump."""
         followed = {
             name: axis.step(getattr(inputs, name), free) for name, axis in self._axes.items()
         }
@@ -104,7 +97,7 @@ class _Axis:
         return self._at
 
     def _braking(self, distance: float) -> float:
-        """Return the speed v with v + (v - change) + (v - 2 change) + ... = distance."""
+        """Return v with v + (v - change) + (v - 2 change) + ... = distance."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

@@ -1,4 +1,4 @@
-"""Timing of slices: simulated time keeps up with a clock, or visibly falls behind."""
+"""Timing of slices: simulated time follows a clock, or visibly falls behind."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
-    """Schedule of the slices on any clock [s].
+    """Schedule of the slices [s].
 
     Attributes:
         slow: clock time per simulated time.
-        given_up: lost time that was not caught up [s].
+        given_up: lost time [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
@@ -33,7 +33,7 @@ class Pace:
         self._starts.clear()
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice [s]; at most 0 if it is due."""
+        """Return the time until the next slice [s]."""
         return self._due - now
 
     def begin(self, now: float) -> None:
@@ -48,13 +48,13 @@ class Pace:
 
     @property
     def factor(self) -> float:
-        """Simulated over elapsed time of the last 400 slices; 0 at first."""
+        """Simulated over elapsed time of 400 slices; 0 at first."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
     def lateness(self) -> float:
-        """Return the 99 % quantile of their lateness [s]."""
+        """Return the 99 % quantile of lateness [s]."""
         return (
             sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0
         )
@@ -62,7 +62,7 @@ class Pace:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable the garbage collector, which takes as long as ten slices."""
+    """Disable the garbage collector, which takes ten slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -1,7 +1,6 @@
 """3D scene of a drive for its page: the objects once, then their poses.
 
-Meshcat is closed before the drive listens: its port accepts input from any page, and malformed
-input ends the process.
+Meshcat is closed before the drive listens: malformed input from any page would end the process.
 """
 
 from __future__ import annotations
@@ -31,17 +30,12 @@ _FILE = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
-    """3D scene of one scenario; a failure leaves the drive without a scene.
+    """3D scene of a scenario; its failure does not end the drive.
 
     Attributes:
-        name: of the scene in the page's addresses.
-        objects: JSON for the page: {"commands": [base64], "files": {address: data URL}}.
+        name: in the page's addresses.
+        objects: JSON {"commands": [base64], "files": {address: data URL}}.
         failure: why there is no scene, or "".
-
-    Args:
-        name: as above.
-        scenario: of the drive.
-        forces: whether arrows show the forces.
     """
 
     def __init__(self, name: str, scenario: Scenario, *, forces: bool = True) -> None:
@@ -58,11 +52,9 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return the scene's part of a frame, at the last row.
+        """Return the scene's part of a frame at the last row.
 
-        Returns:
-            "view": the name, "no_view": the failure, "moves": {"poses": {path: 4x4 matrix by
-            columns}, "sizes": {path: [x, y, z]}}.
+        "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
         """
         moves = {} if self.failure else self._moves(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
@@ -84,7 +76,7 @@ class PageScene:
 
 
 class _Moves:
-    """Recorder of poses and sizes with the interface of Meshcat."""
+    """Recorder with the interface of Meshcat."""
 
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}

@@ -1,4 +1,4 @@
-"""Folder of a recorded drive during the drive: scenario, load, inputs and log."""
+"""Folder of a recorded drive: scenario, load, inputs and log."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Record:
     """Folder of a drive without its log.
 
     Raises:
-        CannotWrite: if the folder contains a drive, or the disk is full.
+        CannotWrite: if it contains a drive, or the disk is full.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write a change at once, so that it survives the end of the process."""
+        """Write a change at once, which survives a kill."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -86,7 +86,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end of the drive; remove the record of one that never started."""
+        """Write the end; remove the record of a drive that never started."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)
@@ -103,7 +103,7 @@ class Record:
 
 
 class LogBeside(LogOnDisk):
-    """`LogOnDisk` that waits for the disk only in `finish` and before the next part."""
+    """Log on a thread, which waits for the disk only in `finish` and the next part."""
 
     def __init__(
         self,
@@ -117,10 +117,10 @@ class LogBeside(LogOnDisk):
         self._writing: Future[None] = self._thread.submit(_import_polars)
 
     def finish(self) -> None:
-        """Wait until all rows taken so far are on the disk.
+        """Wait until all rows are on the disk.
 
         Raises:
-            DrakeTeleopError: if they cannot be written.
+            DrakeTeleopError: if that fails.
         """
         self._writing.result()
 

@@ -1,4 +1,4 @@
-"""Scenarios of a drive: as driven, scenes of the page, and the result of the driver's choices."""
+"""Scenarios of a drive: scenes of the page, and results of the driver's choices."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def with_device(scenario: Scenario) -> Scenario:
 
 
 def scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of one of `SCENES`; "own" is the drive's first scenario."""
+    """Return the scenario of one of `SCENES`."""
     if name == "own":
         return own
     scenario = LoadScenario(_SHIPPED[name])
@@ -76,10 +76,7 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices of the driver.
-
-    Contact detection needs the scenario's own sensor and a load with a noise floor.
-    """
+    """Return the scenario with all choices; detection needs a known noise floor."""
     changes: dict[str, object] = {
         "passivity__method": METHODS[inputs.method],
         "operator__grip": list(GRIPS)[inputs.grip],
@@ -122,17 +119,14 @@ def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
 
 
 def _object_phi(scenario: Scenario) -> Array:
-    """Return phi (10,) of the object alone, about So in S."""
+    """Return phi (10,) of the object, about So in S."""
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
 def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) [offsets, phi] for scenario `now`; None without a load.
-
-    Mass parameters change with the arm model; offsets change as if the new sensor were tared.
-    """
+    """Return the load estimate (16,) for the masses and the tared sensor of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

@@ -1,7 +1,6 @@
 """Server of `drake-teleop drive`: one page on this machine and its socket.
 
-One port of 127.0.0.1 serves page and scenes to clients with the token of the address, and the
-socket only to this page. No other port is open.
+One port of 127.0.0.1 serves clients with the token of the address; the socket only this page.
 """
 
 from __future__ import annotations
@@ -65,10 +64,10 @@ class LiveDrive:
     """A drive on its own thread.
 
     Attributes:
-        url: of the page; its token permits to drive.
-        recorded: folders of the completed drives.
+        url: of the page, with its token.
+        recorded: folders of completed drives.
         ended: after the end, why the simulation had stopped, or "".
-        ms: after the end, the simulated time [ms].
+        ms: after the end, simulated time [ms].
     """
 
     def __init__(
@@ -119,10 +118,10 @@ class LiveDrive:
         progress(1.0)
 
     def wait(self) -> None:
-        """Wait for the end of the drive, by `stop` or Ctrl-C.
+        """Wait for the end, by `stop` or Ctrl-C.
 
         Raises:
-            DrakeTeleopError: if the record is not complete.
+            DrakeTeleopError: if the record is incomplete.
         """
         try:
             while not self._over.wait(0.2):
@@ -135,7 +134,7 @@ class LiveDrive:
         """Wait for Ctrl-C or SIGTERM and return its name.
 
         Raises:
-            DrakeTeleopError: if the record is not complete.
+            DrakeTeleopError: if the record is incomplete.
         """
         try:
             self.wait()
@@ -149,16 +148,13 @@ class LiveDrive:
             raise self._failed
 
     def stop(self) -> None:
-        """End the drive; its record is then complete on the disk."""
+        """End the drive and complete its record."""
         self._stop.set()
         for thread in self._threads:
             thread.join()
 
     def _end(self) -> None:
-        """Stop within 4 s, also if further signals arrive.
-
-        Compiled code on another thread cannot be ended, and Python may crash at its exit then.
-        """
+        """Stop within 4 s; Python may crash at its exit while compiled code runs."""
         self._stop.set()
         end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:
@@ -246,7 +242,7 @@ class LiveDrive:
                 await self._sleep()
 
     async def _sleep(self) -> None:
-        """Wait until the next event, then handle waiting messages."""
+        """Wait until the next event, then handle messages."""
         rest = self._live.wait(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
@@ -342,7 +338,7 @@ class LiveDrive:
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
-    """Return the identified load with its noise floor, None if it is estimated online."""
+    """Return the load with its noise floor, None if it is estimated online."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -350,7 +346,7 @@ def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | Non
 
 
 def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile the functions of the first slices, which takes a minute once."""
+    """Compile the functions of the first slices, a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.frame(session.new_rows(), session.inputs)
@@ -384,16 +380,15 @@ def drive(
 ) -> LiveDrive:
     """Drive a station in the browser: its hand by mouse, keys, gamepad or touch.
 
-    The drive runs on its own thread: `wait()` returns at its end, `stop()` ends it. A notebook
-    shows the page as the value of this call; elsewhere open its `url`.
+    `wait()` returns at the end of the drive, `stop()` ends it. A notebook shows the page as the
+    value of this call; elsewhere open its `url`.
 
     Args:
-        scenario: or a shipped name, or a YAML file; only the grip of its operator is used.
-        record: folder of the drive, which `run --inputs` repeats; None for none.
+        scenario: or a shipped name, or a YAML file; its operator gives only the grip.
+        record: folder for `run --inputs`; None for none.
         port: of the page on 127.0.0.1; 0 for any free port.
         browser: whether to open the page.
-        device: haptic device that replaces the hand: udp://127.0.0.1:PORT of a device client, or
-            haply://localhost:10001.
+        device: haptic device: udp://127.0.0.1:PORT of a client, or haply://localhost:10001.
 
     Raises:
         DrakeTeleopError: if the scenario is invalid, or the port is in use.
@@ -413,7 +408,7 @@ def drive_command(
     """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: as `drive`, or if the drive had stopped or its record is not complete.
+        DrakeTeleopError: as `drive`, or for a stopped drive or incomplete record.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
@@ -431,5 +426,5 @@ def start_condition(device: str | None) -> str:
 
 
 def _print_note(text: str) -> None:
-    """Print on stderr, which no page shows."""
+    """Print on stderr, not on a page."""
     print(text, file=sys.stderr, flush=True)

@@ -1,7 +1,6 @@
-"""A station that runs in slices and takes its inputs between them; without clock and page.
+"""A station that runs in slices and takes its inputs between them.
 
 The motion depends on the inputs alone: `Drive.repeat` gives the same log for any slices.
-A recorded drive is a folder with `scenario.yaml`, `load.npz`, `inputs.csv` and `log.parquet`.
 """
 
 from __future__ import annotations
@@ -51,14 +50,9 @@ _SHORT_STEPS_S = 4e-3
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Bound the steps of error control from below, and keep them short after a rejection.
+    """Bound the steps of error control by `shortest` [s]; keep them for 4 ms after a rejection.
 
-    A bouncing tool makes error control reject two of five steps, which takes time. It resumes 4 ms
-    after a rejection.
-
-    Args:
-        simulator: of a station, whose integrator has error control.
-        shortest: step of error control [s]; at most the integrator's longest.
+    A bouncing tool makes error control reject two of five steps, which takes time.
     """
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
@@ -87,10 +81,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def with_all_signals(log: SimulationResult) -> SimulationResult:
-    """Return a log that has the signals of channel and contact detection.
-
-    Without a channel the received pose is the present command, and energies are 0.
-    """
+    """Return a log that has the signals of channel and contact detection."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -102,14 +93,11 @@ def with_all_signals(log: SimulationResult) -> SimulationResult:
 
 
 class _Station:
-    """A running station, and access to its blocks and signals.
+    """A running station; `number` in the drive is added to its seed.
 
     Args:
-        scenario: of the station.
         estimate: load estimate (16,).
         load: with the noise floor.
-        number: of the station in this drive, from 0; added to the seed.
-        device: as of `Session`.
     """
 
     def __init__(
@@ -187,14 +175,13 @@ class Session:
     """A running station with a hand that follows inputs.
 
     Attributes:
-        scenario: of the drive, from `live_scenario`.
+        scenario: of the drive.
         inputs: in force now.
-        ms: simulated time since the start [ms].
+        ms: simulated time [ms].
 
     Args:
-        scenario: to drive.
-        load: identified load; None if it is estimated online.
-        log: folder of the log; None keeps it in memory until `new_rows` returns it.
+        load: None if it is estimated online.
+        log: folder; None keeps rows in memory until `new_rows` returns them.
         record: folder of scenario, load and inputs; None for none.
         device: whether positions are those of a haptic device.
     """
@@ -224,7 +211,7 @@ class Session:
         self._station.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
-        """Set the inputs from now on; record a change.
+        """Set and record the inputs from now on.
 
         Raises:
             DrakeTeleopError: if there is no such station; then nothing has changed.
@@ -265,7 +252,7 @@ class Session:
 
     @property
     def filling(self) -> bool:
-        """Whether the clutch is open because a new channel delivers no packets yet."""
+        """Whether the clutch is open until a new channel delivers packets."""
         return self.ms < self._filled_at_ms
 
     def advance(self, ms: int = SLICE_MS) -> None:
@@ -285,10 +272,7 @@ class Session:
         advance(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rows since the last call: (n, k) by signal, and "t" (n,) [s].
-
-        Without a recorded log they are then discarded. Call it at least once a second.
-        """
+        """Return the rows since the last call, at most 1 s ago: (n, k) by signal, "t" (n,) [s]."""
         sink, seen = self._station.sink, self._rows_read
         data, times = sink.data()[:, seen:].T.copy(), sink.sample_times()[seen:]
         found = {name: data[:, part] for name, part in self._station.columns.items()}
@@ -301,7 +285,7 @@ class Session:
         return found
 
     def contact_force(self) -> float:
-        """Return the last contact force at the hand's scale [N]; 0 if unknown."""
+        """Return the last contact force at the hand [N]; 0 if unknown."""
         part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -309,7 +293,7 @@ class Session:
         return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
-        """Return inputs of a hand that takes the stylus at its pose."""
+        """Return inputs of a hand that takes the stylus."""
         return self.inputs.holding(self._station.value("pose_master"), self._start)
 
     def force(self) -> NDArray[np.float64]:
@@ -317,14 +301,14 @@ class Session:
         return self._station.value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force that the limit of a new channel removes [N]."""
+        """Return the force that a new channel's limit removes [N]."""
         if self._station_count == 1:
             return 0.0
         over, context = self._station.block("cross_fade")
         return float(over.removed_force(context))
 
     def flush(self) -> None:
-        """Write all rows and inputs until now; the session may continue."""
+        """Write all rows and inputs until now."""
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -335,7 +319,7 @@ class Session:
         return with_all_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        """Return the rows of the log that are in memory."""
+        """Return the rows in memory."""
         parts = [*self._earlier_rows, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
@@ -357,11 +341,8 @@ class Drive:
     """A recorded drive.
 
     Attributes:
-        scenario: of the drive, with its duration.
-        load: identified load of the station.
         changes: of the inputs, with their times [ms]; the last is the end.
         device: whether a haptic device was the hand.
-        folder: of the record.
     """
 
     scenario: Scenario
@@ -373,11 +354,10 @@ class Drive:
     def repeat(
         self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the drive again and return its log, which is the same, bit by bit.
+        """Simulate the drive again and return its log, bit by bit.
 
         Args:
-            progress: called with the fraction done.
-            log: folder of the log; None for one in memory.
+            log: its folder; None for memory.
             slice_ms: longest step between changes [ms].
         """
         session = Session(self.scenario, self.load, log=log, device=self.device)

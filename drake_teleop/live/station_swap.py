@@ -1,6 +1,6 @@
 """Transfer of a station's state to another station, by block names.
 
-Random numbers, and a channel with another network or method, start anew.
+Random numbers, and a changed channel, start anew.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy states and changeable parameters from station `before` to `station`.
+    """Copy states and changeable parameters of `before` to `station`.
 
     Args:
-        before, then: source and its context.
-        station, context: target and its context.
-        excluded: names of blocks that are not copied.
+        then, context: of the two stations.
+        excluded: block names.
     """
     context.SetTime(then.get_time())
     others = dict(_blocks(before))
@@ -79,7 +78,7 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 @njit(cache=True)
 def _weight(change, time):
-    """Return the weight of the new wrench, 0 to 1; `change` as declared in `CrossFade`."""
+    """Return the weight of the new wrench, 0 to 1."""
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
@@ -127,17 +126,17 @@ class CrossFade(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
-        """Cross-fade from `felt` (6,) during `length` [s], beginning at `start` [s]."""
+        """Cross-fade from `felt` (6,) within `length` [s] from `start` [s]."""
         change = np.concatenate([[start, length], felt])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def Limit(self, context: Context, most: float) -> None:
-        """Limit the force to `most` [N] until the wrench was once below it."""
+        """Limit the force to `most` [N] until the wrench was once below."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:
-        """Return the force that the limit removes now [N]."""
+        """Return the force that the limit removes [N]."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 

@@ -1,6 +1,6 @@
 """Simulated haptic device in a simulated hand, for tests and for trying a link.
 
-Dynamics: m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x'), with the force f of the last tick.
+m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x'), with the force f of the last tick.
 """
 
 from __future__ import annotations
@@ -14,18 +14,16 @@ _STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
-    """Light device in a hand that follows a given motion.
+    """Light device of given mass [kg] and damping [N s/m] in a moving hand.
 
     Attributes:
         position: [m].
         velocity: [m/s].
-        energy: of device and hand into the port since the start [J].
+        energy: of device and hand into the port [J].
 
     Args:
         hand: intended position [m] and velocity [m/s] at a time [s].
         grip: of `GRIPS`.
-        mass: of the device [kg].
-        damping: of the device [N s/m].
     """
 
     def __init__(
@@ -59,7 +57,7 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion from `lift` to -`depth` and back [m]; `hold` is the share below."""
+    """Return a hand motion from `lift` to -`depth` [m] and back, with a share `hold` below."""
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from drake_teleop.live.experiment.messages import HAND, parse_study
+from drake_teleop.live.experiment.guided import HAND, parse_study
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import IdentifiedLoad

@@ -27,7 +27,7 @@ from drake_teleop.live.device_packets import (
     unpacked_force,
     unpacked_state,
 )
-from drake_teleop.live.haply import HaplyDevice, read_message, written_force
+from drake_teleop.live.haply import HaplyDevice, read_message, force_message
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_device
@@ -119,7 +119,7 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
 
 
 def test_a_force_goes_to_haply_as_its_place_came():
-    said = json.loads(written_force("a", (1.0, 2.0, 3.0)))
+    said = json.loads(force_message("a", (1.0, 2.0, 3.0)))
     device = {"device_id": "a", "state": {"cursor_position": {"x": 2, "y": -1, "z": 3}}}
     assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
         "x": 2.0, "y": -1.0, "z": 3.0,

@@ -1,1 +1,1 @@
-"""Blind experiments with people in the page of `drive`, or with simulated participants."""
+"""Blind experiments with people or simulated participants."""

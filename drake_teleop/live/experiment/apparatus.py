@@ -1,8 +1,7 @@
 """Station and stimulus of an experiment's task under a condition.
 
-Integer inputs of a drive set the stimulus. To render F newton of a contact force P at the tool,
-gamma is scaled by F / P; the other interval has gamma = 0. For a mass m at the hand, sigma (or the
-eta of a held object) is increased. The recorded level uses the measured contact force.
+A contact of F newton of the contact force P is rendered with gamma scaled by F / P, the other
+interval with gamma = 0. A mass at the hand increases sigma, or the eta of a held object.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
 def load_for(scenario: Scenario) -> IdentifiedLoad | None:
-    """Return the identified load; None if the station estimates it online."""
+    """Return the load, None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
@@ -49,9 +48,6 @@ class Apparatus:
     """Station of a task under a condition.
 
     Attributes:
-        task, condition: of the experiment.
-        scenario: with the condition's network, method and object.
-        load: identified load of the station.
         mass: of the load or object at the hand [kg].
     """
 
@@ -62,12 +58,7 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return the inputs of an interval, in the units of `Inputs`.
-
-        Args:
-            level: of the stimulus; 0 for none.
-            pressed: expected contact force at the tool [N].
-        """
+        """Return the inputs for a stimulus and an expected contact force [N]."""
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
@@ -81,13 +72,7 @@ class Apparatus:
         return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
     def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
-        """Return the result of an interval.
-
-        Args:
-            shown: intended level; 0 for none.
-            inputs: of the interval.
-            rows: of its log.
-        """
+        """Return the result of an interval with an intended level."""
         force = rows.force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -106,13 +91,8 @@ def make_apparatus(
 ) -> Apparatus:
     """Return the station of a task under a condition.
 
-    Args:
-        task, condition: of the experiment.
-        scenario: of the task.
-        load: identified in this scenario.
-
     Raises:
-        DrakeTeleopError: if there is no such station.
+        DrakeTeleopError: if there is none.
     """
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}
@@ -140,11 +120,11 @@ def make_apparatus(
 
 
 class IntervalLog:
-    """Measures of an interval's log, row by row.
+    """Measures of an interval.
 
     Attributes:
         time: of the last row [s].
-        done_at: time at which the tool reached the floor of the slot [s]; 0 before.
+        done_at: time at the floor of the slot [s]; 0 before.
     """
 
     def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
@@ -156,7 +136,7 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows, from `Session.new_rows`."""
+        """Add the newest rows."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -178,13 +158,13 @@ class IntervalLog:
             self.done_at = self._on_floor
 
     def force(self) -> float:
-        """Return the largest 20 ms mean of the contact force at the tool [N]."""
+        """Return the largest 20 ms mean of the contact force [N]."""
         return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """Return the largest change of the rendered force [N] after the time `after` [s].
+        """Return the largest 20 ms mean change of the rendered force [N] from time `after` [s].
 
-        It is averaged over 20 ms, and relative to the mean over the 0.1 s before.
+        It is relative to the 0.1 s before.
         """
         felt = np.concatenate(self._felt)
         begin = round(after / self._dt)

@@ -1,4 +1,4 @@
-"""Design of an experiment: its YAML file with tasks and conditions."""
+"""Design of an experiment: its YAML file."""
 
 # No postponed annotations: yaml_load_typed reads the types of the fields.
 import os
@@ -85,10 +85,7 @@ Task: TypeAlias = ContactDetection | ApparentMass | PegInSlot
 @settings
 @dataclass
 class SimulatedParticipant:
-    """Participant of `--simulated`, who compares the rendered force with normal noise.
-
-    The response to an interval is the largest change of the rendered force.
-    """
+    """Participant of `--simulated`, who compares changes of the rendered force."""
 
     noise: float = quantity(0.06, "N", 1e-4, 100.0, "standard deviation at rest, at the hand")
     weber: float = quantity(0.1, "1", 0.0, 1.0, "and as a share of the response")
@@ -119,7 +116,7 @@ class Experiment:
         """Check the experiment without its scenarios.
 
         Raises:
-            DrakeTeleopError: with `where` and the field.
+            DrakeTeleopError: with the field.
         """
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
@@ -153,18 +150,15 @@ class Experiment:
 
 
 def ExperimentNames() -> list[str]:
-    """Return the names of the shipped experiments."""
+    """Return the shipped names."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Return a checked experiment, and the scenario of each task.
-
-    Args:
-        path: of a YAML file, or the name of a shipped one.
+    """Return a checked experiment by file or name, and its scenarios.
 
     Raises:
-        DrakeTeleopError: with the file and the invalid field.
+        DrakeTeleopError: with the invalid field.
     """
     expect((str, Path), path, "study")
     names = ExperimentNames()

@@ -1,7 +1,6 @@
 """Experiment of one participant, in place of `Live`.
 
-Each interval is a `Live` with its own record, which `run --inputs` repeats. The page receives the
-rendered force for the display, but no other force, condition or stimulus.
+Each interval is a recorded `Live`. The page receives only the rendered force.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rows without the forces that the 3D scene would draw."""
+    """Return rows without the forces of the 3D scene."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
@@ -49,16 +48,7 @@ class Guided:
 
     Attributes:
         refused: number of invalid messages.
-        requested_scene: always "", there are no scenes.
-
-    Args:
-        procedure: of the participant.
-        stations: of each task and condition.
-        scenarios: of the tasks.
-        store: of the trials; the drives are recorded in its folder.
-        shows: scene's part of a frame, for each task.
-        now: the clock [s].
-        link: to a haptic device.
+        requested_scene: always "".
     """
 
     def __init__(
@@ -81,7 +71,6 @@ class Guided:
         self._prepare(now)
 
     def _prepare(self, now: float) -> None:
-        """Start the station of the next interval."""
         procedure = self._procedure
         trial, self._prepared = procedure.trial, procedure.prepared_intervals
         self._apparatus = self._stations[trial.task, trial.condition]
@@ -129,7 +118,7 @@ class Guided:
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; after the driver's, the trial starts again."""
+        """Remove a page; after the driver's, the trial restarts."""
         self._clients.remove(client)
         if client == self._driver:
             self._remove_driver(now)
@@ -150,7 +139,7 @@ class Guided:
 
     @contextmanager
     def _keep_write_error(self) -> Iterator[None]:
-        """Keep a `CannotWrite` for `tick`, which ends the experiment with it."""
+        """Keep a `CannotWrite` for `tick`."""
         try:
             yield
         except CannotWrite as error:
@@ -202,10 +191,10 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate the due slices; return a frame if one is due.
+        """Simulate the due slices; return a due frame.
 
         Raises:
-            CannotWrite: if a trial or a drive cannot be written.
+            CannotWrite: if the disk is full.
         """
         if self._write_error:
             raise CannotWrite(self._write_error)
@@ -236,7 +225,7 @@ class Guided:
         self._prepare_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for the pages."""
+        """Return the present frame for pages."""
         inner = self._live.frame()
         felt = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
@@ -266,11 +255,7 @@ class Guided:
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a message; None without any.
-
-    Returns:
-        Any of "set" and "rates" (numbers of `HAND`), "drive", "go" (True), "answer" (1 or 2).
-    """
+    """Return the valid requests of a message: set, rates, drive, go, answer."""
     message = parse(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

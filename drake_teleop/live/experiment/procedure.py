@@ -1,7 +1,6 @@
-"""Sequence of a participant's trials; without page, clock and station.
+"""Sequence of a participant's trials, drawn from the seed and the participant's number.
 
-The order is drawn from the seed and the participant's number: the tasks, and for each task
-practice and then rounds with every condition once.
+Each task has practice and then rounds with every condition once.
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ class Trial:
 
     Attributes:
         task, condition: index in the experiment.
-        practice: whether it is not evaluated.
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
     """
 
@@ -45,7 +43,7 @@ class IntervalResult:
     Attributes:
         level: of the stimulus; 0 without one.
         force_N: largest contact force at the tool.
-        valid: False without contact; the trial is then repeated.
+        valid: False without contact.
         done: whether the tool reached the floor of the slot.
         time_s: until then.
         lost_s: simulation time behind the clock.
@@ -60,7 +58,7 @@ class IntervalResult:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """Return all trials of a participant, in order."""
+    """Return all trials of a participant."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -78,15 +76,15 @@ def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
 
 
 class Procedure:
-    """State of one participant in an experiment; it continues after the stored rows.
+    """State of a participant, after the stored rows.
 
     Attributes:
         phase: `CONSENT` to `END`.
-        interval: 1 or 2 of the trial; 1 for peg in slot.
-        level: intended level of the trial's stimulus.
-        prepared_intervals: number of intervals prepared so far.
-        said: whether the last answer was right, for practice.
-        again: whether the trial is repeated, because the tool touched nothing.
+        interval: 1 or 2.
+        level: intended, of the trial.
+        prepared_intervals: number so far.
+        said: whether the last answer was right.
+        again: whether the trial is repeated for lack of contact.
     """
 
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
@@ -108,7 +106,7 @@ class Procedure:
 
     @property
     def number(self) -> int:
-        """Number of the trial, from 0; at the end the number of trials."""
+        """Number of the trial, from 0."""
         return len(self._rows)
 
     @property
@@ -128,7 +126,7 @@ class Procedure:
 
     @property
     def expected_force(self) -> float:
-        """Median contact force of the participant so far [N]."""
+        """Median contact force so far [N]."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))
@@ -154,7 +152,7 @@ class Procedure:
             self._next_trial()
 
     def finish_interval(self, felt: IntervalResult) -> None:
-        """End the present interval with its result."""
+        """End the present interval."""
         self._felt[self.interval - 1] = felt
         if not felt.valid:
             self._new_trial()
@@ -178,7 +176,7 @@ class Procedure:
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """Store the interval that the participant chose, in the phase `ANSWER`."""
+        """Store the chosen interval in the phase `ANSWER`."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 
@@ -229,7 +227,7 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """Return the state that the participant may see."""
+        """Return the state for the participant."""
         number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {

@@ -2,10 +2,9 @@
 
     d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2)
 
-At the threshold d' is 1 (76 % correct without lapses). Power law: Foley and Legge, Vision Research
-21, 1981. Phi: Green and Swets, Signal detection theory and psychophysics, 1966. The level is chosen
-by the psi method (Kontsevich and Tyler, Vision Research 39, 1999) with slope and lapse marginalised
-(Prins, J. Vision 13(7), 2013).
+Power law: Foley and Legge, Vision Research 21, 1981. Phi: Green and Swets, Signal detection
+theory and psychophysics, 1966. Psi method: Kontsevich and Tyler, Vision Research 39, 1999; with
+marginalised slope and lapse: Prins, J. Vision 13(7), 2013.
 """
 
 from __future__ import annotations
@@ -29,14 +28,14 @@ _LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """Return P(correct) for levels >= 0; the arguments broadcast."""
+    """Return P(correct) for levels >= 0."""
     d = (level / threshold) ** slope
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Median of a quantity, and its 2.5 % and 97.5 % quantiles."""
+    """Median, and 2.5 % and 97.5 % quantiles."""
 
     value: float
     low: float
@@ -44,11 +43,7 @@ class Estimate:
 
 
 class Psi:
-    """Posterior of threshold, slope and lapse on a grid, of one participant in one condition.
-
-    Args:
-        low, high: range of levels, both > 0.
-    """
+    """Posterior of threshold, slope and lapse on a grid, for levels `low` > 0 to `high`."""
 
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _LEVELS)
@@ -66,10 +61,7 @@ class Psi:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
-        """Return the level with the least expected entropy of the threshold.
-
-        This maximises the mutual information of answer and threshold.
-        """
+        """Return the level with the least expected entropy of the threshold."""
         posterior = self._posterior.reshape(_THRESHOLDS, -1)
         right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
         wrong = posterior.sum(axis=1) - right
@@ -87,7 +79,7 @@ class Psi:
         self._posterior /= self._posterior.sum()
 
     def threshold(self) -> Estimate:
-        """Return the threshold in the unit of the levels."""
+        """Return the threshold."""
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])

@@ -1,9 +1,8 @@
-"""Results of an experiment: thresholds, d', times and forces with 95 % intervals.
+"""Thresholds, d', times and forces of an experiment with 95 % intervals.
 
-A row of `results.csv` is a quantity of a participant, task and condition; participant 0 stands for
-all participants. For one participant, threshold and d' are posterior medians (`Psi`), times and
-forces geometric means with t intervals of the logarithm, and shares have Wilson intervals. For all
-participants it is the geometric mean (share: mean) with its t interval. d' is at the middle level.
+Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
+forces geometric means with t intervals of the logarithm. Participant 0 is the (geometric) mean of
+all, with its t interval.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the table; participant 0 stands for all participants."""
+    """Row of the table; participant 0 stands for all."""
 
     task: str
     condition: str

@@ -1,4 +1,4 @@
-"""Page of an experiment: that of `drive` with questions in place of its instruments."""
+"""Page of an experiment."""
 
 from __future__ import annotations
 
@@ -21,14 +21,7 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Experiment whose page is open to one participant.
-
-    Args:
-        experiment, scenarios: from `LoadExperiment`.
-        store: of the trials.
-        participant: number.
-        port, device: as of `drive`.
-    """
+    """Experiment whose page is open to one participant."""
 
     def __init__(
         self,
@@ -81,10 +74,6 @@ def serve_experiment(
     device: str | None,
 ) -> None:
     """Serve the page until Ctrl-C or SIGTERM.
-
-    Args:
-        experiment, scenarios, store, participant, port, device: as of `ExperimentDrive`.
-        browser: whether to open the page.
 
     Raises:
         DrakeTeleopError: why the drive had stopped.

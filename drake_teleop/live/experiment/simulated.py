@@ -1,9 +1,8 @@
-"""Simulated participants: an observer with noise compares the forces of a simulated station.
+"""Simulated participants: an observer with noise compares rendered forces.
 
-In each interval a scripted hand presses down and up, or moves back and forth. The response is the
-largest change of the rendered force plus normal noise; the interval with the larger one is the
-answer. The peg is inserted by the simulated operator of `docs/operator.md`. Participants differ
-only in their noise; they do not learn or tire.
+A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
+larger response, the largest change of the rendered force plus normal noise. The simulated operator
+inserts the peg.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ _ROWS_PERIOD_MS = 200
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """Return the station of each task and condition; identify unknown loads."""
+    """Return the station of each task and condition."""
     found = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
@@ -56,7 +55,7 @@ def all_apparatus(
 
 
 def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with a seed for this participant, trial and interval."""
+    """Return the scenario with a seed for this interval."""
     number = 2 * procedure.number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -70,15 +69,7 @@ def take_part(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run the remaining trials of a simulated participant.
-
-    Args:
-        experiment: with its `simulated`.
-        scenarios, stations: as of `all_apparatus`.
-        store: of the trials.
-        participant: number.
-        progress: called with the numbers of finished and of all trials.
-    """
+    """Run the remaining trials; `progress` receives finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END:
@@ -105,7 +96,7 @@ def compare_responses(
 ) -> int:
     """Return the interval, 1 or 2, with the larger noisy response.
 
-    With equal standard deviations s, d' = (r1 - r2) / s: a difference of `noise` at rest is d' = 1.
+    A difference of `noise` at rest is d' = 1.
     """
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))

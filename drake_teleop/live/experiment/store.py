@@ -1,7 +1,4 @@
-"""Trials of an experiment on disk: `participants/03.csv`, complete after each trial.
-
-The file is replaced after each trial; a kill loses only the present trial.
-"""
+"""Trials of an experiment on disk: `participants/03.csv`, complete after each trial."""
 
 from __future__ import annotations
 
@@ -28,14 +25,12 @@ class Row:
     """A finished trial.
 
     Attributes:
-        trial: number, from 0.
-        task, condition: names.
         practice: 1 if it is not evaluated.
         level: measured stimulus: contact force at the tool [N], mass at the hand [kg].
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
-        answer: interval of the answer; 0 for peg in slot.
-        correct: 1 if right; for peg in slot, if the tool reached the floor.
-        time_s: of the answer after the intervals; for peg in slot, until the floor.
+        answer: interval of the answer.
+        correct: 1 if right, or if the tool reached the floor.
+        time_s: of the answer, or until the floor.
         force_N: largest contact force at the tool.
         lost_s: simulation time behind the clock.
     """
@@ -61,7 +56,7 @@ _SCHEMA: dict[str, type[pl.DataType]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """Trials in the folder of the results."""
+    """Trials in a folder."""
 
     folder: Path
 
@@ -70,12 +65,12 @@ class Store:
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
-        """Return the sorted numbers of participants with a trial."""
+        """Return the participants with a trial."""
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
     def rows(self, participant: int) -> list[Row]:
-        """Return a participant's trials, in order.
+        """Return a participant's trials.
 
         Raises:
             DrakeTeleopError: with a damaged file.
