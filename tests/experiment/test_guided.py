@@ -6,13 +6,12 @@ import json
 
 import numpy as np
 import pytest
-from drake_teleop.live.experiment.guided import HAND, parse_study
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.live.experiment.guided import Guided
+from drake_teleop.live.experiment.guided import HAND, Guided, parse_study
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.session import read_drive

@@ -27,7 +27,7 @@ from drake_teleop.live.device_packets import (
     unpacked_force,
     unpacked_state,
 )
-from drake_teleop.live.haply import HaplyDevice, read_message, force_message
+from drake_teleop.live.haply import HaplyDevice, force_message, read_message
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
 from drake_teleop.live.scenarios import with_device
