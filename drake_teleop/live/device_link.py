@@ -149,13 +149,10 @@ class DeviceLink:
 
     def status_text(self) -> str:
         """Return the state at the last `poll` in words."""
-        return self._lateness_text() + self.refused_text()
-
-    def refused_text(self) -> str:
-        """Return the number of refused packets and the last reason, or ""."""
         if not self.refused:
-            return ""
-        return f". Refused packets: {self.refused}; the last one {self.refusal}"
+            return self._lateness_text()
+        reason = f"the last one {self.refusal}"
+        return f"{self._lateness_text()}. Refused packets: {self.refused}; {reason}"
 
     def _lateness_text(self) -> str:
         now = self._polled_at

@@ -22,7 +22,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.fault import Fault, sound
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.live.station_swap import CrossFade
+from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD
 from drake_teleop.station.operator.operator import HandImpedance
@@ -207,12 +207,10 @@ def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> D
         "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
     )
     builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
-    felt = master.GetInputPort("wrench_command")
+    wrench = master.GetInputPort("wrench_command")
     if cross_fade:
-        block = builder.AddNamedSystem("cross_fade", CrossFade(1 / scenario.rates.hand_hz))
-        builder.Connect(block.get_output_port(), felt)
-        felt = block.get_input_port()
-    builder.ExportInput(felt, "wrench_command")
+        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
+    builder.ExportInput(wrench, "wrench_command")
     builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
     export(builder, inner_side, "pose_command")
     for index in range(master.num_output_ports()):

@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
-from drake_teleop.live.station_swap import CrossFade
+from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (
     HandImpedance,
@@ -28,17 +28,15 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 
 # Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
 # for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
 # half the distance in 46 ms. After a change of the grip the path is slower.
-_TRANSLATION_POLE, _SLOW_POLE, _ROTATION_POLE = (
-    2 * math.pi * 16.0,
-    2 * math.pi * 5.0,
-    2 * math.pi * 5.0,
-)
+_TRANSLATION_POLE = 2 * math.pi * 16.0
+_SLOW_POLE = _ROTATION_POLE = 2 * math.pi * 5.0
 #: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
 #: stop the error is at most the distance of 5 ms.
 LEAD_TIME_S = 2.5 / _TRANSLATION_POLE
@@ -215,13 +213,11 @@ def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagr
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
     side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
-    felt = side.GetInputPort("wrench_command")
+    wrench = side.GetInputPort("wrench_command")
     if cross_fade:
-        block = builder.AddNamedSystem("cross_fade", CrossFade(1 / scenario.rates.hand_hz))
-        builder.Connect(block.get_output_port(), felt)
-        felt = block.get_input_port()
-    builder.ExportInput(felt, "wrench_command")
+        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
+    builder.ExportInput(wrench, "wrench_command")
     builder.ExportInput(side.GetInputPort("clutch"), "clutch")
     for index in range(side.num_output_ports()):
-        builder.ExportOutput(side.get_output_port(index), side.get_output_port(index).get_name())
+        export(builder, side, side.get_output_port(index).get_name())
     return builder.Build()

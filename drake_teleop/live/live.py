@@ -21,7 +21,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
-from drake_teleop.live.inputs import CHOICES, NAMES, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.inputs import CHOICES, MAX_DURATION_MS, NAMES, RANGES, SLICE_MS, Inputs
 from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.scenarios import SCENES
@@ -39,7 +39,6 @@ TOUCH_FORCE_N = 0.12
 # Time without a driver until the simulation stops [s]; most slices between two polls of messages.
 _SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
-_LONGEST_MS = 36_000_000
 _RELEASED = {"held": 0, "clutch": 0}
 # Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
@@ -85,7 +84,6 @@ class Live:
         self._link, self._slice_ms = link, SLICE_MS if link is None else TICK_MS
         self.refused, self.requested_scene, self.scene = 0, "", SCENES[0]
         self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
-        self._clients: list[int] = []
         self._driver: int | None = None
         self._drives, self._paused, self.stopped = 0, False, ""
         self.recorded: list[str] = []
@@ -99,14 +97,15 @@ class Live:
         folder = None if self._record is None else _free_folder(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
+        by_device = self._link is not None
         self._session = Session(
-            self._scenario, self._load, log=log, record=folder, device=self._link is not None
+            self._scenario, self._load, log=log, record=folder, device=by_device
         )
         self._folder = "" if folder is None else str(folder)
         self._session.apply(self._session.inputs.changed(self._initial))
         if self._link is not None:
             self._link.reset_origin(now)
-        scaling, by_device = self._scenario.kinematic_scaling, self._link is not None
+        scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
         self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
         self._cockpit, self.stopped = Cockpit(self._scenario), ""
@@ -155,13 +154,11 @@ class Live:
 
     def join(self, client: int, now: float) -> None:
         """Add a page; the first one drives."""
-        self._clients.append(client)
         if self._driver is None:
             self._set_driver(client, now)
 
     def leave(self, client: int, now: float) -> None:
         """Remove a page; the driver's hand lets go."""
-        self._clients.remove(client)
         if client == self._driver:
             self._driver, self._alone_since = None, now
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
@@ -196,10 +193,8 @@ class Live:
 
     def _set_driver(self, client: int, now: float) -> None:
         self._driver = client
-        self._requested, self._rates = (
-            self._session.inputs_at_stylus().changed({"clutch": 1}),
-            RateInputs(),
-        )
+        self._requested = self._session.inputs_at_stylus().changed({"clutch": 1})
+        self._rates = RateInputs()
         if self._asleep:
             self.pace.start(now)
         self._asleep = False
@@ -236,9 +231,8 @@ class Live:
         show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
         if now < self._frame_due and not show_now:
             return None
-        self._frame_due = (
-            now + 1.5 * FRAME if show_now else max(self._frame_due + FRAME, now - FRAME)
-        )
+        scheduled = max(self._frame_due + FRAME, now - FRAME)
+        self._frame_due = now + 1.5 * FRAME if show_now else scheduled
         self._last_frame_at, self._show_now = now, False
         return self.frame()
 
@@ -279,7 +273,7 @@ class Live:
             self._pressed = pressed
         if self._link is not None and not self.stopped:
             self._link.send(self._session.force())
-        if self._session.ms >= _LONGEST_MS:
+        if self._session.ms >= MAX_DURATION_MS:
             self.stopped = "ten hours are over"
 
     def _limited(self, wanted: Inputs) -> Inputs:

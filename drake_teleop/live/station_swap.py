@@ -14,7 +14,9 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     Diagram,
+    DiagramBuilder,
     DiscreteValues,
+    InputPort,
     LeafSystem,
     System,
 )
@@ -97,6 +99,13 @@ def _cross_fade_into(wrench, before, share, most, out):
 @njit(cache=True)
 def _force(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
+
+
+def add_cross_fade(builder: DiagramBuilder, port: InputPort, period: float) -> InputPort:
+    """Add a `CrossFade` in front of `port`, and return its input port."""
+    block = builder.AddNamedSystem("cross_fade", CrossFade(period))
+    builder.Connect(block.get_output_port(), port)
+    return block.get_input_port()
 
 
 class CrossFade(LeafSystem):

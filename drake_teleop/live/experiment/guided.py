@@ -64,7 +64,6 @@ class Guided:
         self.refused, self.requested_scene = 0, ""
         self._procedure, self._stations, self._scenarios = procedure, stations, scenarios
         self._drives, self._shows, self._link = store.folder / "drives", shows, link
-        self._clients: list[int] = []
         self._driver: int | None = None
         self._write_error = ""
         self._intervals, self._since, self._frame_due = 0, now, now
@@ -108,7 +107,6 @@ class Guided:
 
     def join(self, client: int, now: float) -> None:
         """Add a page; the first one drives."""
-        self._clients.append(client)
         if self._driver is None:
             self._set_driver(client, now)
 
@@ -119,7 +117,6 @@ class Guided:
 
     def leave(self, client: int, now: float) -> None:
         """Remove a page; after the driver's, the trial restarts."""
-        self._clients.remove(client)
         if client == self._driver:
             self._remove_driver(now)
 

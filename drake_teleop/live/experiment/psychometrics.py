@@ -10,7 +10,7 @@ marginalised slope and lapse: Prins, J. Vision 13(7), 2013.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,7 @@ def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Arr
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(NamedTuple):
     """Median, and 2.5 % and 97.5 % quantiles."""
 
     value: float

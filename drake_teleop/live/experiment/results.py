@@ -58,20 +58,15 @@ def results(experiment: Experiment, store: Store) -> list[Result]:
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
                 for quantity, estimate in _participant_estimates(task, done).items():
-                    values = (estimate.value, estimate.low, estimate.high)
-                    result = Result(kind, condition.name, n, len(done), quantity, *values)
+                    result = Result(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
                     over = _mean_with_interval([r.value for r in one], share=quantity == _SHARE)
                     trials = sum(r.trials for r in one)
-                    found.append(Result(kind, condition.name, 0, trials, quantity, *_triple(over)))
+                    found.append(Result(kind, condition.name, 0, trials, quantity, *over))
     return found
-
-
-def _triple(estimate: Estimate) -> tuple[float, float, float]:
-    return estimate.value, estimate.low, estimate.high
 
 
 def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:

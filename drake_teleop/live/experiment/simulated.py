@@ -28,7 +28,7 @@ from drake_teleop.live.experiment.procedure import (
     Procedure,
 )
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.inputs import LENGTH, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -38,7 +38,6 @@ from drake_teleop.station.task_measures import contact_force, task_measures
 
 # Start of the hand's motion [s].
 _MOTION_START_S = 0.4
-_UNIT = 1e-5  # m, unit of the inputs
 _ROWS_PERIOD_MS = 200
 
 
@@ -122,7 +121,7 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
             place = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
         else:
             place = {"z": -observer.reach * 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))}
-        hand = {name: value / _UNIT for name, value in place.items()}
+        hand = {name: value / LENGTH for name, value in place.items()}
         session.apply(session.inputs.changed(stimulus | hand))
         session.advance(SLICE_MS)
         if session.ms % _ROWS_PERIOD_MS == 0:

@@ -97,15 +97,12 @@ class Store:
 
     def table(self) -> pl.DataFrame:
         """Return all trials, with the column participant."""
-        parts = [
-            pl.DataFrame(
-                [dataclasses.asdict(row) for row in self.rows(n)], schema=_SCHEMA
-            ).insert_column(0, pl.Series("participant", [n]).new_from_index(0, len(self.rows(n))))
+        rows = [
+            {"participant": n} | dataclasses.asdict(row)
             for n in self.participants()
+            for row in self.rows(n)
         ]
-        return (
-            pl.concat(parts) if parts else pl.DataFrame(schema={"participant": pl.Int64, **_SCHEMA})
-        )
+        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_SCHEMA})
 
 
 @contextmanager
