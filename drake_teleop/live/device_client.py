@@ -166,7 +166,9 @@ def open_device(address: str, grip: str, depth: float) -> Device:
         return RealTimeDevice(VirtualDevice(tapping(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
-    raise DrakeTeleopError("is no device", where=address, remedy="virtual, or haply://HOST:PORT")
+    raise DrakeTeleopError(
+        "is not a device", where=address, remedy="use virtual or haply://HOST:PORT"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -50,9 +50,9 @@ class DeviceLink:
         host, port = endpoint(address)
         if not _is_loopback(host):
             raise DrakeTeleopError(
-                "is not this machine: whoever can send there moves the arm",
+                "is not an address of this machine (other senders could move the arm)",
                 where=address,
-                remedy="give udp://127.0.0.1:PORT, and run the device's client here",
+                remedy="use udp://127.0.0.1:PORT, and run the device's client on this machine",
             )
         self._socket = listening(host, port)
         self._socket.setblocking(False)
@@ -196,9 +196,9 @@ class DeviceConnection:
         kind = address.partition("://")[0]
         if kind not in ("udp", "haply"):
             raise DrakeTeleopError(
-                "is no haptic device",
+                "is not a haptic device address",
                 where=address,
-                remedy="give udp://127.0.0.1:PORT or haply://localhost:10001",
+                remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
             )
         self.link = DeviceLink(address if kind == "udp" else f"udp://{THIS_MACHINE}:0")
         self._client: subprocess.Popen[bytes] | None = None

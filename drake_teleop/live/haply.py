@@ -106,7 +106,9 @@ class HaplyDevice:
         except TimeoutError:
             return None
         except ConnectionClosed as error:
-            raise DrakeTeleopError("the service has gone", where="haply") from error
+            raise DrakeTeleopError(
+                "the service has closed the connection", where="haply"
+            ) from error
         if message is None:
             return None
         self._device = message.device

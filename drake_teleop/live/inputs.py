@@ -204,12 +204,12 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:
-        raise _cannot_repeat("has numbers for names, and no version that gives them meaning", path)
+        raise _cannot_repeat("has choices as numbers and no version of this package", path)
     if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
-            "is no record of a drive",
+            "is not a record of a drive",
             where=str(path),
-            remedy=f"its columns are {', '.join(_COLUMNS)}",
+            remedy=f"use the columns {', '.join(_COLUMNS)}",
         )
     recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
@@ -220,7 +220,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             raise _cannot_repeat(changed if name == "files" else what, path)
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError("ends when it begins", where=str(path))
+        raise DrakeTeleopError("contains no simulated time", where=str(path))
     return changes
 
 
@@ -243,12 +243,12 @@ def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Input
         try:
             ms, *values = map(int, line)
         except ValueError:
-            raise DrakeTeleopError("has something other than whole numbers", where=where) from None
+            raise DrakeTeleopError("has a value that is not a whole number", where=where) from None
         if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
-                f"{ms} ms is no time here",
+                f"{ms} ms is not a valid time",
                 where=where,
-                remedy="times are whole milliseconds, from 0 on, in order",
+                remedy="use increasing times in whole milliseconds from 0",
             )
         earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
         for name, (low, high) in RANGES.items():

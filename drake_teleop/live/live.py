@@ -274,7 +274,7 @@ class Live:
         if self._link is not None and not self.stopped:
             self._link.send(self._session.force())
         if self._session.ms >= MAX_DURATION_MS:
-            self.stopped = "ten hours are over"
+            self.stopped = "the limit of ten hours is reached"
 
     def _limited(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None

@@ -205,8 +205,8 @@ class LiveDrive:
                 logger=_LOGGER,
             )
         except OSError as error:
-            what = f"cannot be listened to ({error.strerror})"
-            remedy = "give another --port"
+            what = f"cannot be opened ({error.strerror})"
+            remedy = "use another --port"
             raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
         self._port = server.sockets[0].getsockname()[1]
         self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
@@ -298,11 +298,17 @@ class LiveDrive:
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"The address needs its token.\n")
+            return _response(
+                HTTPStatus.FORBIDDEN, "text/plain", b"The address requires its token.\n"
+            )
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
-                return _response(HTTPStatus.FORBIDDEN, "text/plain", b"Another page's.\n")
+                return _response(
+                    HTTPStatus.FORBIDDEN,
+                    "text/plain",
+                    b"Only this server's page may open the socket.\n",
+                )
             return None
         if path == "/":
             page = self._page()
@@ -315,7 +321,7 @@ class LiveDrive:
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
             return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
-        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
+        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
 
     async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
@@ -334,7 +340,9 @@ class LiveDrive:
             del self._pages[connection]
             live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _print_note("no page is open: nothing runs" + _OR_DEVICE[self._device is not None])
+                _print_note(
+                    "no page is open: the simulation waits" + _OR_DEVICE[self._device is not None]
+                )
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
@@ -422,7 +430,7 @@ def drive_command(
 
 def start_condition(device: str | None) -> str:
     """Return for which event a drive waits."""
-    return "nothing runs until that page is open" + _OR_DEVICE[device is not None]
+    return "the simulation waits until this page is open" + _OR_DEVICE[device is not None]
 
 
 def _print_note(text: str) -> None:

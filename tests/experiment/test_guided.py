@@ -1,4 +1,4 @@
-"""An experiment in virtual time, driven by the page's messages: what a page is told, and can do."""
+"""An experiment in virtual time, driven by messages of the page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXPERIMENT = Experiment(
 
 
 class Person:
-    """A participant with a clock of its own, who presses when something is asked."""
+    """Participant with a clock, who presses in each interval."""
 
     def __init__(self, folder) -> None:
         scenario = LoadScenario("contact_transition")
@@ -57,7 +57,7 @@ class Person:
         self.guided.handle_message(client, json.dumps(message), self.now)
 
     def wait(self, phase: str, seconds: float = 3.0) -> None:
-        """Until the procedure has come there; time goes by as fast as it is simulated."""
+        """Simulate until a phase of the procedure."""
         end = self.now + seconds
         while self.procedure.phase != phase and self.now < end:
             self.now += 0.005
@@ -73,16 +73,16 @@ class Person:
 
 
 @pytest.mark.slow
-def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
+def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person = Person(tmp_path)
-    person.say(answer=1)  # nobody asked
+    person.say(answer=1)  # not in the phase of an answer
     person.begin()
     person.say(set={"z": -1500, "sigma": 300, "gamma": 0})
     person.wait("gap")
     person.wait("interval")
     person.say(set={"z": -2500})
     person.wait("answer")
-    person.say(client=2, answer=1)  # who only watches
+    person.say(client=2, answer=1)  # a spectator
     assert person.procedure.phase == "answer"
     person.say(answer=2)
     (row,) = person.store.rows(1)
@@ -100,20 +100,20 @@ def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
 
 
 @pytest.mark.slow
-def test_when_the_page_is_closed_the_trial_begins_again(tmp_path):
+def test_trial_restarts_after_the_page_is_closed(tmp_path):
     person = Person(tmp_path)
     person.begin()
     person.say(set={"z": -1500})
     person.wait("gap")
     person.guided.leave(1, person.now)
     assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
-    person.say(client=2, go=True)  # is not there
+    person.say(client=2, go=True)  # has left
     person.guided.join(3, person.now)
     person.say(client=3, go=True)
     assert person.procedure.phase == "interval" and person.store.participants() == []
 
 
-def test_10000_messages_change_nothing_but_what_they_may():
+def test_10000_random_messages_change_only_permitted_inputs():
     rng = np.random.default_rng(0)
     pieces = [
         "{",

@@ -1,4 +1,4 @@
-"""A participant's way through an experiment: its order, what it learns, and what a kill leaves."""
+"""Sequence of an experiment: order, estimates, and continuation after a kill."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SHORT = dataclasses.replace(
 
 
 def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
-    """A participant whose answers come from the level; or until a number of trials is done."""
+    """Run a participant whose answers depend on the level, or until a number of trials."""
     while procedure.phase != "end" and procedure.number < most:
         if procedure.phase == "interval":
             felt = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
@@ -54,7 +54,7 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
             procedure.go()
 
 
-def test_order_is_drawn_for_each_participant_and_each_round_has_every_condition_once():
+def test_order_is_random_and_each_round_has_every_condition_once():
     one, other = trials_of(SMALL, 1), trials_of(SMALL, 2)
     assert one == trials_of(SMALL, 1) != other
     counted = [t.condition for t in one if t.task == 0 and not t.practice]
@@ -66,8 +66,8 @@ def test_order_is_drawn_for_each_participant_and_each_round_has_every_condition_
     assert 0.4 < np.mean(np.array(signals) == 1) < 0.6
 
 
-def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
-    """A kill is a new process, which has nothing but the folder; an unfinished trial is lost."""
+def test_participant_continues_with_the_same_levels(tmp_path):
+    """A new process has only the folder; an unfinished trial is lost."""
     whole, cut = Store(tmp_path / "whole"), Store(tmp_path / "cut")
     go_through(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
     rng = np.random.default_rng(1)
@@ -83,7 +83,7 @@ def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
 
 
 def goes_through(folder: str) -> None:
-    """A participant with answers that a trial's number tells, who says each trial that is over."""
+    """Run a participant with answers by trial number, and print each trial."""
     with open_results(Path(folder), SHORT) as store:
         procedure = Procedure(SHORT, 1, store)
         while procedure.phase != "end":
@@ -103,7 +103,7 @@ def goes_through(folder: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_experiment_has_all_trials_that_were_over_and_goes_on(tmp_path):
+def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     code = "import sys; from test_procedure import goes_through; goes_through(sys.argv[1])"
     command = [sys.executable, "-c", code, str(tmp_path / "cut")]
     folder = Path(__file__).parent
@@ -120,12 +120,12 @@ def test_a_killed_experiment_has_all_trials_that_were_over_and_goes_on(tmp_path)
     assert cut.rows(1) == Store(tmp_path / "whole").rows(1)
 
 
-def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path):
+def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_path):
     procedure = Procedure(SMALL, 1, Store(tmp_path))
     before = procedure.number
     procedure.go(), procedure.go(), procedure.go()
     assert procedure.phase == "interval"
-    procedure.answer(1, 0.1)  # nobody was asked
+    procedure.answer(1, 0.1)  # not in the phase of an answer
     procedure.finish_interval(IntervalResult(valid=False))
     assert (procedure.phase, procedure.again, procedure.number) == ("ready", True, before)
     go_through(procedure, np.random.default_rng(0), 2.0)
@@ -133,9 +133,7 @@ def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path
     assert len(counted) == 3 * (6 + 5 + 2)
 
 
-def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
-    """Blind: with each condition in place of every other, the page is told the same."""
-
+def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
     def told(names: list[int]) -> list[dict]:
         conditions = [SMALL.conditions[k] for k in names]
         other = dataclasses.replace(SMALL, conditions=conditions)
@@ -157,7 +155,7 @@ def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
     assert not {"condition", "level", "signal"} & set(told([0, 1, 2])[0])
 
 
-def test_a_folder_is_one_experiments_and_a_damaged_file_is_named(tmp_path):
+def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
     with open_results(tmp_path, SMALL) as store:
         with pytest.raises(DrakeTeleopError, match="another process"):
             open_results(tmp_path, SMALL).__enter__()
@@ -175,16 +173,19 @@ def test_a_folder_is_one_experiments_and_a_damaged_file_is_named(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("tasks: []", "tasks: there is none"),
-        ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "nothing of a slot"),
+        ("tasks: []", "tasks: is empty"),
+        ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "has no slot"),
         ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
-        ("tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]", "no range"),
-        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "its own name"),
+        (
+            "tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]",
+            "too small a range",
+        ),
+        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "not unique"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, sigma: 1, eta: 0.5}]", "eta"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_field(tmp_path, text, said):
+def test_invalid_file_is_an_error_with_its_field(tmp_path, text, said):
     (tmp_path / "e.yaml").write_text(text)
     with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{said}|{said}.*e\.yaml"):
         LoadExperiment(tmp_path / "e.yaml")

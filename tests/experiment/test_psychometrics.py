@@ -1,4 +1,4 @@
-"""What answers say about a threshold, held against known thresholds and a slow calculation."""
+"""Thresholds from answers, compared with known thresholds and a direct calculation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def test_the_threshold_is_where_d_prime_is_1():
     assert correct_probability(1e6, 2.0, 1.7, 0.04) == pytest.approx(0.98)
 
 
-def test_the_level_asked_for_tells_most_about_the_threshold():
+def test_next_level_minimises_the_expected_entropy():
     psi = Psi(0.2, 20.0)
     for level, correct in ((2.0, True), (1.0, False), (0.9, True)):
         psi.update(level, correct)
 
     def expected(level: float) -> float:
-        """Entropy of the threshold after the answer, by what each answer makes of the grid."""
+        """Return the expected entropy of the threshold, by explicit updates of the grid."""
         posterior = psi._posterior
         p = float((psi._probability(level) * posterior).sum())
         after = []
@@ -35,8 +35,8 @@ def test_the_level_asked_for_tells_most_about_the_threshold():
     assert psi.next_level() == min(psi.levels, key=expected)
 
 
-def test_thresholds_are_found_and_lie_in_their_intervals():
-    """Of 200 participants 96 % (benchmarks/participants.py); of these 30 all but two."""
+def test_intervals_contain_the_true_thresholds():
+    """96 % of 200 participants (benchmarks/participants.py), 28 of these 30."""
     rng = np.random.default_rng(0)
     held, off = [], []
     for _ in range(30):

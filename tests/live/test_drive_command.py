@@ -1,4 +1,4 @@
-"""`drake-teleop drive` as the pages have it typed, with a client in the place of the browser."""
+"""Documented shell commands of `drake-teleop drive`, with a client in place of the browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
-    """What the browser does when it is told to open the page, and then Ctrl-C; it keeps frames."""
+    """Replace the browser by a client that collects frames and then sends Ctrl-C."""
     monkeypatch.chdir(tmp_path)
     for room in ("live.server", "experiment.apparatus"):
         monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda *_: load)
@@ -72,7 +72,7 @@ def test_a_drive_is_recorded_and_repeated(page, capsys):
     type_in("docs/live.md", "drake-teleop drive contact_transition --record")
     said, stages = capsys.readouterr()
     assert stages.startswith("Prepare the station and its 3D scenes ...\n")
-    assert "nothing runs until that page is open; Ctrl-C ends it" in said
+    assert "the simulation waits until this page is open; Ctrl-C ends it" in said
     assert "repeat it: drake-teleop run --inputs out/drive" in said
     assert frames[-1]["inputs"]["z"] == -3000
     type_in("docs/live.md", "drake-teleop run --inputs")
@@ -103,8 +103,8 @@ def test_a_virtual_device_is_the_hand(page, capfd):
     assert json.loads(figures)["largest_force_n"] > 0.0
 
 
-def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, monkeypatch):
-    monkeypatch.setattr(replay, "Arrow", None)  # eyes would tell, were it called
+def test_experiment_starts_with_consent_and_draws_no_force(page, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "Arrow", None)  # fails if an arrow is drawn
     before, opened = ports(), list[int]()
     frames = page(
         '{"go": true}',
@@ -120,14 +120,14 @@ def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, m
 
 
 def drive(*arguments: str) -> object:
-    """The exit status."""
+    """Return the exit status."""
     with hearing_ctrl_c(), pytest.raises(SystemExit) as ended:
         main(["drive", "contact_transition", *arguments])
     return ended.value.code
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_drive_says_what_ended_it(page, capsys, stop):
+def test_drive_reports_the_signal_that_ended_it(page, capsys, stop):
     frames = page(stop=stop)
     assert drive("--record", "here") == 0
     said = capsys.readouterr().out
@@ -138,7 +138,7 @@ def test_a_drive_says_what_ended_it(page, capsys, stop):
     assert read_drive("here").changes[-1][0] == pytest.approx(1e3 * float(seconds), abs=51)
 
 
-def test_a_drive_that_had_stopped_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
+def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
     def fail(self, ms=5):
         raise RuntimeError("joint 2\nleaves its range")
 
@@ -150,7 +150,7 @@ def test_a_drive_that_had_stopped_ends_with_the_reason_and_status_2(page, capsys
     assert said.endswith("error: drive: had stopped: joint 2 leaves its range\n")
 
 
-def test_a_record_that_is_not_complete_is_no_success(page, capsys, monkeypatch):
+def test_incomplete_record_has_status_2(page, capsys, monkeypatch):
     def fail(self):
         raise DrakeTeleopError("no space left on device", where="here/log.parquet")
 

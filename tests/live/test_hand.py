@@ -1,4 +1,4 @@
-"""The led hand: whatever turns follow, its way has no jump, and its rates are those of its pose."""
+"""Paths of the simulated hand are continuous, and their rates consistent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drake_teleop.live.hand import LiveHand
 from drake_teleop.station.operator.operator import OperatorConfig
 
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
-#: When, and where to: a turn [rad] and a place [m], both about and along other axes each time.
+#: Time [s], rotation vector [rad] and position [m] of targets, with different axes.
 TARGETS = (
     (0.0, (1.5, 0.0, 0.0), (0.2, 0.2, 0.3)),
     (0.05, (0.0, -2.0, 0.7), (0.1, 0.3, 0.3)),
@@ -19,7 +19,7 @@ TARGETS = (
 
 
 class Led:
-    """A hand on a stylus that rests, and what it wants."""
+    """Hand on a stylus at rest."""
 
     def __init__(self) -> None:
         self.hand = LiveHand(OperatorConfig(), START)
@@ -28,7 +28,7 @@ class Led:
         self.hand.GetInputPort("twist_master").FixValue(self.context, np.zeros(6))
 
     def wants(self, time: float) -> list[np.ndarray]:
-        """Quaternion (4,), place (3,) [m], twist [v; omega] (6,) and acceleration (3,) then."""
+        """Return the intended quaternion (4,), position [m], twist (6,) and acceleration (3,)."""
         self.context.SetTime(time)
         return np.split(self.hand._present_intention(self.context).copy(), [4, 7, 13])
 
@@ -38,13 +38,13 @@ class Led:
 
 
 def turned(to: np.ndarray, since: np.ndarray) -> np.ndarray:
-    """(3,) rotation vector in B [rad] from one orientation to another."""
+    """Return the rotation vector (3,) in B [rad] between two orientations."""
     return np.array(logarithm(multiply(tuple(to), conjugate(tuple(since)))))
 
 
 @pytest.fixture
 def led() -> Led:
-    """On its way to the last of the targets."""
+    """Return a hand on its way to the last of several targets."""
     led = Led()
     for time, turn, place in TARGETS:
         led.lead(time, exponential(turn), place)
@@ -52,8 +52,7 @@ def led() -> Led:
 
 
 @pytest.mark.parametrize("angle", [2.5, 0.5, 9e-3, 1e-4])
-def test_to_another_target_it_goes_on_as_it_was(led, angle):
-    """About an axis across the one that it turns about."""
+def test_new_target_keeps_position_velocity_and_acceleration(led, angle):
     orientation, place, twist, acceleration = led.wants(0.11)
     across = np.cross(twist[3:], [0.3, -0.2, 0.5])
     turn = exponential(tuple(angle / np.linalg.norm(across) * across))
@@ -68,7 +67,7 @@ def test_to_another_target_it_goes_on_as_it_was(led, angle):
 
 
 @pytest.mark.parametrize("time", [0.09, 0.12, 0.2, 0.4])
-def test_its_twist_is_the_rate_of_its_pose(led, time):
+def test_twist_is_the_derivative_of_the_pose(led, time):
     h = 1e-5
     before, after, now = led.wants(time - h), led.wants(time + h), led.wants(time)
     rate = np.concatenate([after[1] - before[1], turned(after[0], before[0])]) / (2 * h)

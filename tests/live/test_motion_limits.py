@@ -1,4 +1,4 @@
-"""Inputs move an arm no faster in slow motion than in real time."""
+"""Limits and rates of inputs are independent of the speed of the simulation."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 def place(inputs: Inputs) -> np.ndarray:
-    """[m, rad] at the hand."""
+    """Return [m, rad] at the hand."""
     return np.array([getattr(inputs, name) for name in NAMES]) * np.repeat([1e-5, 1e-4], 3)
 
 
 def at(values: np.ndarray) -> Inputs:
-    """Of [m, rad]."""
+    """Return the inputs of [m, rad]."""
     units = values / np.repeat([1e-5, 1e-4], 3)
     return Inputs().changed(dict(zip(NAMES, units.tolist(), strict=True)))
 
 
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
-    """Up to 13 m/s^2 and 50 rad/s^2; steps of 10 um in 2 ms are 2.5 m/s^2."""
     follower = MotionLimiter(slice_s, (1.0, 1.0), device=device)
     for k in range(400):
         t = k * slice_s
@@ -62,7 +61,7 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
     np.testing.assert_array_equal(path[-1], place(wanted))
 
 
-def test_it_stops_without_overshoot():
+def test_limited_motion_stops_without_overshoot():
     follower, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
         path.append(follower.step(at(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
@@ -71,7 +70,7 @@ def test_it_stops_without_overshoot():
     assert path[60].x > 2500  # as soon as 20 m/s^2 allow
 
 
-def test_what_does_not_move_the_arm_may_jump():
+def test_free_target_may_jump():
     follower, far = MotionLimiter(2e-3, (1.0, 1.0), device=True), at(np.full(6, 0.1))
     assert follower.step(far, free=True) == far
     assert follower.step(far, free=False) == far
@@ -80,8 +79,7 @@ def test_what_does_not_move_the_arm_may_jump():
 @pytest.mark.slow
 @pytest.mark.parametrize("slow", [1, 10])
 @pytest.mark.parametrize("rates", [{"x": 12_000, "rz": 5000}, {"z": -777.7}, {"y": 2400, "x": 0}])
-def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load, slow, rates):
-    """Whatever the clock does meanwhile, as long as the page repeats them."""
+def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, rates):
     now, live = 0.0, Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, now)
     live.handle_message(1, json.dumps({"slow": slow, "rates": rates}), now)
@@ -97,7 +95,7 @@ def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load
     assert live.frame()["inputs"] == found
 
 
-def test_what_a_page_does_not_repeat_ends_after_a_second():
+def test_rate_ends_one_second_after_its_last_repetition():
     steering, inputs = RateInputs(), Inputs()
     inputs = steering.begin({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
     for k in range(400):
@@ -120,7 +118,7 @@ def test_a_target_that_is_set_ends_a_rate(scenario, load):
 
 @pytest.fixture
 def noisy(scenario) -> Scenario:
-    """With a sensor that saturates; the leaf is where nothing touches it."""
+    """Return a scenario with a saturating sensor and a leaf out of reach."""
     sensor = {"wrist_sensor__ideal": False, "wrist_sensor__offset": [0.0] * 6}
     return replace(scenario, sheet_spring=None, **sensor)
 
@@ -128,7 +126,7 @@ def noisy(scenario) -> Scenario:
 @pytest.mark.slow
 @pytest.mark.parametrize(("slow", "jumps"), [(1, True), (5, True), (10, False), (20, True)])
 def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow, jumps):
-    """It moves by 60 mm at 1 Hz, in the time of its hand."""
+    """The mouse moves by 60 mm at 1 Hz of real time."""
     now, felt = 0.0, []
     live = Live(noisy, load, None, lambda rows: {}, now)
     live.join(1, now)
@@ -148,7 +146,7 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
 def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
     noisy, load, rate, burst
 ):
-    """It goes up and down by 45 mm and rests between; slices come in bursts."""
+    """The device moves up and down by 45 mm with rests; slices come in bursts."""
     link = DeviceLink("udp://127.0.0.1:0")
     live = Live(with_device(noisy), load, None, lambda rows: {}, 0.0, link)
     felt, now, due, number = [], 0.0, 0.0, 0

@@ -78,7 +78,7 @@ class Store:
         path = self.path(participant)
         if not path.exists():
             return []
-        remedy = "remove it; the participant then begins again"
+        remedy = "remove it; the participant then starts again"
         with reading(path, remedy):
             table = pl.read_csv(path, schema=_SCHEMA)
         rows = [Row(**row) for row in table.iter_rows(named=True)]
