@@ -76,10 +76,10 @@ class Client:
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
         """Return the displayed wrench after one exchange; None without a pose."""
-        place = self._device.read()
+        pose = self._device.read()
         now = clock()
         self._receive()
-        if place is None:
+        if pose is None:
             self._device.set((0.0,) * 6)
             return None
         command = self._command
@@ -91,9 +91,9 @@ class Client:
         )
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
-        wrench = self.guard.tick(place.position, commanded, age, period)
+        wrench = self.guard.tick(pose.position, commanded, age, period)
         self._device.set(wrench)
-        self._send(place, now, age)
+        self._send(pose, now, age)
         return wrench
 
     def _receive(self) -> None:
@@ -110,14 +110,14 @@ class Client:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send(self, place: DevicePose, now: float, age: float) -> None:
+    def _send(self, pose: DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
             self.behind.append(behind)
-        x, y, z = map(float, place.position)
-        w, i, j, k = map(float, place.orientation)
-        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), place.flags, behind)
+        x, y, z = map(float, pose.position)
+        w, i, j, k = map(float, pose.orientation)
+        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
         try:
             self._socket.send(packed_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer

@@ -52,10 +52,10 @@ def _pose_on_path(path, time, out):
     share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
     r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
     start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
-    turned = multiply(exponential(r), start)
+    rotation = multiply(exponential(r), start)
     moves = 1.0 / TICK if share < 1.0 else 0.0
     for k in range(4):
-        out[k] = turned[k]
+        out[k] = rotation[k]
     for k in range(3):
         out[4 + k] = path[_START_POSE + 4 + k] + share * path[_DISPLACEMENT + k]
         out[7 + k] = moves * path[_DISPLACEMENT + k]
@@ -162,9 +162,9 @@ class ExternalMaster(LeafSystem):
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
         pose = self._present(context)
-        turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
-        turns = (turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle())
-        output.SetFromVector([*pose[4:7], *turns, *([0.0] * 6)])
+        rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
+        angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
+        output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[:_FAULT])

@@ -109,12 +109,12 @@ def _path_into(path, time, now, target, poles):
     """Write the path from the intention `now` (16,) to `target` (7,)."""
     path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
-    turned = logarithm(multiply(now, conjugate(target)))
-    rate = _rotation_vector_rate(turned, three(now, 10))
+    rotation = logarithm(multiply(now, conjugate(target)))
+    rate = _rotation_vector_rate(rotation, three(now, 10))
     for k in range(3):
         path[_OFFSET + k], path[_OFFSET + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
         path[_OFFSET + 6 + k] = now[13 + k]
-        path[_ROTATION + k], path[_ROTATION + 3 + k] = turned[k], rate[k]
+        path[_ROTATION + k], path[_ROTATION + 3 + k] = rotation[k], rate[k]
 
 
 @njit(cache=True, borrows=True)
@@ -172,15 +172,15 @@ class LiveHand(Operator):
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
         intention = self._present_intention(context)
-        turn = np.array(logarithm(multiply(tuple(intention[:4]), conjugate(tuple(pose[:4])))))
-        turn *= before.rotational_stiffness / after.rotational_stiffness
-        way = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
+        rotation = np.array(logarithm(multiply(tuple(intention[:4]), conjugate(tuple(pose[:4])))))
+        rotation *= before.rotational_stiffness / after.rotational_stiffness
+        displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         damping = np.repeat(
             [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
             3,
         )
-        intention[:4] = multiply(exponential(tuple(turn)), tuple(pose[:4]))
-        intention[4:7] = pose[4:] + way
+        intention[:4] = multiply(exponential(tuple(rotation)), tuple(pose[:4]))
+        intention[4:7] = pose[4:] + displacement
         intention[7:13] = twist + damping * (intention[7:13] - twist)
         intention[13:] *= before.mass / after.mass
         _path_into(path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE)

@@ -44,9 +44,9 @@ _SCALE_RAMP_S = 0.05
 _MIN_STEP_S = 2.5e-4
 #: Largest increase of the rendered force after a change of channel [N].
 _MAX_FORCE_RISE_N = 0.9
-
 # Duration of short steps after a rejected one [s].
 _SHORT_STEPS_S = 4e-3
+_NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
@@ -75,7 +75,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
             until = math.inf
             integrator.set_maximum_step_size(longest)
             integrator.set_fixed_step_mode(False)
-        return EventStatus.DidNothing()
+        return _NO_EVENT
 
     simulator.set_monitor(after_step)
 
@@ -126,10 +126,10 @@ class _Station:
         self.columns = columns(self.station)
 
     def block(self, name: str) -> tuple[Any, Context]:
-        led = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
-        inside = led.HasSubsystemNamed(name)
-        found = led.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
-        return found, found.GetMyMutableContextFromRoot(self.context)
+        inner_side = self.station.GetSubsystemByName("master_side").GetSubsystemByName("inner_side")
+        inside = inner_side.HasSubsystemNamed(name)
+        block = inner_side.GetSubsystemByName(name) if inside else GetBlock(self.station, name)
+        return block, block.GetMyMutableContextFromRoot(self.context)
 
     def value(self, signal: str) -> NDArray[np.float64]:
         values: NDArray[np.float64] = self.station.GetOutputPort(signal).Eval(self.context).copy()
@@ -140,23 +140,23 @@ class _Station:
 
     def follow(self, other: _Station, channel_anew: bool) -> float:
         """Continue another station's state; return how long the clutch stays open [s]."""
-        anew = {"channel"} if channel_anew else set()
+        excluded = {"channel"} if channel_anew else set()
         if not self.scenario.load_estimator.enabled:
-            anew.add("load_estimator")  # its configured load differs
-        copy_state(other.station, other.context, self.station, self.context, anew)
+            excluded.add("load_estimator")  # its configured load differs
+        copy_state(other.station, other.context, self.station, self.context, excluded)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block("wrist_sensor")
             sensor.bring_up_to_date(context)
-        wait = fill_time(self.scenario) if channel_anew else 0.0
-        over, context = self.block("cross_fade")
-        felt = other.value("force_to_master")
-        over.Begin(context, self.context.get_time() + wait, CROSS_FADE_S, felt)
+        wait_s = fill_time(self.scenario) if channel_anew else 0.0
+        cross_fade, context = self.block("cross_fade")
+        rendered = other.value("force_to_master")
+        cross_fade.Begin(context, self.context.get_time() + wait_s, CROSS_FADE_S, rendered)
         if channel_anew:
-            over.Limit(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(felt[:3])))
-        grips = other.scenario.operator.hand, self.scenario.operator.hand
-        if grips[0] != grips[1]:
+            cross_fade.Limit(context, _MAX_FORCE_RISE_N + float(np.linalg.norm(rendered[:3])))
+        impedances = other.scenario.operator.hand, self.scenario.operator.hand
+        if impedances[0] != impedances[1]:
             hand, context = self.block("live_hand")
-            hand.SetImpedance(context, *grips)
+            hand.SetImpedance(context, *impedances)
         if not channel_anew:
             return 0.0
         name = "pose_command" if other.scenario.is_direct else "pose_received"
@@ -167,8 +167,8 @@ class _Station:
             channel, context = self.block("channel")
             side = self.station.GetSubsystemByName("slave_side")
             pose = side.GetOutputPort("pose_slave").Eval(side.GetMyContextFromRoot(self.context))
-            channel.Begin(context, command, pose, wait)
-        return wait + CROSS_FADE_S
+            channel.Begin(context, command, pose, wait_s)
+        return wait_s + CROSS_FADE_S
 
 
 class Session:
@@ -238,9 +238,9 @@ class Session:
         scenario.check()
         estimate = adapted_estimate(self.scenario, self._load, scenario)
         station = _Station(scenario, estimate, self._load, self._station_count, device=self._device)
-        filled = station.follow(self._station, inputs.channel != self.inputs.channel)
-        if filled:
-            self._filled_at_ms = self.ms + math.ceil(1e3 * filled)
+        wait_s = station.follow(self._station, inputs.channel != self.inputs.channel)
+        if wait_s:
+            self._filled_at_ms = self.ms + math.ceil(1e3 * wait_s)
         if self._on_disk is not None:
             self._on_disk.take()
             self._on_disk.follow(station.simulator)
@@ -273,16 +273,16 @@ class Session:
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
         """Return the rows since the last call, at most 1 s ago: (n, k) by signal, "t" (n,) [s]."""
-        sink, seen = self._station.sink, self._rows_read
-        data, times = sink.data()[:, seen:].T.copy(), sink.sample_times()[seen:]
-        found = {name: data[:, part] for name, part in self._station.columns.items()}
-        found["t"] = times.copy()
+        sink, start = self._station.sink, self._rows_read
+        data, times = sink.data()[:, start:].T.copy(), sink.sample_times()[start:]
+        rows = {name: data[:, part] for name, part in self._station.columns.items()}
+        rows["t"] = times.copy()
         self._rows_read += len(times)
         if self._on_disk is None:
             sink.Clear()
             self._rows_read = 0
             self._earlier_rows.clear()
-        return found
+        return rows
 
     def contact_force(self) -> float:
         """Return the last contact force at the hand [N]; 0 if unknown."""
@@ -304,8 +304,8 @@ class Session:
         """Return the force that a new channel's limit removes [N]."""
         if self._station_count == 1:
             return 0.0
-        over, context = self._station.block("cross_fade")
-        return float(over.removed_force(context))
+        cross_fade, context = self._station.block("cross_fade")
+        return float(cross_fade.removed_force(context))
 
     def flush(self) -> None:
         """Write all rows and inputs until now."""

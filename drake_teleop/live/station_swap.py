@@ -40,13 +40,17 @@ def copy_state(
         excluded: block names.
     """
     context.SetTime(then.get_time())
-    others = dict(_blocks(before))
+    sources = dict(_blocks(before))
     for path, block in _blocks(station):
-        other = others.get(path)
-        if other is None or type(other) is not type(block) or excluded & set(path.split("/")):
+        source_block = sources.get(path)
+        if (
+            source_block is None
+            or type(source_block) is not type(block)
+            or excluded & set(path.split("/"))
+        ):
             continue
         _copy(
-            other.GetMyContextFromRoot(then),
+            source_block.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
             path.rpartition("/")[2] in _BLOCKS_WITH_PARAMETERS,
         )
@@ -134,9 +138,9 @@ class CrossFade(LeafSystem):
         self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
-        """Cross-fade from `felt` (6,) within `length` [s] from `start` [s]."""
-        change = np.concatenate([[start, length], felt])
+    def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
+        """Cross-fade from `rendered` (6,) within `length` [s] from `start` [s]."""
+        change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 

@@ -105,12 +105,12 @@ def make_apparatus(
     setup = replace(setup, contact_detection=None, **changes)
     empty = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        held = chosen_scenario(setup, load, Inputs.of(setup).changed({"object": 1}))
-        estimate = adapted_estimate(setup, load, held)
+        with_object = chosen_scenario(setup, load, Inputs.of(setup).changed({"object": 1}))
+        estimate = adapted_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
-        setup = held
+        setup = with_object
     setup.check()
     mass = empty
     if condition.eta is not None:
@@ -130,7 +130,7 @@ class IntervalLog:
     def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
         self.time, self.done_at = 0.0, 0.0
         self._forces: list[Array] = []
-        self._felt: list[Array] = []
+        self._rendered: list[Array] = []
         self._dt = 1.0 / scenario.rates.log_hz
         self._slave, self._insert = NominalSlave(scenario.slave), insert
         self._on_floor: float | None = None
@@ -142,7 +142,7 @@ class IntervalLog:
         self.time = float(rows["t"][-1])
         contact = rows.get("true_contact_wrench_W", np.zeros((len(rows["t"]), 6)))
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
-        self._felt.append(rows["force_to_master"][:, :3])
+        self._rendered.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
             self._detect_floor(self._insert, rows)
 
@@ -166,10 +166,10 @@ class IntervalLog:
 
         It is relative to the 0.1 s before.
         """
-        felt = np.concatenate(self._felt)
-        begin = round(after / self._dt)
-        rest = felt[round((after - 0.1) / self._dt) : begin].mean(axis=0)
-        return _largest_mean(np.linalg.norm(felt[begin:] - rest, axis=1), self._dt)
+        rendered = np.concatenate(self._rendered)
+        start = round(after / self._dt)
+        rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)
+        return _largest_mean(np.linalg.norm(rendered[start:] - rest, axis=1), self._dt)
 
 
 def _largest_mean(values: Array, dt: float) -> float:

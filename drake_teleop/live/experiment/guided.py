@@ -200,9 +200,9 @@ class Guided:
             self._procedure.start_second_interval()
             self._live.pace.start(now)
         if self._runs:
-            told = self._live.tick(clock) is not None
+            frame_is_due = self._live.tick(clock) is not None
             self._end_interval_if_over(clock())
-            return self.frame() if told else None
+            return self.frame() if frame_is_due else None
         if now < self._frame_due:
             return None
         self._frame_due = now + FRAME
@@ -215,16 +215,16 @@ class Guided:
         if live.ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
-        felt = self._apparatus.result(self._procedure.present_level, self._stimulus, self._rows)
-        felt = dataclasses.replace(felt, lost_s=live.pace.given_up)
-        self._procedure.finish_interval(felt)
+        result = self._apparatus.result(self._procedure.present_level, self._stimulus, self._rows)
+        result = dataclasses.replace(result, lost_s=live.pace.given_up)
+        self._procedure.finish_interval(result)
         self._since = self._frame_due = now
         self._prepare_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
         """Return the present frame for pages."""
         inner = self._live.frame()
-        felt = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
+        rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._runs else 0.0
@@ -235,7 +235,7 @@ class Guided:
         return {
             **{name: inner[name] for name in _SHOWN_KEYS if name in inner},
             **_HIDDEN_VALUES,
-            "f": [felt] * 3,
+            "f": [rendered] * 3,
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,
             "drive": self._intervals,

@@ -133,7 +133,7 @@ class Procedure:
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
     def _new_trial(self) -> None:
-        self.interval, self._felt, self.level = 1, [IntervalResult(), IntervalResult()], 0.0
+        self.interval, self._results, self.level = 1, [IntervalResult(), IntervalResult()], 0.0
         self.prepared_intervals += 1
         task, trial = self.task, self.trial
         if not isinstance(task, PegInSlot):
@@ -151,14 +151,14 @@ class Procedure:
         elif self.phase == FEEDBACK:
             self._next_trial()
 
-    def finish_interval(self, felt: IntervalResult) -> None:
+    def finish_interval(self, result: IntervalResult) -> None:
         """End the present interval."""
-        self._felt[self.interval - 1] = felt
-        if not felt.valid:
+        self._results[self.interval - 1] = result
+        if not result.valid:
             self._new_trial()
             self.phase, self.again = READY, True
         elif self.trial.signal == 0:
-            self._finish_trial(0, felt.done, felt.time_s)
+            self._finish_trial(0, result.done, result.time_s)
         elif self.interval == 1:
             self.interval, self.phase = 2, GAP
             self.prepared_intervals += 1
@@ -181,19 +181,19 @@ class Procedure:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 
     def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
-        trial, felt = self.trial, self._felt
+        trial, results = self.trial, self._results
         row = Row(
             trial=self.number,
             task=type(self.task).__name__,
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
-            level=max(f.level for f in felt),
+            level=max(f.level for f in results),
             signal=trial.signal,
             answer=answer,
             correct=int(correct),
             time_s=round(time_s, 4),
-            force_N=max(f.force_N for f in felt),
-            lost_s=sum(f.lost_s for f in felt),
+            force_N=max(f.force_N for f in results),
+            lost_s=sum(f.lost_s for f in results),
         )
         self._store.write(self.participant, [*self._rows, row])
         self._rows.append(row)

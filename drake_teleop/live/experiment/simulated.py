@@ -45,12 +45,12 @@ def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
     """Return the station of each task and condition."""
-    found = {}
+    stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
         for c, condition in enumerate(experiment.conditions):
-            found[t, c] = make_apparatus(task, condition, scenario, load)
-    return found
+            stations[t, c] = make_apparatus(task, condition, scenario, load)
+    return stations
 
 
 def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
@@ -75,11 +75,11 @@ def take_part(
         if procedure.phase == INTERVAL:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                felt = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
             else:
-                felt, response = _run_interval(apparatus, procedure)
+                result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
-            procedure.finish_interval(felt)
+            procedure.finish_interval(result)
         elif procedure.phase == GAP:
             procedure.start_second_interval()
         elif procedure.phase == ANSWER:
@@ -113,15 +113,16 @@ def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalR
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
     stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
     rows = IntervalLog(task, apparatus.scenario, None)
-    sways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
+    moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
         t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)
-        if sways:
+        if moves_sideways:
             ramp = min(t, 1.0)
-            place = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
+            displacement = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
         else:
-            place = {"z": -observer.reach * 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))}
-        hand = {name: value / LENGTH for name, value in place.items()}
+            share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
+            displacement = {"z": -observer.reach * share}
+        hand = {name: value / LENGTH for name, value in displacement.items()}
         session.apply(session.inputs.changed(stimulus | hand))
         session.advance(SLICE_MS)
         if session.ms % _ROWS_PERIOD_MS == 0:
@@ -148,7 +149,7 @@ def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) ->
     estimate = None if apparatus.load is None else apparatus.load.estimate
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=False)
-    found = task_measures(result, scenario)
-    done = found["success"] > 0.0
-    taken = found["task_time_s"] if done else task.timeout
-    return IntervalResult(force_N=float(contact_force(result).max()), done=done, time_s=taken)
+    measures = task_measures(result, scenario)
+    done = measures["success"] > 0.0
+    time_s = measures["task_time_s"] if done else task.timeout
+    return IntervalResult(force_N=float(contact_force(result).max()), done=done, time_s=time_s)
