@@ -74,7 +74,7 @@ def test_participant_continues_with_the_same_levels(tmp_path):
     first = Procedure(SMALL, 3, cut)
     go_through(first, rng, 2.0, most=17)
     first.go()
-    first.finish_interval(IntervalResult(first.shown))
+    first.finish_interval(IntervalResult(first.present_level))
     again = Procedure(SMALL, 3, cut)
     assert (again.phase, again.number) == ("consent", 17)
     go_through(again, rng, 2.0)

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.slow
 def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
     """Replace the browser by a client that collects frames and then sends Ctrl-C."""
     monkeypatch.chdir(tmp_path)
-    for room in ("live.server", "experiment.apparatus"):
+    for room in ("live.server", "live.experiment.apparatus"):
         monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda *_: load)
     for painted in ("write_replay", "write_picture", "overview"):
         monkeypatch.setattr(f"drake_teleop.lab.run.{painted}", lambda *_: None)
