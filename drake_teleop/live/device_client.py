@@ -84,11 +84,8 @@ class Client:
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
-        period = (
-            _PERIOD_S
-            if self._last_tick is None
-            else min(max(now - self._last_tick, 1e-5), _MAX_LATENESS_S)
-        )
+        elapsed = _PERIOD_S if self._last_tick is None else now - self._last_tick
+        period = min(max(elapsed, 1e-5), _MAX_LATENESS_S)
         self._last_tick = now
         commanded = (0.0,) * 6 if command is None else command.wrench
         wrench = self.guard.tick(pose.position, commanded, age, period)
@@ -176,11 +173,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")
-    parser.add_argument("--grip", choices=tuple(GRIPS), default="medium", help="of the virtual one")
-    parser.add_argument("--depth", type=float, default=0.08, help="how far its hand goes down [m]")
-    parser.add_argument("--seconds", type=float, default=float("inf"))
-    parser.add_argument("--no-observer", action="store_true")
-    parser.add_argument("--json", type=Path, help="figures, at the end")
+    parser.add_argument(
+        "--grip", choices=tuple(GRIPS), default="medium", help="of the virtual hand"
+    )
+    parser.add_argument("--depth", type=float, default=0.08, help="stroke of that hand [m]")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="duration")
+    parser.add_argument("--no-observer", action="store_true", help="no passivity observer")
+    parser.add_argument("--json", type=Path, help="output file of the figures")
     options = parser.parse_args(arguments)
     device = open_device(options.device, options.grip, options.depth)
     client = Client(device, options.station, observe=not options.no_observer)

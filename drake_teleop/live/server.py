@@ -106,13 +106,11 @@ class LiveDrive:
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
 
     def _make_scenes(self, scenario: Scenario, device: bool, progress: Progress) -> None:
-        self._scene_scenarios = {name: scene(name, scenario) for name in SCENES}
-        if device:
-            self._scene_scenarios = {
-                name: with_device(each) for name, each in self._scene_scenarios.items()
-            }
-        for name, each in self._scene_scenarios.items():
-            self._views[name] = PageScene(name, each)
+        self._scene_scenarios: dict[str, Scenario] = {}
+        for name in SCENES:
+            setup = scene(name, scenario)
+            self._scene_scenarios[name] = with_device(setup) if device else setup
+            self._views[name] = PageScene(name, self._scene_scenarios[name])
             progress(len(self._views) / (1 + len(SCENES)))
         warm_up(scenario, self._load, device)
         progress(1.0)

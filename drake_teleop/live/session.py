@@ -272,7 +272,10 @@ class Session:
         advance(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rows since the last call, at most 1 s ago: (n, k) by signal, "t" (n,) [s]."""
+        """Return the rows since the last call: (n, k) by signal, and "t" (n,) [s].
+
+        Call it at least once a second: `advance` discards older rows.
+        """
         sink, start = self._station.sink, self._rows_read
         data, times = sink.data()[:, start:].T.copy(), sink.sample_times()[start:]
         rows = {name: data[:, part] for name, part in self._station.columns.items()}
