@@ -53,7 +53,7 @@ class Person:
         )
         self.guided.join(1, self.now)
 
-    def say(self, client: int = 1, **message) -> None:
+    def send(self, client: int = 1, **message) -> None:
         self.guided.handle_message(client, json.dumps(message), self.now)
 
     def wait(self, phase: str, seconds: float = 3.0) -> None:
@@ -68,23 +68,23 @@ class Person:
 
     def begin(self) -> None:
         for _ in range(3):
-            self.say(go=True)
+            self.send(go=True)
         assert self.procedure.phase == "interval"
 
 
 @pytest.mark.slow
 def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person = Person(tmp_path)
-    person.say(answer=1)  # not in the phase of an answer
+    person.send(answer=1)  # not in the phase of an answer
     person.begin()
-    person.say(set={"z": -1500, "sigma": 300, "gamma": 0})
+    person.send(set={"z": -1500, "sigma": 300, "gamma": 0})
     person.wait("gap")
     person.wait("interval")
-    person.say(set={"z": -2500})
+    person.send(set={"z": -2500})
     person.wait("answer")
-    person.say(client=2, answer=1)  # a spectator
+    person.send(client=2, answer=1)  # a spectator
     assert person.procedure.phase == "answer"
-    person.say(answer=2)
+    person.send(answer=2)
     (row,) = person.store.rows(1)
     assert row.answer == 2 and row.force_N > 1.0 and row.level > 0.0
     assert person.procedure.phase == "end"
@@ -92,24 +92,24 @@ def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
     assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
     assert drive.repeat(silent).t[-1] == pytest.approx(0.5, abs=0.03)
-    told = json.dumps(person.frames) + json.dumps(person.guided.hello())
-    assert "secret" not in told
+    messages = json.dumps(person.frames) + json.dumps(person.guided.hello())
+    assert "secret" not in messages
     assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)
-    felt = [f["f"] for f in person.frames]
-    assert all(f[0] == f[1] == f[2] for f in felt)
+    forces = [f["f"] for f in person.frames]
+    assert all(f[0] == f[1] == f[2] for f in forces)
 
 
 @pytest.mark.slow
 def test_trial_restarts_after_the_page_is_closed(tmp_path):
     person = Person(tmp_path)
     person.begin()
-    person.say(set={"z": -1500})
+    person.send(set={"z": -1500})
     person.wait("gap")
     person.guided.leave(1, person.now)
     assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
-    person.say(client=2, go=True)  # has left
+    person.send(client=2, go=True)  # has left
     person.guided.join(3, person.now)
-    person.say(client=3, go=True)
+    person.send(client=3, go=True)
     assert person.procedure.phase == "interval" and person.store.participants() == []
 
 

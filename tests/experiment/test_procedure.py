@@ -42,8 +42,8 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
     """Run a participant whose answers depend on the level, or until a number of trials."""
     while procedure.phase != "end" and procedure.number < most:
         if procedure.phase == "interval":
-            felt = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
-            procedure.finish_interval(felt)
+            result = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+            procedure.finish_interval(result)
         elif procedure.phase == "gap":
             procedure.start_second_interval()
         elif procedure.phase == "answer":
@@ -109,12 +109,12 @@ def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     folder = Path(__file__).parent
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    said = next(int(line) for line in process.stdout if int(line) >= 4)
+    message = next(int(line) for line in process.stdout if int(line) >= 4)
     process.kill()
     process.communicate()
     cut = Store(tmp_path / "cut")
     left = len(cut.rows(1))
-    assert said <= left < len(trials_of(SHORT, 1))
+    assert message <= left < len(trials_of(SHORT, 1))
     goes_through(str(tmp_path / "cut"))
     goes_through(str(tmp_path / "whole"))
     assert cut.rows(1) == Store(tmp_path / "whole").rows(1)
@@ -134,7 +134,7 @@ def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_p
 
 
 def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
-    def told(names: list[int]) -> list[dict]:
+    def views(names: list[int]) -> list[dict]:
         conditions = [SMALL.conditions[k] for k in names]
         other = dataclasses.replace(SMALL, conditions=conditions)
         procedure = Procedure(other, 1, Store(tmp_path / str(names)))
@@ -151,8 +151,8 @@ def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
                 procedure.go()
         return seen
 
-    assert told([0, 1, 2]) == told([2, 0, 1])
-    assert not {"condition", "level", "signal"} & set(told([0, 1, 2])[0])
+    assert views([0, 1, 2]) == views([2, 0, 1])
+    assert not {"condition", "level", "signal"} & set(views([0, 1, 2])[0])
 
 
 def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
@@ -171,7 +171,7 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("tasks: []", "tasks: is empty"),
         ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "has no slot"),
@@ -185,9 +185,9 @@ def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
     ],
 )
-def test_invalid_file_is_an_error_with_its_field(tmp_path, text, said):
+def test_invalid_file_is_an_error_with_its_field(tmp_path, text, message):
     (tmp_path / "e.yaml").write_text(text)
-    with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{said}|{said}.*e\.yaml"):
+    with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{message}|{message}.*e\.yaml"):
         LoadExperiment(tmp_path / "e.yaml")
 
 

@@ -50,9 +50,9 @@ def test_axis_of_a_quantity_has_tick_labels(least, most):
     axes = Picture(figsize=(2.9, 2.0)).subplots()
     _draw(axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)])
     low, high = axes.get_xlim()
-    told = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
-    told = [label for label in told if low <= label.get_position()[0] <= high]
-    assert 2 <= sum(bool(label.get_text()) for label in told) <= 7
+    labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
+    labels = [label for label in labels if low <= label.get_position()[0] <= high]
+    assert 2 <= sum(bool(label.get_text()) for label in labels) <= 7
 
 
 def test_next_participant_has_trials_left_or_is_new(tmp_path):

@@ -99,9 +99,11 @@ def test_invalid_packets_only_change_a_counter(link):
     for k, packet in enumerate(odd):
         sender.raw(packet)
         if k % 40 == 0:
-            led = link.hand_inputs(1e-4 * k)
-            assert all(np.isfinite(value) for value in led.values())
-            assert np.isfinite(Inputs().changed(led).pose(np.zeros(3))[0] if led["held"] else 0.0)
+            inputs = link.hand_inputs(1e-4 * k)
+            assert all(np.isfinite(value) for value in inputs.values())
+            assert np.isfinite(
+                Inputs().changed(inputs).pose(np.zeros(3))[0] if inputs["held"] else 0.0
+            )
     assert link.refused > 40
     assert read_message(said).state.position == (-2.0, 1.0, 3.0)
     texts = ["", "[]", "{}", "null", "[" * 9000, '{"inverse3":[]}', said[:-1], "1e999", 7, None]
@@ -171,8 +173,8 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
     one.send(3, (0.2, 0.0, 0.0))
     one.send(4, (0.2, 0.0, 0.0))
     other.send(9, (0.3, 0.0, 0.0))
-    led = link.hand_inputs(0.049)
-    assert led["x"] == pytest.approx(1000.0)
+    inputs = link.hand_inputs(0.049)
+    assert inputs["x"] == pytest.approx(1000.0)
     assert (link.lost, link.refused) == (1, 1)
     assert ". Refused packets: 1; the last one is from a second device" in link.status_text()
     link.send(np.arange(6.0))
@@ -182,8 +184,8 @@ def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link
     other.send(1, (0.1, 0.02, 0.0))
     assert link.hand_inputs(0.2)["clutch"] == 0
     other.send(2, (0.1, 0.02, 0.0))
-    led = link.hand_inputs(0.2401)
-    assert led["y"] == pytest.approx(2000.0)
+    inputs = link.hand_inputs(0.2401)
+    assert inputs["y"] == pytest.approx(2000.0)
     other.send(3, (0.1, 0.02, 0.0))
     assert "clutch" not in link.hand_inputs(0.2801)
     other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
@@ -214,7 +216,7 @@ def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
         last = now
 
 
-def pressed(stiffness, grip, delay, *, observe):
+def tap_on_wall(stiffness, grip, delay, *, observe):
     """Return the least energy of the port and the final speed after one tap on a wall."""
     virtual = VirtualDevice(tapping(0.02, hertz=1.0), grip)
     guard, heights = DeviceGuard(Limits(37.5), observe=observe), [virtual.position[2]] * delay
@@ -232,16 +234,16 @@ def pressed(stiffness, grip, delay, *, observe):
 
 
 def test_leaf_is_passive_with_a_delay_of_five_samples():
-    assert pressed(291.0, "light", 5, observe=True)[0] >= -1e-6
-    assert pressed(291.0, "light", 5, observe=False)[0] < -1e-3
+    assert tap_on_wall(291.0, "light", 5, observe=True)[0] >= -1e-6
+    assert tap_on_wall(291.0, "light", 5, observe=False)[0] < -1e-3
 
 
 def test_a_stiff_wall_comes_to_rest():
-    assert pressed(6000.0, "medium", 3, observe=True)[1] < 0.05
-    assert pressed(6000.0, "medium", 3, observe=False)[1] > 0.3
+    assert tap_on_wall(6000.0, "medium", 3, observe=True)[1] < 0.05
+    assert tap_on_wall(6000.0, "medium", 3, observe=False)[1] > 0.3
 
 
-class Still:
+class RestingDevice:
     """Device at rest that records the displayed wrenches."""
 
     limits = Limits(10.0)
@@ -260,7 +262,7 @@ class Still:
 
 
 def test_client_displays_the_stations_force_and_none_after_silence(link):
-    device = Still()
+    device = RestingDevice()
     client = Client(device, f"udp://127.0.0.1:{link.port}")
     for k in range(200):
         now = MS * k
@@ -335,20 +337,20 @@ def test_device_drives_without_a_page_and_releases_after_silence(scenario, load,
 def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
     setup = with_device(scenario)
     session = Session(setup, load, log=tmp_path / "log.parquet", record=tmp_path, device=True)
-    felt = []
+    rendered = []
     for k in range(128):
         down = {"z": -20 * k, "rx": k, "held": k < 100, "clutch": k < 100}
         session.apply(session.inputs.changed(down))
         session.advance(2)
-        felt.append(np.linalg.norm(session.force()[:3]))
+        rendered.append(np.linalg.norm(session.force()[:3]))
     session.close()
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     drive = read_drive(tmp_path)
     again = drive.repeat(silent(""))
     assert all(np.array_equal(log[name], again[name], equal_nan=True) for name in ("t", *log))
-    assert max(felt) > 0.3
-    assert max(felt[80:101]) > 0.3
-    assert felt[127] == 0.0  # 54 ms after the release
+    assert max(rendered) > 0.3
+    assert max(rendered[80:101]) > 0.3
+    assert rendered[127] == 0.0  # 54 ms after the release
     steps = np.diff(log["pose_command"][:, 6])
     assert np.abs(steps).max() < 1.2e-4 * setup.kinematic_scaling.translation_scale
     assert set(RANGES) == set(vars(drive.changes[0][1]))

@@ -18,7 +18,7 @@ TARGETS = (
 )
 
 
-class Led:
+class MovingHand:
     """Hand on a stylus at rest."""
 
     def __init__(self) -> None:
@@ -27,50 +27,56 @@ class Led:
         self.hand.GetInputPort("pose_master").FixValue(self.context, START)
         self.hand.GetInputPort("twist_master").FixValue(self.context, np.zeros(6))
 
-    def wants(self, time: float) -> list[np.ndarray]:
+    def intention(self, time: float) -> list[np.ndarray]:
         """Return the intended quaternion (4,), position [m], twist (6,) and acceleration (3,)."""
         self.context.SetTime(time)
         return np.split(self.hand._present_intention(self.context).copy(), [4, 7, 13])
 
-    def lead(self, time: float, orientation: tuple[float, ...], place: tuple[float, ...]) -> None:
+    def move_to(
+        self, time: float, orientation: tuple[float, ...], position: tuple[float, ...]
+    ) -> None:
         self.context.SetTime(time)
-        self.hand.SetTarget(self.context, np.array([*orientation, *place]))
+        self.hand.SetTarget(self.context, np.array([*orientation, *position]))
 
 
-def turned(to: np.ndarray, since: np.ndarray) -> np.ndarray:
+def rotation_between(to: np.ndarray, since: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) in B [rad] between two orientations."""
     return np.array(logarithm(multiply(tuple(to), conjugate(tuple(since)))))
 
 
 @pytest.fixture
-def led() -> Led:
+def moving_hand() -> MovingHand:
     """Return a hand on its way to the last of several targets."""
-    led = Led()
-    for time, turn, place in TARGETS:
-        led.lead(time, exponential(turn), place)
-    return led
+    moving_hand = MovingHand()
+    for time, turn, position in TARGETS:
+        moving_hand.move_to(time, exponential(turn), position)
+    return moving_hand
 
 
 @pytest.mark.parametrize("angle", [2.5, 0.5, 9e-3, 1e-4])
-def test_new_target_keeps_position_velocity_and_acceleration(led, angle):
-    orientation, place, twist, acceleration = led.wants(0.11)
+def test_new_target_keeps_position_velocity_and_acceleration(moving_hand, angle):
+    orientation, position, twist, acceleration = moving_hand.intention(0.11)
     across = np.cross(twist[3:], [0.3, -0.2, 0.5])
     turn = exponential(tuple(angle / np.linalg.norm(across) * across))
-    led.lead(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
-    then = led.wants(0.11)
+    moving_hand.move_to(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
+    then = moving_hand.intention(0.11)
     assert np.linalg.norm(twist[3:]) > 5.0
-    np.testing.assert_allclose(turned(then[0], orientation), 0.0, atol=1e-12)
-    np.testing.assert_allclose(then[1], place, atol=1e-15)
+    np.testing.assert_allclose(rotation_between(then[0], orientation), 0.0, atol=1e-12)
+    np.testing.assert_allclose(then[1], position, atol=1e-15)
     np.testing.assert_allclose(then[2], twist, rtol=0, atol=1e-9)
     assert np.linalg.norm(acceleration) > 5.0
     np.testing.assert_allclose(then[3], acceleration, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.09, 0.12, 0.2, 0.4])
-def test_twist_is_the_derivative_of_the_pose(led, time):
+def test_twist_is_the_derivative_of_the_pose(moving_hand, time):
     h = 1e-5
-    before, after, now = led.wants(time - h), led.wants(time + h), led.wants(time)
-    rate = np.concatenate([after[1] - before[1], turned(after[0], before[0])]) / (2 * h)
+    before, after, now = (
+        moving_hand.intention(time - h),
+        moving_hand.intention(time + h),
+        moving_hand.intention(time),
+    )
+    rate = np.concatenate([after[1] - before[1], rotation_between(after[0], before[0])]) / (2 * h)
     np.testing.assert_allclose(rate, now[2], rtol=0, atol=1e-5)
     faster = (after[2] - before[2])[:3] / (2 * h)
     np.testing.assert_allclose(faster, now[3], rtol=1e-5, atol=1e-5)

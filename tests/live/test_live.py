@@ -182,10 +182,10 @@ def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", [60_000, 400_000])
-def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, room):
+@pytest.mark.parametrize("size_bytes", [60_000, 400_000])
+def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):
     """For the inputs and the log."""
-    with small_disk(tmp_path, room):
+    with small_disk(tmp_path, size_bytes):
         live = make(scenario, load, clock, tmp_path / "drive")
         live.join(1, clock())
         for k in range(6000):
@@ -284,7 +284,7 @@ def test_short_delays_are_caught_up_and_long_ones_given_up():
     assert pace.wait(0.305) == pytest.approx(0.02)
 
 
-def nonsense(rng: np.random.Generator) -> object:
+def random_message(rng: np.random.Generator) -> object:
     """Return a random message: damaged, of other types, or with non-finite numbers."""
     good = json.dumps({"set": {"x": 10, "sigma": 50, "clutch": 1}, "slow": 2.0, "pause": False})
     kind = rng.integers(8)
@@ -311,7 +311,7 @@ def test_all_values_stay_finite_after_10000_random_messages(scenario, load, cloc
     live.join(1, clock())
     live._start_drive = lambda now: None  # a thousand resets would build as many stations
     for k in range(10_000):
-        live.handle_message(1, nonsense(rng), clock())
+        live.handle_message(1, random_message(rng), clock())
         if k % 1000 == 0:
             live.handle_message(1, '{"pause": false, "slow": 1}', clock())
             live.requested_scene = ""  # likewise

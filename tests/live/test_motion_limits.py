@@ -19,12 +19,12 @@ from drake_teleop.station.scenario import Scenario, replace
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def place(inputs: Inputs) -> np.ndarray:
+def pose_of(inputs: Inputs) -> np.ndarray:
     """Return [m, rad] at the hand."""
     return np.array([getattr(inputs, name) for name in NAMES]) * np.repeat([1e-5, 1e-4], 3)
 
 
-def at(values: np.ndarray) -> Inputs:
+def inputs_of(values: np.ndarray) -> Inputs:
     """Return the inputs of [m, rad]."""
     units = values / np.repeat([1e-5, 1e-4], 3)
     return Inputs().changed(dict(zip(NAMES, units.tolist(), strict=True)))
@@ -32,24 +32,24 @@ def at(values: np.ndarray) -> Inputs:
 
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
-    follower = MotionLimiter(slice_s, (1.0, 1.0), device=device)
+    limiter = MotionLimiter(slice_s, (1.0, 1.0), device=device)
     for k in range(400):
         t = k * slice_s
         begun = min(t / 0.2, 1.0)
         ramp = begun**2 * (3.0 - 2.0 * begun)
-        wanted = at(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
-        assert follower.step(wanted, free=False) == wanted
+        target = inputs_of(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
+        assert limiter.step(target, free=False) == target
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, device, scale):
-    follower = MotionLimiter(slice_s, (scale, scale), device=device)
-    rng, wanted, path = np.random.default_rng(0), Inputs(), []
+    limiter = MotionLimiter(slice_s, (scale, scale), device=device)
+    rng, target, path = np.random.default_rng(0), Inputs(), []
     for k in range(4000):
         if k % 40 == 0 and k < 3000:
-            wanted = at(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # and out of the box
-        path.append(place(follower.step(wanted, free=False)))
+            target = inputs_of(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # partly outside
+        path.append(pose_of(limiter.step(target, free=False)))
     tool = scale * np.array(path)
     speed = np.diff(tool, axis=0) / slice_s
     rounding = 2.0 * scale * 1e-5 / slice_s
@@ -58,22 +58,22 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
         if device:
             changes = np.abs(np.diff(speed[:, part], axis=0))
             assert changes.max() < change * slice_s + 2.0 * unit * rounding
-    np.testing.assert_array_equal(path[-1], place(wanted))
+    np.testing.assert_array_equal(path[-1], pose_of(target))
 
 
 def test_limited_motion_stops_without_overshoot():
-    follower, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
+    limiter, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
-        path.append(follower.step(at(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
+        path.append(limiter.step(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
     assert max(each.x for each in path) <= 5000 * 1.01 and path[-1].x == 5000
     assert max(each.rz for each in path) <= 5000 * 1.01 and path[-1].rz == 5000
     assert path[60].x > 2500  # as soon as 20 m/s^2 allow
 
 
 def test_free_target_may_jump():
-    follower, far = MotionLimiter(2e-3, (1.0, 1.0), device=True), at(np.full(6, 0.1))
-    assert follower.step(far, free=True) == far
-    assert follower.step(far, free=False) == far
+    limiter, target = MotionLimiter(2e-3, (1.0, 1.0), device=True), inputs_of(np.full(6, 0.1))
+    assert limiter.step(target, free=True) == target
+    assert limiter.step(target, free=False) == target
 
 
 @pytest.mark.slow
@@ -127,18 +127,18 @@ def noisy(scenario) -> Scenario:
 @pytest.mark.parametrize(("slow", "jumps"), [(1, True), (5, True), (10, False), (20, True)])
 def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow, jumps):
     """The mouse moves by 60 mm at 1 Hz of real time."""
-    now, felt = 0.0, []
+    now, rendered = 0.0, []
     live = Live(noisy, load, None, lambda rows: {}, now)
     live.join(1, now)
     live.handle_message(1, json.dumps({"slow": slow}), now)
     while live.ms < 500:
         sine = math.sin(2.0 * math.pi * now)
-        far = 6000.0 * (math.copysign(1.0, sine) if jumps else sine)
-        live.handle_message(1, json.dumps({"set": {"x": far, "z": 0.5 * far}}), now)
+        target = 6000.0 * (math.copysign(1.0, sine) if jumps else sine)
+        live.handle_message(1, json.dumps({"set": {"x": target, "z": 0.5 * target}}), now)
         frame = live.tick(lambda now=now: now)
-        felt += [frame["f"][2][1]] if frame and "f" in frame else []
+        rendered += [frame["f"][2][1]] if frame and "f" in frame else []
         now += max(live.wait(now), 1e-3)
-    assert len(felt) > 20 and max(felt) < 0.5
+    assert len(rendered) > 20 and max(rendered) < 0.5
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
     """The device moves up and down by 45 mm with rests; slices come in bursts."""
     link = DeviceLink("udp://127.0.0.1:0")
     live = Live(with_device(noisy), load, None, lambda rows: {}, 0.0, link)
-    felt, now, due, number = [], 0.0, 0.0, 0
+    rendered, now, due, number = [], 0.0, 0.0, 0
     while live.ms < 600:
         now, number = now + 1e-3, number + 1
         up = 0.045 * max(-1.0, min(3.0 * math.sin(2.0 * math.pi * now), 1.0))
@@ -159,6 +159,6 @@ def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
             for _ in range(burst):
                 live._simulate_slice(now)
             due += burst * 2e-3 / rate
-            felt.append(live.frame()["f"][2][1])
+            rendered.append(live.frame()["f"][2][1])
     live.close()
-    assert max(felt) < 0.5
+    assert max(rendered) < 0.5

@@ -178,22 +178,22 @@ def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch
 @pytest.mark.slow
 def test_drive_ends_while_a_scene_identifies_its_load(scenario, load, monkeypatch):
     """The identification checks for the end in its progress function."""
-    asked, drives = threading.Event(), itertools.count()
+    started, drives = threading.Event(), itertools.count()
 
     def identify(_, progress):
         if next(drives) == 0:
             return load
-        told = progress("Identify the load")
+        report = progress("Identify the load")
         while True:
-            asked.set()
-            told(0.5)
+            started.set()
+            report(0.5)
             time.sleep(0.01)
 
     monkeypatch.setattr(server, "identified_load", identify)
     drive = server.drive(scenario)
     with open_socket(drive) as page:
         page.send('{"scene": "slot"}')
-        assert asked.wait(10.0)
+        assert started.wait(10.0)
         start = time.monotonic()
         drive.stop()
         assert time.monotonic() - start < 5.0

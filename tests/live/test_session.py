@@ -105,11 +105,11 @@ def test_new_network_and_method_continue_the_state(scenario, load):
     log = session.log()
     np.testing.assert_allclose(np.diff(log.t), 1e-3, atol=1e-12)
     assert np.linalg.norm(log["true_contact_wrench_W"][200:, :3], axis=1).min() > 3.0
-    felt, command = log["force_to_master"][:, 2], log["pose_received"][:, 4:]
+    rendered, command = log["force_to_master"][:, 2], log["pose_received"][:, 4:]
     for k in (250, 1050):
         np.testing.assert_array_equal(command[k + 2], command[k])
-        np.testing.assert_allclose(felt[k : k + 6], felt[k], atol=1e-3)
-        assert np.abs(np.diff(felt[k:])).max() < 0.02
+        np.testing.assert_allclose(rendered[k : k + 6], rendered[k], atol=1e-3)
+        assert np.abs(np.diff(rendered[k:])).max() < 0.02
     # The number of steps of a slice is limited.
     assert session._station.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
     # The clutch is closed at the end, and the channel delivers packets.
@@ -121,44 +121,44 @@ def test_new_network_and_method_continue_the_state(scenario, load):
 
 def test_rendered_wrench_cross_fades_at_a_constant_wrench():
     simulator = Simulator(CrossFade(1e-3))
-    over, context = simulator.get_system(), simulator.get_mutable_context()
+    cross_fade, context = simulator.get_system(), simulator.get_mutable_context()
     wrench = np.array([3.0, 0.0, 4.0, 0.1, 0.2, 0.3])
-    over.get_input_port().FixValue(context, wrench)
-    felt = over.get_output_port()
-    np.testing.assert_array_equal(felt.Eval(context), wrench)
-    over.Begin(context, 0.1, 0.2, np.ones(6))
-    np.testing.assert_array_equal(felt.Eval(context), np.ones(6))
+    cross_fade.get_input_port().FixValue(context, wrench)
+    rendered = cross_fade.get_output_port()
+    np.testing.assert_array_equal(rendered.Eval(context), wrench)
+    cross_fade.Begin(context, 0.1, 0.2, np.ones(6))
+    np.testing.assert_array_equal(rendered.Eval(context), np.ones(6))
     simulator.AdvanceTo(0.1995)
-    np.testing.assert_allclose(felt.Eval(context), (1.0 + wrench) / 2, atol=0.05)
-    over.Limit(context, 2.5)
+    np.testing.assert_allclose(rendered.Eval(context), (1.0 + wrench) / 2, atol=0.05)
+    cross_fade.Limit(context, 2.5)
     simulator.AdvanceTo(0.4)
-    np.testing.assert_allclose(felt.Eval(context), wrench / 2, rtol=1e-12)
-    over.get_input_port().FixValue(context, wrench / 2)
+    np.testing.assert_allclose(rendered.Eval(context), wrench / 2, rtol=1e-12)
+    cross_fade.get_input_port().FixValue(context, wrench / 2)
     simulator.AdvanceTo(0.402)
-    over.get_input_port().FixValue(context, wrench)
-    np.testing.assert_array_equal(felt.Eval(context), wrench)
+    cross_fade.get_input_port().FixValue(context, wrench)
+    np.testing.assert_array_equal(rendered.Eval(context), wrench)
 
 
 @pytest.mark.slow
 def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, load):
     """A press is rendered at most 0.9 N harder, and in full from the next one on."""
-    session, felt = Session(scenario, load), []
+    session, rendered = Session(scenario, load), []
 
-    def go(ms, **changes):
+    def simulate(ms, **changes):
         session.apply(session.inputs.changed(changes))
         session.advance(ms)
-        felt.append(float(np.linalg.norm(session.force()[:3])))
+        rendered.append(float(np.linalg.norm(session.force()[:3])))
         return session.removed_force()
 
-    assert go(500, z=-4000) == 0.0
-    assert go(1000, network=2, method=METHODS.index("force_limit")) == 0.0
-    kept = go(1000, method=0)
-    assert felt[-1] == pytest.approx(felt[-2] + 0.9, abs=1e-9)
-    assert felt[-1] + kept == pytest.approx(felt[0], rel=0.02) and kept > 1.0
-    assert go(400, grip=1) > 0.2  # another station, but no other channel
-    assert felt[-1] == pytest.approx(felt[-2], abs=1e-9)
-    assert go(400, z=-1000) == 0.0 and felt[-1] < 0.1
-    assert go(400, z=-4000) == 0.0 and felt[-1] > felt[1] + 1.0
+    assert simulate(500, z=-4000) == 0.0
+    assert simulate(1000, network=2, method=METHODS.index("force_limit")) == 0.0
+    removed = simulate(1000, method=0)
+    assert rendered[-1] == pytest.approx(rendered[-2] + 0.9, abs=1e-9)
+    assert rendered[-1] + removed == pytest.approx(rendered[0], rel=0.02) and removed > 1.0
+    assert simulate(400, grip=1) > 0.2  # another station, but no other channel
+    assert rendered[-1] == pytest.approx(rendered[-2], abs=1e-9)
+    assert simulate(400, z=-1000) == 0.0 and rendered[-1] < 0.1
+    assert simulate(400, z=-4000) == 0.0 and rendered[-1] > rendered[1] + 1.0
     until_it_leaves = np.linalg.norm(session.log()["force_to_master"][1500:3200, :3], axis=1)
     assert np.abs(np.diff(until_it_leaves)).max() < 0.2
 
@@ -199,11 +199,11 @@ def test_new_grip_object_and_sensor_continue_the_state(scenario, load):
         ends.append(session.ms)
         session.advance(30)
     log = session.log()
-    pull, felt = log["hand_wrench_E"][:, :3], log["force_to_master"][:, :3]
+    pull, rendered = log["hand_wrench_E"][:, :3], log["force_to_master"][:, :3]
     assert np.abs(pull[115:120]).max() > 0.01
     for k in ends:
         assert np.abs(np.diff(pull[k - 1 : k + 2], axis=0)).max() < 0.05
-        assert np.abs(np.diff(felt[k - 1 : k + 5], axis=0)).max() < 2e-3
+        assert np.abs(np.diff(rendered[k - 1 : k + 5], axis=0)).max() < 2e-3
         assert np.abs(np.diff(log["slave_state"][k - 1 : k + 5, :6], axis=0)).max() < 1e-3
     mass = log["load_estimate"][:, 6]
     assert mass[ends[1] + 1] - mass[ends[1]] == pytest.approx(0.8)
