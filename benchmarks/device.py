@@ -30,11 +30,11 @@ from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state, unpacked_state
-from drake_teleop.live.external_master import with_device
 from drake_teleop.live.haply import read_message
 from drake_teleop.live.live import Live
-from drake_teleop.live.pace import without_collections
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.pace import without_garbage_collection
+from drake_teleop.live.scenarios import live_scenario, with_device
+from drake_teleop.live.session import Session
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.operator.operator import GRIPS
@@ -171,7 +171,7 @@ def in_station(grip: str, *, observe: bool) -> tuple[float, float]:
         place = {"z": 1e5 * (virtual.position[2] - start), "held": 1, "clutch": 1}
         session.apply(session.inputs.changed(place))
         session.advance(2)
-        session.news()
+        session.new_rows()
         for _ in range(2):
             force = guard.tick(virtual.position, tuple(wrench), 2e-3, _TICK)
             virtual.move(force[:3], _TICK)
@@ -194,8 +194,8 @@ def fuzzed(count: int = 10_000) -> dict[str, float]:
         for i in random.integers(0, len(packet), random.integers(1, 40)):
             packet[i] = random.integers(256)
         cut = bytes(packet[: random.integers(len(packet))] if k % 10 == 0 else packet)
-        link._take(cut, "peer", 1e-3 * k)
-        led = link.lead(1e-3 * k)
+        link._handle_packet(cut, "peer", 1e-3 * k)
+        led = link.hand_inputs(1e-3 * k)
         wrong += not all(np.isfinite(value) for value in led.values())
         state = unpacked_state(cut)
         refused += state is None
@@ -217,7 +217,7 @@ def driven(seconds: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "device.json"
         device = client(link.port, seconds + 2.0, told, "--depth", "0.075", "--grip", "medium")
-        while live.still or link.silent(clock()):  # until it has begun
+        while live.is_idle or link.silent(clock()):  # until it has begun
             live.tick(clock)
             time.sleep(1e-3)
         live.join(1, clock())
@@ -250,7 +250,7 @@ def main() -> None:
     parser.add_argument("--drive", action="store_true", help="the whole station too")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    with without_collections():  # as in the server
+    with without_garbage_collection():  # as in the server
         figures, late = linked(options.seconds)
     figures |= silent() | passive(late) | fuzzed()
     for grip in GRIPS:

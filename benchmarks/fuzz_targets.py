@@ -37,7 +37,7 @@ from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study
 from drake_teleop.live.inputs import RANGES, Inputs, header, read_inputs
 from drake_teleop.live.inputs import row as inputs_row
-from drake_teleop.live.messages import SLOWEST, parse
+from drake_teleop.live.live import MAX_SLOWDOWN, parse
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -509,7 +509,7 @@ def _message(path: Path) -> None:
             if not (isinstance(value, int) and low <= value <= high):
                 raise AssertionError(f"{name} = {value!r}")
         pose = inputs.changed({"held": 1}).pose(np.zeros(3))
-        if not 1.0 <= found.get("slow", 1.0) <= SLOWEST or not np.isfinite(pose).all():
+        if not 1.0 <= found.get("slow", 1.0) <= MAX_SLOWDOWN or not np.isfinite(pose).all():
             raise AssertionError(f"{found!r}")
 
 

@@ -28,12 +28,12 @@ import numpy as np
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.choice_names import NETWORKS
-from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.inputs import NETWORKS, SLICE_MS
 from drake_teleop.live.live import FRAME, Live
-from drake_teleop.live.pace import without_collections
+from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
+from drake_teleop.live.scenarios import live_scenario
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import LoadScenario
@@ -64,8 +64,8 @@ def driven(seconds: float, folder: Path) -> dict[str, float]:
         now = clock()
         if now >= next_message:
             next_message += FRAME
-            live.hear(1, json.dumps({"set": wanted(now - start)}), now)
-        if not live.still and live.pace.wait(now) <= 0:
+            live.handle_message(1, json.dumps({"set": wanted(now - start)}), now)
+        if not live.is_idle and live.pace.wait(now) <= 0:
             late.append(-live.pace.wait(now))
         frame = live.tick(clock)
         if frame is not None:
@@ -119,7 +119,7 @@ def spent(session: Session, choice: dict[str, int], seconds: float) -> list[floa
         session.apply(session.inputs.changed(wanted(1e-3 * session.ms)))
         session.advance()
         taken.append(1e3 * (time.thread_time() - start))
-        session.news()  # a page asks for them, too
+        session.new_rows()  # a page asks for them, too
     return taken[1000 // SLICE_MS :]
 
 
@@ -139,15 +139,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     if options.slices:
-        with without_collections():
+        with without_garbage_collection():
             finish(slices(options.seconds), options.json)
         return
     with tempfile.TemporaryDirectory() as folder:
-        with without_collections():
+        with without_garbage_collection():
             figures = driven(options.seconds, Path(folder) / "drive")
         drive = read_drive(Path(folder) / "drive")
         cpu = time.process_time()
-        repeat(drive, silent(""), Path(folder) / "again")
+        drive.repeat(silent(""), Path(folder) / "again")
         seconds = drive.scenario.simulation.duration
         figures["core_share_of_repeat"] = (time.process_time() - cpu) / seconds
         parts = sorted((Path(folder) / "drive" / "log.parquet").iterdir())

@@ -20,9 +20,9 @@ import numpy as np
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.choice_names import NAMES
-from drake_teleop.live.choices import chosen, filled_after
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.inputs import NAMES
+from drake_teleop.live.scenarios import chosen_scenario, fill_time, live_scenario
+from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
 
@@ -45,7 +45,7 @@ class Driven:
         while self.session.ms < end:
             self.session.apply(self.inputs)
             self.session.advance()
-            self.rows.append(self.session.news())
+            self.rows.append(self.session.new_rows())
 
     def signal(self, name: str, instead: str = "") -> np.ndarray:
         return np.concatenate([rows[name if name in rows else instead] for rows in self.rows])
@@ -82,7 +82,7 @@ class Driven:
 def measured(driven: Driven, z: int, network: int, method: int) -> dict[str, float]:
     """Figures of one network and method."""
     still = driven.inputs.changed({"network": network, "method": method})
-    fills = filled_after(chosen(driven.scenario, driven.load, still))
+    fills = fill_time(chosen_scenario(driven.scenario, driven.load, still))
     figures = driven.change(fills + AFTER, network=network, method=method)
     driven.go(0.8 + fills, z=z)  # at rest, with nothing on its way
     back = driven.change(0.8, network=0, method=0)

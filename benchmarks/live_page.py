@@ -24,10 +24,11 @@ from browser import CHROMIUM, Page, opened
 
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.hand import BEHIND
-from drake_teleop.live.live import TOUCH, Live
+from drake_teleop.live.hand import LEAD_TIME_S
+from drake_teleop.live.live import TOUCH_FORCE_N, Live
+from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.live.server import LiveDrive, drive
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import forward_kinematics
 
@@ -94,13 +95,13 @@ def way(speed: float = 0.12) -> float:
     scenario = live_scenario(LoadScenario("touch"))
     session, table = Session(scenario, identified_load(scenario)), slave_arm(scenario).table
     session.advance(1000)
-    session.news()
+    session.new_rows()
     R_WS, start, place = np.empty((3, 3)), np.full(3, np.nan), np.empty(3)
     while True:
-        ahead = BEHIND + 1e-3 * (session.ms - 1000)
+        ahead = LEAD_TIME_S + 1e-3 * (session.ms - 1000)
         session.apply(session.inputs.changed({"z": 1e5 * speed * ahead}))
         session.advance(1)
-        q = session.news()["slave_state"][-1, : table.shape[0] - 1]
+        q = session.new_rows()["slave_state"][-1, : table.shape[0] - 1]
         forward_kinematics(table, q, R_WS, place)
         start = place.copy() if np.isnan(start[0]) else start
         if np.linalg.norm(place - start) > 2e-4:
@@ -117,7 +118,7 @@ def vibration(page: Page, driven: LiveDrive, trials: int) -> list[float | None]:
     def watched(ms: int) -> None:
         start = time.time()
         advance(ms)
-        if not touched and session.pressed() > 0.5:
+        if not touched and session.contact_force() > 0.5:
             touched.append(start)
 
     session.advance = watched  # type: ignore[method-assign]
@@ -177,7 +178,9 @@ def free_motion(seconds: float) -> dict[str, float]:
     while clock.now < seconds + 2.0:
         share = min(clock.now, 2.0) / 2.0
         z = share * (4000.0 + 9000.0 * np.sin(2 * np.pi * 2.63 * clock.now))
-        live.hear(1, json.dumps({"set": {"z": z, "x": 600.0 * np.sin(3.0 * clock.now)}}), clock())
+        live.handle_message(
+            1, json.dumps({"set": {"z": z, "x": 600.0 * np.sin(3.0 * clock.now)}}), clock()
+        )
         frame = live.tick(clock)
         if frame is not None and clock.now > 2.0:
             seen.append([frame["f"][1][1], frame["f"][0][1]])
@@ -187,8 +190,8 @@ def free_motion(seconds: float) -> dict[str, float]:
         "free_s": seconds,
         "free_peak_acceleration": fastest,
         "free_contact_force_max_N": float(forces[:, 0].max()),
-        "free_vibrates_by_contact": float((forces[:, 0] >= TOUCH).mean()),
-        "free_vibrates_by_measured": float((forces[:, 1] >= TOUCH).mean()),
+        "free_vibrates_by_contact": float((forces[:, 0] >= TOUCH_FORCE_N).mean()),
+        "free_vibrates_by_measured": float((forces[:, 1] >= TOUCH_FORCE_N).mean()),
     }
 
 

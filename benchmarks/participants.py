@@ -69,7 +69,7 @@ def of_psi(curve: Curve, rng: np.random.Generator, trials: int) -> Psi:
     psi = Psi(LOW, HIGH)
     for _ in range(trials):
         level = psi.next_level()
-        psi.answered(level, bool(rng.random() < curve(level)))
+        psi.update(level, bool(rng.random() < curve(level)))
     return psi
 
 

@@ -23,9 +23,9 @@ import numpy as np
 
 from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.choice_names import NETWORKS
-from drake_teleop.live.inputs import RANGES, SLICE_MS, Inputs
-from drake_teleop.live.session import Drive, Session, live_scenario, read_drive, repeat
+from drake_teleop.live.inputs import NETWORKS, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.scenarios import live_scenario
+from drake_teleop.live.session import Drive, Session, read_drive
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario
@@ -72,7 +72,7 @@ def driven(seconds: float, folder: Path) -> None:
         session.apply(wanted(session.inputs, session.ms, end))
         session.advance()
         if session.ms % (3 * SLICE_MS) == 0:
-            session.news()
+            session.new_rows()
     session.close()
 
 
@@ -81,7 +81,7 @@ def begun(drive: Drive, late: int) -> SimulationResult:
     changes = list(drive.changes[:100])
     ms, inputs = changes[20]
     changes[20] = ms + late, inputs
-    return repeat(Drive(drive.scenario, drive.load, changes), silent(""))
+    return Drive(drive.scenario, drive.load, changes).repeat(silent(""))
 
 
 def differ(one: SimulationResult, other: SimulationResult) -> int:
@@ -112,13 +112,11 @@ def main() -> None:
         figures["numbers"] = sum(log[name].size for name in log)
         force = np.abs(log["true_contact_wrench_W"][:, 2])
         figures["contact_share"] = float((force > 0.5).mean())
-        repeat(drive, silent(""), again)
+        drive.repeat(silent(""), again)
         parts = sorted((folder / "log.parquet").iterdir())
         figures["same_bytes"] = all(p.read_bytes() == (again / p.name).read_bytes() for p in parts)
         for slice_ms in (1, 7, 1000):
-            figures[f"differ_{slice_ms}_ms"] = differ(
-                log, repeat(drive, silent(""), None, slice_ms)
-            )
+            figures[f"differ_{slice_ms}_ms"] = differ(log, drive.repeat(silent(""), None, slice_ms))
             print(f"sliced by {slice_ms} ms", flush=True)
         figures["differ_late"] = differ(begun(drive, 0), begun(drive, 1))
     for name, value in figures.items():

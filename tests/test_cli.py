@@ -1,4 +1,4 @@
-"""The command line: starts light, hands its options on, and fails in one line."""
+"""The command line: light imports, passing of options, one-line errors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def run_main(capsys, *arguments: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def install(monkeypatch):
-    """Puts a function in the place of a command's module."""
+    """Replace a command's module by one function."""
 
     def put(module: str, name: str, function) -> None:
         fake = types.ModuleType(module)
@@ -131,7 +131,7 @@ def test_wrong_usage_is_one_error_line_and_status_2(capsys, arguments):
         ("--acceleration", "1e300", "1e+300 is outside 0 to 100000"),
     ],
 )
-def test_a_range_is_said_in_words(capsys, option, number, says):
+def test_number_out_of_range_is_reported_in_words(capsys, option, number, says):
     assert run_main(capsys, "excite", option, number)[2].endswith(f"'{option}': {says}\n")
 
 
@@ -147,7 +147,7 @@ def test_a_range_is_said_in_words(capsys, option, number, says):
         ("--causal-tare", "1e9", "1e+09 is outside 0 to 36000"),
     ],
 )
-def test_no_option_takes_a_number_that_cannot_be(capsys, option, number, says):
+def test_options_refuse_impossible_numbers(capsys, option, number, says):
     err = run_main(capsys, "eliminate", "log.csv", "--load", "x.json", option, number)[2]
     assert err.endswith(f"'{option}': {says}\n")
 
@@ -162,19 +162,19 @@ def test_a_command_that_fails_leaves_no_empty_folder(capsys, tmp_path, command):
     assert there.is_dir() and not (tmp_path / "new").exists()
 
 
-def test_what_a_command_wrote_is_kept(capsys, tmp_path):
+def test_output_of_a_command_is_kept(capsys, tmp_path):
     log = tmp_path / "x.csv"
     log.write_text("a,b\n1,2\n")
     assert run_main(capsys, "inspect", str(log), "--quiet", "--out", str(tmp_path / "new"))[0] == 0
     assert (tmp_path / "new" / "summary.json").is_file()
 
 
-def test_an_error_line_has_an_end(capsys):
+def test_error_line_has_a_maximum_length(capsys):
     err = run_main(capsys, "run", "\x1b[31m" + "x" * 1000)[2]
     assert len(err) <= LONGEST_LINE + len("\n") and err.isascii() and "\x1b" not in err
 
 
-def test_warnings_are_for_those_who_write_programs(capsys, monkeypatch, recwarn):
+def test_python_warnings_are_not_printed(capsys, monkeypatch, recwarn):
     def names():
         np.float64(1e308) * np.float64(10.0)
         warnings.warn("slow", NumbaWarning, stacklevel=1)
@@ -193,7 +193,7 @@ def test_warnings_are_for_those_who_write_programs(capsys, monkeypatch, recwarn)
         (OSError("disk on fire"), 2, "error: disk on fire"),
     ],
 )
-def test_bad_input_is_one_error_line(capsys, install, exception, status, message):
+def test_invalid_input_is_one_error_line(capsys, install, exception, status, message):
     def fail(*arguments, **options):
         raise exception
 
@@ -210,7 +210,7 @@ def test_ctrl_c_is_status_130_and_no_traceback(capsys, install):
     assert (status, out, err.split()) == (130, "", ["interrupted"])
 
 
-def test_programming_mistakes_keep_their_traceback(install):
+def test_programming_errors_keep_their_traceback(install):
     def mistake(*arguments, **options):
         raise TypeError("a bug")
 
@@ -220,7 +220,7 @@ def test_programming_mistakes_keep_their_traceback(install):
 
 
 @pytest.mark.parametrize(("lines", "status"), [([], 0), (["Mass: beyond our bound"], 1)])
-def test_a_number_that_is_not_as_accepted_is_status_1(capsys, install, lines, status):
+def test_unaccepted_number_has_status_1(capsys, install, lines, status):
     install(
         "drake_teleop.lab.reproduction.reproduce", "reproduce_command", lambda *_, **__: "figures"
     )
@@ -232,7 +232,7 @@ def test_a_number_that_is_not_as_accepted_is_status_1(capsys, install, lines, st
     ("terminal", "typed", "status"),
     [(False, "y", 2), (True, "n", 2), (True, "", 2), (True, "y", 0)],
 )
-def test_many_runs_are_asked_for_where_somebody_can_answer(
+def test_many_runs_require_a_confirmation_at_a_terminal(
     tmp_path, capsys, monkeypatch, install, terminal, typed, status
 ):
     def study_command(path, out, *, yes, **options):
@@ -284,7 +284,7 @@ def test_options_reach_the_commands(capsys, install):
     ]
 
 
-def test_eliminate_hands_on_the_scaling_law(capsys, install):
+def test_eliminate_passes_the_scaling_law_on(capsys, install):
     calls = []
     install(
         "drake_teleop.cli.logs",

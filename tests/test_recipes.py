@@ -122,7 +122,8 @@ assert (force(method="share", share={"share": 0.0}) == 0.0).all()
 DRIVE = """
 from pathlib import Path
 from drake_teleop.live.inputs import Inputs
-from drake_teleop.live.session import Session, live_scenario, read_drive, repeat
+from drake_teleop.live.scenarios import live_scenario
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.common.progress import silent
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import ScenarioFromData
@@ -140,7 +141,7 @@ if {tdpa} == 2:
         session.advance(10)
     session.close()
 else:
-    repeat(read_drive(folder), silent(""), folder / "again.parquet")
+    read_drive(folder).repeat(silent(""), folder / "again.parquet")
     names = [sorted((folder / name).iterdir()) for name in ("log.parquet", "again.parquet")]
     one, other = ([path.read_bytes() for path in paths] for paths in names)
     assert one == other and len(b"".join(one)) > 10_000

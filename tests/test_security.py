@@ -48,7 +48,7 @@ EXPLAINED = {
     ("robots/rtde.py", "subprocess"),
     ("robots/changes.py", "subprocess"),  # the test of the fit, beside the loop
     # Likewise, with the addresses of a device and of this process.
-    ("live/device.py", "subprocess"),
+    ("live/device_link.py", "subprocess"),
 }  # fmt: skip
 LISTENS = re.compile(
     r"\bMeshcat\(.*|\bClient\(|LocalCluster\(|\bsocket\b|\bhttp\.|socketserver|asyncio"

@@ -15,8 +15,9 @@ import numpy as np
 
 import drake_teleop as dt
 from drake_teleop.lab.identified_load import identified_load
-from drake_teleop.live.choice_names import METHODS, NETWORKS
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.inputs import METHODS, NETWORKS
+from drake_teleop.live.scenarios import live_scenario
+from drake_teleop.live.session import Session
 
 scenario = live_scenario(dt.LoadScenario("contact_transition"))
 session = Session(scenario, identified_load(scenario))

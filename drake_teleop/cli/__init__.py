@@ -1,1 +1,1 @@
-"""The command line: commands and their tables on the terminal."""
+"""Command line: commands and their tables on the terminal."""

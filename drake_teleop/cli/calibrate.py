@@ -1,9 +1,9 @@
-"""`drake-teleop calibrate`: identify the load from a stream until it is known, with advice.
+"""`drake-teleop calibrate`: guided identification of the load from a live stream.
 
 Files in the output folder, beside those of `identify`:
 
 ============= ==================================================================================
-log.parquet   the recorded log, for `identify log.parquet`; log.yaml with a table for each stream
+log.parquet   recorded log, for `identify log.parquet`; log.yaml with a table for each stream
               if the source delivers poses or an IMU
 settling.png  half-widths of the intervals over time, with the advice
 summary.json  that of `identify`, with "tolerance", "known" (by name), "all_known",
@@ -36,10 +36,9 @@ from drake_teleop.load.tolerance import (
 )
 from drake_teleop.robots.calibrate import DEFAULT, calibrate
 from drake_teleop.robots.calibration import Look
-from drake_teleop.robots.joints import SensorPoseOfJoints
 from drake_teleop.robots.sources_and_sinks import recorded
 
-_BAR, _DECADES = 24, 3.0  # cells, and decades of the half-width over the tolerance
+_BAR, _DECADES = 24, 3.0  # cells of a bar, and decades of the half-width over the tolerance
 
 
 def calibrate_command(
@@ -49,51 +48,40 @@ def calibrate_command(
     until: str = DEFAULT,
     largest: tuple[float, float] | None = None,
     seconds: float = 120.0,
-    real_time: bool = False,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
     quiet: bool = False,
+    **stream_options: Any,
 ) -> dict[str, Any]:
-    """The command `calibrate`; see the top of this module.
+    """Run `calibrate` and return its summary; see `source_of` for the stream's options.
 
     Args:
-        source, real_time, motion, sensor_pose: see `source_of`.
-        out: the folder.
         until: see `read_tolerance`.
-        largest: the sensor's range [N], [N m].
-        seconds, cutoff_hz, delay: see `calibrate`.
-        arm: as for `compensate_command`.
-        quiet: no table.
-
-    Returns:
-        the summary.
+        largest: range of the sensor [N], [N m].
 
     Raises:
-        DrakeTeleopError: if one of them cannot be used, or nothing of a load is in the record.
+        DrakeTeleopError: if an argument is invalid, or the record contains no load.
     """
     tolerance = read_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
-    stream, recorder = recorded(
-        source, limits, real_time=real_time, motion=motion, sensor_pose=sensor_pose, arm=arm
-    )
+    stream, recorder = recorded(source, limits, **stream_options)
+    path = out / recorder.file
     console = Console(stderr=True, quiet=quiet)
-    options = {"cutoff_hz": cutoff_hz, "delay": delay, "seconds": seconds}
+    processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
         with Live(console=console, auto_refresh=False) as live:
 
             def show(at: Look) -> None:
                 live.update(shown(at, tolerance), refresh=True)
 
-            path = out / recorder.file
-            looks = calibrate(stream, recorder, path, tolerance, show=show, **options)  # type: ignore[arg-type]
+            looks = calibrate(
+                stream, recorder, path, tolerance, seconds=seconds, show=show, **processing
+            )
     finally:
         stream.close()
     last = looks[-1]
-    summary = identify_command(path, out, cutoff_hz=cutoff_hz, delay=delay, quiet=True)
+    summary = identify_command(path, out, quiet=True, **processing)
     write_picture(out / "settling.png", draw_settling(looks, tolerance))
     summary |= {
         "tolerance": str(tolerance),
@@ -108,19 +96,17 @@ def calibrate_command(
         "began_anew": recorder.began_anew,
     }
     write_json(out / "summary.json", summary)
-    if summary["all_known"]:
-        console.print(f"known after {last.t:.1f} s: {tolerance}", highlight=False)
-    else:
-        console.print(f"[bold red]not known[/] after {last.t:.1f} s: {tolerance}", highlight=False)
+    verdict = "known" if summary["all_known"] else "[bold red]not known[/]"
+    console.print(f"{verdict} after {last.t:.1f} s: {tolerance}", highlight=False)
     console.print(f"written to {out}", highlight=False, markup=False)
     return summary
 
 
 def shown(at: Look, tolerance: Tolerance) -> Group:
-    """The table of a look, and what to do next."""
+    """Return the table of an intermediate result, and the advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
-    for heading in ("value", "+- (95 %)", "asked", "unit"):
+    for heading in ("value", "+- (95 %)", "required", "unit"):
         table.add_column(heading, justify="left" if heading == "unit" else "right")
     table.add_column("settled", width=_BAR)
     table.add_column("verdict")
@@ -143,7 +129,6 @@ def shown(at: Look, tolerance: Tolerance) -> Group:
 
 
 def _bar(half: float, known: bool) -> Text:
-    """Full at the tolerance, empty `_DECADES` above it."""
     share = 1.0 - np.log10(max(half, 1.0)) / _DECADES if np.isfinite(half) else 0.0
     cells = int(np.clip(share, 0.0, 1.0) * _BAR)
     return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")
@@ -153,14 +138,14 @@ def _verdict(at: Look, k: int) -> str:
     if at.known[k]:
         return "known"
     if not np.isfinite(at.half[k]):
-        return "not known: nothing tells it yet"
+        return "not known: no information yet"
     if at.doubts:
         return "not known: see below"
     return "almost" if at.half[k] <= 1.0 else "not known"
 
 
 def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
-    """Half-widths of the 95 % intervals over the tolerances, and the advice under them."""
+    """Draw half-widths of the 95 % intervals over the tolerances, with the advice."""
     with house_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()
@@ -182,7 +167,7 @@ def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
                 )
                 last = at.advice
         axes.set(
-            title="Half of the 95 % interval over what is asked",
+            title="Half-width of the 95 % interval over the tolerance",
             xlabel="length of the record [s]",
             yscale="log",
         )

@@ -1,15 +1,15 @@
-"""`drake-teleop drive --study STUDY.yaml`: an experiment in the page, or with simulated people."""
+"""`drake-teleop drive --study STUDY.yaml`: an experiment with people or simulated participants."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.experiment.design import Experiment, LoadExperiment
 from drake_teleop.live.experiment.procedure import trials_of
 from drake_teleop.live.experiment.results import write_results
-from drake_teleop.live.experiment.store import MOST, Store, open_results
+from drake_teleop.live.experiment.store import MAX_PARTICIPANT, Store, open_results
 from drake_teleop.station.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -22,26 +22,18 @@ def experiment_command(
     *,
     participant: int | None = None,
     simulated: int = 0,
-    port: int = 0,
-    browser: bool = True,
-    device: str | None = None,
+    **page: Any,
 ) -> pl.DataFrame:
-    """Goes on with an experiment where its folder ends.
+    """Continue an experiment and return the table of `write_results`.
 
     Args:
-        study: the experiment's file, or the name of one that is shipped.
-        out: the folder of the results.
-        participant: whose turn it is; by default of the first who has not done all, or else the
-            next number.
-        simulated: how many simulated participants there are in all; 0: people, in the page.
-        port, browser, device: as of `drive`.
-
-    Returns:
-        The table of `write_results`.
+        participant: default: the first with trials left, or a new one.
+        simulated: total number of simulated participants; 0 for people.
+        page: options of `drive`.
 
     Raises:
-        DrakeTeleopError: for a bad file, or a folder of something else.
-        KeyboardInterrupt: after what is done has been written.
+        DrakeTeleopError: for an invalid file, or a folder with other contents.
+        KeyboardInterrupt: after the results have been written.
     """
     experiment, scenarios = LoadExperiment(study)
     with open_results(out, experiment) as store:
@@ -52,8 +44,7 @@ def experiment_command(
                 from drake_teleop.live.experiment.server import serve_experiment
 
                 number = whose_turn(store, len(trials_of(experiment, 1)), participant)
-                setup = (experiment, scenarios, store, number)
-                serve_experiment(*setup, port=port, browser=browser, device=device)
+                serve_experiment(experiment, scenarios, store, number, **page)
         finally:
             table = write_results(experiment, store)
             print(f"written {out / 'results.csv'} and .png, from {out / 'trials.csv'}", flush=True)
@@ -61,7 +52,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """The participant who goes on: the one that is wanted, or has not done all, or a new one."""
+    """Return the requested participant, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()
@@ -69,8 +60,11 @@ def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
         if len(store.rows(number)) < trials:
             return number
     number = max(known, default=0) + 1
-    if number > MOST:
-        raise DrakeTeleopError(f"{MOST} participants are many", where=str(store.folder))
+    if number > MAX_PARTICIPANT:
+        raise DrakeTeleopError(
+            f"there are {MAX_PARTICIPANT} participants already (the largest number)",
+            where=str(store.folder),
+        )
     return number
 
 

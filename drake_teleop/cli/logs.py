@@ -1,4 +1,4 @@
-"""The commands `identify`, `eliminate` and `detect`: write the results, print a table."""
+"""Commands `identify`, `eliminate` and `detect`: write the results, print a table."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.cli.printing import (
-    print_detection,
-    print_elimination,
-    print_identification,
-)
+from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
 from drake_teleop.common.writing import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
@@ -52,18 +48,10 @@ def identify_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`identify_log`, writing its results into `out`.
+    """Identify the load of a log, write the results into `out`, return the summary.
 
-    Files: identification.json; summary.json; report.html; fit.png and knowledge.png, its
-    pictures; report.png, both on one page.
-
-    Args:
-        method: of the fit, one of `drake_teleop.load.batch.methods.METHODS`.
-        gripper: identification.json of the gripper alone; then the object's object.json, of the
-            same format, is written too (see `drake_teleop.load.identification`).
-
-    Returns:
-        the summary; docs/logs.md explains its names.
+    Files: identification.json; summary.json (names: docs/logs.md); report.html; fit.png and
+    knowledge.png, and report.png with both; with a gripper's file also object.json.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
@@ -122,25 +110,20 @@ def eliminate_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`eliminate_log`, writing contact_wrench.parquet, contact_wrench.png and summary.json.
+    """Write contact_wrench.parquet, contact_wrench.png and summary.json; return the summary.
 
-    The Parquet table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
-    `non_contact_f_x` and `measured_f_x` (offsets removed); with `causal` (see `eliminate_log`) also
-    `causal_contact_f_x` and `causal_scaled_f_x`. The flag `in_contact` says where there is contact,
-    `edge` which samples are not judged (see `EliminatedLog`).
-
-    Returns:
-        the summary; docs/logs.md explains its names.
+    The table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
+    `non_contact_f_x` and `measured_f_x` (without offsets); with `causal` (see `eliminate_log`) also
+    `causal_contact_f_x` and `causal_scaled_f_x`. `in_contact` flags contact, `edge` samples without
+    a decision.
     """
     load_file = Identification.load(load)
+    scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
     found = eliminate_log(
         log,
         load_file,
+        **scales,
         gripper=gripper,
-        sigma=sigma,
-        sigma_object=sigma_object,
-        gamma=gamma,
-        eta=eta,
         causal=causal,
         causal_tare_s=causal_tare_s,
         free=free,
@@ -150,10 +133,7 @@ def eliminate_command(
     summary = common_figures(log, found, cutoff_hz, found.delay_s) | {
         "load": str(load),
         "gripper": None if gripper is None else str(gripper),
-        "sigma": sigma,
-        "sigma_object": sigma_object,
-        "gamma": gamma,
-        "eta": eta,
+        **scales,
         "free": None if free is None else str(free),
         "tare": found.offsets - load_file.offsets,
         "tare_fraction": found.tare_fraction,
@@ -210,13 +190,10 @@ def detect_command(
     delay: str | float = "auto",
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """`detect_log`, writing detection.parquet, detection.png and summary.json.
+    """Write detection.parquet, detection.png and summary.json; return the summary.
 
-    The Parquet table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and
-    `edge` for samples that are not judged.
-
-    Returns:
-        the summary; docs/detection.md explains its names.
+    The table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and `edge` for
+    samples without a decision. The names of the summary: docs/detection.md.
     """
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated
@@ -247,8 +224,6 @@ def detect_command(
 
 def _detection_table(found: DetectedLog) -> pl.DataFrame:
     import polars as pl
-
-    from drake_teleop.logs.read.canonical import WRENCH
 
     columns: dict[str, NDArray[Any]] = {"t": found.eliminated.log.t}
     columns |= {name: found.statistics[:, i] for i, name in enumerate(STATISTICS)}

@@ -1,4 +1,4 @@
-"""The kinds of values and the options that commands have in common."""
+"""Parameter types and options that commands have in common."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from drake_teleop.common.quantities import in_short
 from drake_teleop.common.resources import scenarios_dir, studies_dir
 
 
-class Named(click.Path):
-    """A path that all libraries can say: its name is UTF-8."""
+class Utf8Path(click.Path):
+    """Path whose name is UTF-8, which all libraries accept."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the path, or fail with one line."""
         path = super().convert(value, param, ctx)
         try:
             str(path).encode()
         except UnicodeEncodeError:
-            self.fail(f"{click.format_filename(path)!r} is no name in UTF-8", param, ctx)
+            self.fail(f"{click.format_filename(path)!r} is not a UTF-8 name", param, ctx)
         return path
 
 
-class Shipped(Named):
-    """What is shipped by name, or a file; a shell that is asked to completes both."""
+class ShippedOrPath(Utf8Path):
+    """Name of a shipped file, or a path; the shell completes both."""
 
     def __init__(self, folder: Path, path_type: type) -> None:
         super().__init__(path_type=path_type)
@@ -41,15 +41,15 @@ class Shipped(Named):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """What the shell offers for a word that is begun."""
+        """Return the completions of an incomplete word."""
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
 
 
-PATH = Named(path_type=Path)
-SCENARIO = Shipped(scenarios_dir(), str)
-STUDY = Shipped(studies_dir(), Path)
+PATH = Utf8Path(path_type=Path)
+SCENARIO = ShippedOrPath(scenarios_dir(), str)
+STUDY = ShippedOrPath(studies_dir(), Path)
 
 
 def _check_range(
@@ -58,7 +58,7 @@ def _check_range(
     param: click.Parameter | None,
     ctx: click.Context | None,
 ) -> None:
-    """Refuses what is outside, in words: click's own would be `x>=0`."""
+    """Fail with words for a number out of range; click writes `x>=0`."""
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
         text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
@@ -69,14 +69,14 @@ def _check_range(
 
 
 class Number(click.FloatRange):
-    """A finite number in a range: click's own lets "nan" and "inf" through."""
+    """Finite number in a range; click's type accepts nan and inf."""
 
     name = "number"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number, or fail with one line."""
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -84,13 +84,13 @@ class Number(click.FloatRange):
         return number
 
 
-class Whole(click.IntRange):
-    """A whole number in a range."""
+class Integer(click.IntRange):
+    """Integer in a range."""
 
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number, or fail with one line."""
         number: int = click.INT.convert(value, param, ctx)
         _check_range(self, number, param, ctx)
         return number
@@ -104,23 +104,56 @@ class Delay(click.ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """The value of an option's text; what cannot be one fails in one line."""
+        """Return the number or "auto", or fail with one line."""
         return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
+SCALE = Number(0, 100)
+POSITIVE = Number(0, 1e5, min_open=True)
+
+
+class Names(click.ParamType):
+    """Names separated by commas."""
+
+    name = "NAME,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """Return the names."""
+        if isinstance(value, tuple):
+            return value
+        return tuple(name.strip() for name in value.split(","))
+
+
+class PositiveNumbers(click.ParamType):
+    """Positive numbers separated by commas."""
+
+    name = "number,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Return the numbers, or fail with one line."""
+        if isinstance(value, tuple):
+            return value
+        return tuple(POSITIVE.convert(part, param, ctx) for part in value.split(","))
+
+
 def out(command: str) -> Callable[[Any], Any]:
-    """`--out DIR`, by default out/COMMAND. A command that fails leaves no empty folder there."""
+    """Return the option `--out DIR`; a command that fails leaves no empty folder there."""
     return click.option(
         "--out",
         type=PATH,
         default=Path("out") / command,
         show_default=True,
         metavar="DIR",
-        callback=_not_left_empty,
+        help="Output folder.",
+        callback=_remove_empty_at_failure,
     )
 
 
-def _not_left_empty(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
+def _remove_empty_at_failure(ctx: click.Context, _: click.Parameter, folder: Path) -> Path:
     new = [each for each in (folder, *folder.parents) if not os.path.exists(each)]
     if new:
         ctx.call_on_close(lambda: _remove_empty(new))
@@ -128,40 +161,112 @@ def _not_left_empty(ctx: click.Context, _: click.Parameter, folder: Path) -> Pat
 
 
 def _remove_empty(new: list[Path]) -> None:
-    """Removes the folders as far as there is nothing in them but empty folders; innermost first."""
+    """Remove the folders if they contain only empty folders, innermost first."""
     inner = sorted(new[0].rglob("*"), reverse=True)
     for folder in (*inner, *new):
         if folder.is_symlink() or not folder.is_dir():
             return
         try:
             folder.rmdir()
-        except OSError:  # there is something in it
+        except OSError:  # it is not empty
             return
 
 
-_SEED = Whole(0, 2**32 - 1)
-seed = click.option("--seed", type=_SEED, help="Instead of the scenario's seed.")
-seed_0 = click.option("--seed", type=_SEED, default=0, show_default=True)
+_SEED = Integer(0, 2**32 - 1)
+seed = click.option("--seed", type=_SEED, help="Seed of the noise.  [default: the scenario's]")
+seed_0 = click.option("--seed", type=_SEED, default=0, show_default=True, help="Random seed.")
 jobs = click.option(
-    "--jobs", type=Whole(1, 4096), help="Processes at once.  [default: one for each core]"
+    "--jobs",
+    type=Integer(1, 4096),
+    callback=lambda _ctx, _param, count: count or -1,
+    help="Number of parallel processes.  [default: one for each core]",
 )
-quiet = click.option("--quiet", is_flag=True, help="No progress bars, no tables.")
+cluster = click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Dask scheduler that runs the processes, or local for one on this machine.",
+)
+quiet = click.option("--quiet", is_flag=True, help="Print no progress bars and no tables.")
 cutoff = click.option(
     "--cutoff",
     "cutoff_hz",
-    type=Number(0, 1e5, min_open=True),
+    type=POSITIVE,
     default=30.0,
     show_default=True,
     metavar="HZ",
-    help="Zero-phase low-pass on all signals.",
+    help="Zero-phase low-pass on all signals [Hz].",
 )
 delay = click.option(
     "--delay",
     type=Delay(),
     default="auto",
     show_default=True,
-    help="Motion behind the wrench, in seconds, or estimated.",
+    help="Delay of the motion behind the wrench [s], or auto to estimate it.",
 )
+gamma = click.option(
+    "--gamma", type=SCALE, default=1.0, show_default=True, help="Scale of the contact wrench."
+)
+package_paths = click.option(
+    "--package-path",
+    "package_paths",
+    type=PATH,
+    multiple=True,
+    metavar="DIR",
+    help="Folder of package:// addresses in the model; may be repeated.",
+)
+gripper = click.option(
+    "--gripper",
+    type=PATH,
+    help="identification.json of the gripper without the object, in the same sensor frame.",
+)
+free = click.option(
+    "--free",
+    type=PATH,
+    metavar="LOG",
+    help="Log of free motion with this load, for the threshold of contact."
+    "  [default: quiet parts of LOG]",
+)
+
+
+def ask(question: str) -> bool:
+    """Return the answer of a user at a terminal; False without a terminal."""
+    return sys.stdin.isatty() and click.confirm(question, err=True)
+
+
+yes = click.option(
+    "--yes",
+    is_flag=True,
+    callback=lambda _ctx, _param, is_set: is_set or ask,
+    help="Start more than 100,000 runs without a question.",
+)
+
+
+def load(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
+    """Return the option `--load`, with a description of its default."""
+    text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
+    return click.option("--load", type=PATH, required=required, help=text)
+
+
+def sigma(text: str) -> Callable[[Any], Any]:
+    """Return the option `--sigma` with this help."""
+    return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
+
+
+def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
+    """Return the option `--sensor-frame`."""
+    text = "Frame or link of the model at which the wrist sensor measures."
+    return click.option("--sensor-frame", required=required, metavar="NAME", help=text)
+
+
+def sensor_pose(text: str) -> Callable[[Any], Any]:
+    """Return the option `--sensor-pose` with this help."""
+    return click.option(
+        "--sensor-pose",
+        nargs=6,
+        type=Number(-1e3, 1e3),
+        metavar="X Y Z ROLL PITCH YAW",
+        help=text,
+    )
 
 
 def stream(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -182,35 +287,26 @@ def stream(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (
         delay,
         cutoff,
-        click.option("--real-time", is_flag=True, help="Replay a log in its own time."),
+        click.option("--real-time", is_flag=True, help="Replay a log in real time."),
         click.option(
             "--range",
             "largest",
-            type=Number(0, 1e5, min_open=True),
+            type=POSITIVE,
             nargs=2,
             metavar="N NM",
-            help="Of the sensor: what is at its ends is not used, and nothing above it goes out.",
+            help="Range of the sensor [N, N m]; readings at its limits are not used.",
         ),
+        sensor_pose("Pose of the sensor in the frame of the streamed poses [m, deg]."),
+        package_paths,
+        sensor_frame(),
         click.option(
-            "--sensor-pose",
-            nargs=6,
-            type=Number(-1e3, 1e3),
-            metavar="X Y Z ROLL PITCH YAW",
-            help="Of the sensor in the frame whose poses come [m, deg].",
-        ),
-        click.option(
-            "--package-path",
-            "package_paths",
+            "--model",
             type=PATH,
-            multiple=True,
-            metavar="DIR",
-            help="Where package:// addresses of the model are looked up; may be repeated.",
+            help="Model of the arm (URDF, SDF, MJCF), if the motion is that of its joints.",
         ),
-        click.option("--sensor-frame", metavar="NAME", help="Its frame or link with the sensor."),
         click.option(
-            "--model", type=PATH, help="The arm, if its joints tell the motion: URDF, SDF, MJCF."
+            "--motion", metavar="SOURCE", help="Source of the motion, if it is not SOURCE."
         ),
-        click.option("--motion", metavar="SOURCE", help="Who tells the motion, if not SOURCE."),
     ):
         decorated = option(decorated)
     return decorated
@@ -224,63 +320,10 @@ def _arm(model: Path | None, sensor_frame: str | None, package_paths: tuple[Path
         return None
     if sensor_frame is None:
         raise DrakeTeleopError(
-            "the model does not say where the sensor is",
+            "is required with --model",
             where="--sensor-frame",
-            remedy="name the frame or link at which it measures",
+            remedy="name the frame or link at which the sensor measures",
         )
     from drake_teleop.station.slave.joint_poses import arm_of
 
     return arm_of(model, sensor_frame, package_paths)
-
-
-gripper = click.option(
-    "--gripper",
-    type=PATH,
-    help="The identification.json of the gripper without the object, in the same sensor frame.",
-)
-
-
-free = click.option(
-    "--free",
-    type=PATH,
-    metavar="LOG",
-    help="Free motion with this load, which sets the threshold of contact."
-    "  [default: what is quiet in LOG]",
-)
-
-
-def ask(question: str) -> bool:
-    """The answer of somebody at a terminal; nobody there says no."""
-    return sys.stdin.isatty() and click.confirm(question, err=True)
-
-
-yes = click.option("--yes", is_flag=True, help="Begin, also if there are more than 100,000 runs.")
-
-
-class Names(click.ParamType):
-    """Names with commas between them."""
-
-    name = "NAME,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """The value of an option's text; what cannot be one fails in one line."""
-        if isinstance(value, tuple):
-            return value
-        return tuple(name.strip() for name in value.split(","))
-
-
-class PositiveNumbers(click.ParamType):
-    """Positive numbers with commas between them."""
-
-    name = "number,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """The value of an option's text; what cannot be one fails in one line."""
-        if isinstance(value, tuple):
-            return value
-        number = Number(0, 1e5, min_open=True)
-        return tuple(number.convert(part, param, ctx) for part in value.split(","))

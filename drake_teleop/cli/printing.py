@@ -1,4 +1,4 @@
-"""What the commands for logs print on the terminal."""
+"""Tables of the log commands on the terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from drake_teleop.load.identification import PARAMETERS
 
 
 def print_identification(summary: dict[str, Any], out: Path) -> None:
-    """The table of the load, and what the fit leaves."""
+    """Print the identified load and the residuals."""
     from rich.table import Table
 
     table = Table(title=f"Load identified from {Path(summary['log']).name}", title_justify="left")
@@ -38,7 +38,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
 
 
 _Row: TypeAlias = tuple[str, float, float, float, str, str]
-"""Label, value, standard deviation, how many of the unit make one of SI, unit, parameter."""
+"""Label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
 def _load_rows(load: dict[str, Any]) -> list[_Row]:
@@ -62,7 +62,7 @@ def _add_rows(table: Any, rows: list[_Row], identifiable: list[str]) -> None:
 
 
 def print_elimination(summary: dict[str, Any], out: Path) -> None:
-    """The table of what is left of the wrench, and the contacts."""
+    """Print the residual wrench and the contacts."""
     from rich.table import Table
 
     table = Table(title=f"Contact wrench in {Path(summary['log']).name}", title_justify="left")
@@ -89,7 +89,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
         figures += "; no contact found"
     causal = summary["causal"]
     if causal is not None:
-        late = "late" if causal["mode"] == "delayed" else "made up for by prediction"
+        late = "late" if causal["mode"] == "delayed" else "compensated by prediction"
         figures += (
             f"\ncausal: {1e3 * causal['lag_s']:.1f} ms {late},"
             f" rms of |F| {causal['residual_rms']:.4g} N,"
@@ -99,6 +99,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
+    """Print the contacts, and shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -129,7 +130,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
-    """A table, figures in words, the notes, and where the files are."""
+    """Print a table, figures in words, notes and the folder."""
     from rich.console import Console
 
     lines = [figures]

@@ -1,1 +1,1 @@
-"""A station that is driven while it runs, by a page in the browser or by a recorded drive."""
+"""Live drives of a running station, from the browser or by a haptic device."""

@@ -1,4 +1,4 @@
-"""What the page shows of a station that runs: forces, energy, contact, and what is not right."""
+"""Forces, energy, contact and warnings of a running station, for the page."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 
 Array = NDArray[np.float64]
 
-#: A calculated contact force at the slave that is a contact [N]; above what noise and motion leave.
-CONTACT = 2.0
-_AT_LIMIT = 0.999
-_HAND_PULLS = 59.0  # N of the 60 that a hand can
-_SILENT = 0.05  # s
+#: Eliminated force at the slave that counts as contact [N], above the residual of noise and motion.
+CONTACT_FORCE_N = 2.0
+_LIMIT_SHARE = 0.999
+_HAND_FORCE_LIMIT_N = 59.0  # N; the limit of a hand is 60 N
+_PACKET_TIMEOUT_S = 0.05  # s
 
 
 @njit(cache=True)
-def _least_and_most(vectors, origins, out):
-    """Writes the least and the largest length of vectors (n, 3 or more) from `origins` to `out`."""
+def _norm_range_into(vectors, origins, out):
+    """Write the smallest and largest norm of vectors (n, 3 or more) minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -39,8 +39,8 @@ def _least_and_most(vectors, origins, out):
 
 
 @njit(cache=True)
-def _at_limits(values, limits):
-    """Which columns of (n, k) `values` get to `limits` (k,): their bits are set."""
+def _columns_at_limit(values, limits):
+    """Return a bit mask of the columns of (n, k) that reach `limits` (k,)."""
     found = 0
     for row in range(len(values)):
         for k in range(len(limits)):
@@ -50,11 +50,10 @@ def _at_limits(values, limits):
 
 
 @njit(cache=True)
-def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Adds the work of some rows to `energy` (2,), as of `Cockpit.frame` [J].
+def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
+    """Add the work of new rows to `energy` (2,) [J].
 
-    `before` (4,) is the time and p_WS of the row before them, nan if there is none; then of the
-    last of them.
+    `before` (4,) is [t, p_WS] of the previous row, nan without one.
     """
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
@@ -72,68 +71,56 @@ def _go_on(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Makes frames for the page out of the rows of the log.
-
-    It is called between two slices, when nothing of it is in the processor's caches any more: there
-    each call of numpy takes several times as long as in a loop.
-
-    Args:
-        scenario: of the station.
-    """
+    """Frames of the page. Loops are compiled, as NumPy calls are slow between slices."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
         self._table, n = arm.table, arm.num_joints
         self._limits = (
-            ("speed", "slave_state", slice(n, None), _AT_LIMIT * arm.velocity_limit),
-            ("torque", "joint_torque", slice(None), _AT_LIMIT * arm.effort_limit),
+            ("speed", "slave_state", slice(n, None), _LIMIT_SHARE * arm.velocity_limit),
+            ("torque", "joint_torque", slice(None), _LIMIT_SHARE * arm.effort_limit),
         )
         self._peak = scenario.master.device(0.0, 0.0).peak_force
         self._energy = np.zeros(2)
-        self._before = np.full(4, np.nan)  # t, p_WS of the last row
+        self._last_row = np.full(4, np.nan)  # t, p_WS of the last row
         self._forces = np.zeros((3, 2))
 
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Numbers of the newest rows, for JSON: every one of them is finite.
+        """Return finite values of at least one new row, for JSON.
 
-        Args:
-            rows: as `Session.news` gives them, one at least.
-            inputs: that hold.
-
-        Returns:
-            "t" [s]; "f": least and largest measured, contact and felt force, all at the hand [N];
-            "contact"; "energy": of the hand into the device, of the tool into what it touches [J];
-            "tool" and "stylus" [m]; "words": what is clipped or in a safe state.
+        "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": of
+        the hand into the device, of the tool into the environment [J]; "tool", "stylus" [m];
+        "words": warnings.
         """
-        nothing = np.zeros((len(rows["t"]), 6))
-        contact_S = rows.get("contact_wrench_S", nothing)
-        measured, contact, felt = self._forces
-        _least_and_most(rows["measured_wrench_S"], rows["load_estimate"], measured)
-        _least_and_most(contact_S, nothing, contact)
-        _least_and_most(rows["force_to_master"], nothing, felt)
-        noticed = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT
+        zeros = np.zeros((len(rows["t"]), 6))
+        contact_S = rows.get("contact_wrench_S", zeros)
+        measured, contact, rendered = self._forces
+        _norm_range_into(rows["measured_wrench_S"], rows["load_estimate"], measured)
+        _norm_range_into(contact_S, zeros, contact)
+        _norm_range_into(rows["force_to_master"], zeros, rendered)
+        in_contact = rows["contact"].any() if "contact" in rows else contact[1] > CONTACT_FORCE_N
         self._forces[:2] *= inputs.scales["force_scale"]
-        _go_on(
+        _add_work(
             self._table,
             rows["t"],
             rows["slave_state"],
             contact_S,
             rows["hand_wrench_E"],
             rows["twist_master"],
-            self._before,
+            self._last_row,
             self._energy,
         )
         return {
             "f": [_numbers(pair, 4) for pair in self._forces],
-            "contact": bool(noticed),
+            "contact": bool(in_contact),
             "energy": _numbers(self._energy, 5),
-            "words": list(dict.fromkeys(self._words(rows, inputs, nothing))),
-            "t": round(float(self._before[0]), 3),
-            "tool": _numbers(self._before[1:], 5),
+            "words": list(dict.fromkeys(self._warnings(rows, inputs, zeros))),
+            "t": round(float(self._last_row[0]), 3),
+            "tool": _numbers(self._last_row[1:], 5),
             "stylus": _numbers(rows["pose_master"][-1, 4:], 5),
         }
 
-    def _words(self, rows: dict[str, Array], inputs: Inputs, nothing: Array) -> Iterator[str]:
+    def _warnings(self, rows: dict[str, Array], inputs: Inputs, zeros: Array) -> Iterator[str]:
         for name in ("fault", "fault_at_hand"):
             if name in rows and rows[name].any():
                 faults = set(rows[name][:, 0]) - {0.0}
@@ -142,23 +129,22 @@ class Cockpit:
             yield "the arm cannot reach the position of the hand"
         if rows["saturated"].max() > 0:
             yield "the wrist sensor is saturated"
-        if self._forces[2, 1] >= _AT_LIMIT * self._peak:
+        if self._forces[2, 1] >= _LIMIT_SHARE * self._peak:
             yield f"the device renders its largest force, {self._peak:g} N"
         hand = np.empty(2)
-        _least_and_most(rows["hand_wrench_E"], nothing, hand)
-        if hand[1] > _HAND_PULLS:
+        _norm_range_into(rows["hand_wrench_E"], zeros, hand)
+        if hand[1] > _HAND_FORCE_LIMIT_N:
             yield "the simulated hand pulls with its largest force"
-        for what, name, part, limits in self._limits:
-            full = _at_limits(rows[name][:, part], limits)
-            if full:
-                joints = [str(k + 1) for k in range(len(limits)) if full >> k & 1]
-                yield f"joint {', '.join(joints)} at the limit of its {what}"
-        if "ports" in rows and rows["ports"][:, 4:6].max() > _SILENT:
+        for quantity, name, part, limits in self._limits:
+            at_limit = _columns_at_limit(rows[name][:, part], limits)
+            if at_limit:
+                joints = [str(k + 1) for k in range(len(limits)) if at_limit >> k & 1]
+                yield f"joint {', '.join(joints)} at the limit of its {quantity}"
+        if "ports" in rows and rows["ports"][:, 4:6].max() > _PACKET_TIMEOUT_S:
             yield "the network delivers no packets"
         if any(abs(getattr(inputs, name)) == RANGES[name][1] for name in ("x", "y", "z")):
             yield "the hand is at the edge of its box, 0.3 m wide"
 
 
 def _numbers(values: Array, digits: int) -> list[float]:
-    """Rounded, for JSON; what is not finite is 0 (and a fault, which has its words)."""
     return [round(x, digits) if math.isfinite(x) else 0.0 for x in values.tolist()]

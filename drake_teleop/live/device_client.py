@@ -1,10 +1,9 @@
-"""What runs beside a haptic device: its pose to the station, the force back, at 1 kHz.
+"""Client of a haptic device: sends its pose to the station, displays the force, at 1 kHz.
 
     python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
     python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
 
-In a process of its own, so that no slice of the station holds it up; all that keeps a hand safe is
-here (`device_guard`). The virtual device is a mass in a simulated hand that taps and presses.
+A separate process, so that the station cannot delay its safety functions (`device_guard`).
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import DeviceGuard, Limits
 from drake_teleop.live.device_packets import (
-    LONGEST,
+    MAX_PACKET_BYTES,
+    DevicePose,
     DeviceState,
     ForceCommand,
-    Place,
     packed_state,
     unpacked_force,
 )
@@ -36,75 +35,71 @@ from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.robots.udp import endpoint
 from drake_teleop.station.operator.operator import GRIPS
 
-_PERIOD, _LATE = 1e-3, 0.1  # s
-_REMEMBERED = 100_000  # ticks
+_PERIOD_S, _MAX_LATENESS_S = 1e-3, 0.1  # s
+_MAX_AGES = 100_000  # ticks
 
 
 class Device(Protocol):
-    """Any hardware, at its own pace."""
+    """Interface of a haptic device."""
 
     @property
     def limits(self) -> Limits:
-        """What it may give."""
+        """Limits of force, torque and their slew rates."""
 
-    def read(self) -> Place | None:
-        """Waits for its next place, half a second at most; None if there is none."""
+    def read(self) -> DevicePose | None:
+        """Return the next pose, None after half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
-        """Displays [f; tau] in B until the next call."""
+        """Display [f; tau] in B [N, N m]."""
 
     def close(self) -> None:
-        """Lets it go, without force."""
+        """Release the device without force."""
 
 
 class Client:
-    """One device and one station.
+    """Connection of a device and a station.
 
     Attributes:
-        guard: between the two.
-        behind: how old the place was that each force answered [s].
-
-    Args:
-        device: the hardware.
-        address: of the station, udp://127.0.0.1:PORT.
-        observe: whether passivity is observed.
+        guard: safety functions.
+        behind: age of the position that each force answers [s].
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
         self.guard = DeviceGuard(device.limits, observe=observe)
-        self.behind: deque[float] = deque(maxlen=_REMEMBERED)
+        self.behind: deque[float] = deque(maxlen=_MAX_AGES)
         self._device, self._number = device, 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(endpoint(address))
         self._socket.setblocking(False)
         self._command: ForceCommand | None = None
-        self._last: float | None = None
+        self._last_tick: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
-        """One place there and one force back; what was set, None without a place."""
-        place = self._device.read()
+        """Return the displayed wrench after one exchange; None without a pose."""
+        pose = self._device.read()
         now = clock()
-        self._listen()
-        if place is None:
+        self._receive()
+        if pose is None:
             self._device.set((0.0,) * 6)
             return None
         command = self._command
         age = now - command.t if command is not None else np.inf
-        period = _PERIOD if self._last is None else min(max(now - self._last, 1e-5), _LATE)
-        self._last = now
-        asked = (0.0,) * 6 if command is None else command.wrench
-        wrench = self.guard.tick(place.position, asked, age, period)
+        elapsed = _PERIOD_S if self._last_tick is None else now - self._last_tick
+        period = min(max(elapsed, 1e-5), _MAX_LATENESS_S)
+        self._last_tick = now
+        commanded = (0.0,) * 6 if command is None else command.wrench
+        wrench = self.guard.tick(pose.position, commanded, age, period)
         self._device.set(wrench)
-        self._send(place, now, age)
+        self._send(pose, now, age)
         return wrench
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         while True:
             try:
-                packet = self._socket.recv(LONGEST + 1)
+                packet = self._socket.recv(MAX_PACKET_BYTES + 1)
             except BlockingIOError:
                 return
-            except ConnectionError:  # nobody listens there yet
+            except ConnectionError:  # the station is not started yet
                 continue
             command = unpacked_force(packet)
             if command is None or command.number > self._number:
@@ -112,85 +107,81 @@ class Client:
             if self._command is None or command.number >= self._command.number:
                 self._command = command
 
-    def _send(self, place: Place, now: float, age: float) -> None:
+    def _send(self, pose: DevicePose, now: float, age: float) -> None:
         self._number += 1
         behind = age if age < 1.0 else 0.0
         if behind:
             self.behind.append(behind)
-        x, y, z = map(float, place.position)
-        w, i, j, k = map(float, place.orientation)
-        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), place.flags, behind)
+        x, y, z = map(float, pose.position)
+        w, i, j, k = map(float, pose.orientation)
+        state = DeviceState(self._number, now, (x, y, z), (w, i, j, k), pose.flags, behind)
         try:
             self._socket.send(packed_state(state))
         except (BlockingIOError, ConnectionError):  # the next one is newer
             return
 
     def close(self) -> None:
-        """Lets the device go."""
+        """Release the device and close the socket."""
         self._device.close()
         self._socket.close()
 
 
-class Simulated:
-    """A virtual device as hardware, in real time.
-
-    Args:
-        virtual: the device.
-    """
+class RealTimeDevice:
+    """Virtual device in real time."""
 
     limits = Limits(force=10.0)
 
     def __init__(self, virtual: VirtualDevice) -> None:
         self.virtual = virtual
         self._wrench: Sequence[float] = (0.0,) * 6
-        self._due = self._moved = time.perf_counter()
+        self._due = self._simulated_until = time.perf_counter()
 
-    def read(self) -> Place:
-        """See `Device`."""
-        self._due += _PERIOD
+    def read(self) -> DevicePose:
+        """See `Device.read`."""
+        self._due += _PERIOD_S
         now = time.perf_counter()
         if self._due > now:
             time.sleep(self._due - now)
         now = time.perf_counter()
-        if now - self._due > _LATE:  # what was missed is not made up for
-            self._due = self._moved = now
-        self.virtual.move(self._wrench[:3], max(now - self._moved, 1e-6))
-        self._moved = now
-        return Place(self.virtual.position)
+        if now - self._due > _MAX_LATENESS_S:  # missed ticks are not made up for
+            self._due = self._simulated_until = now
+        self.virtual.move(self._wrench[:3], max(now - self._simulated_until, 1e-6))
+        self._simulated_until = now
+        return DevicePose(self.virtual.position)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device`."""
+        """See `Device.set`."""
         self._wrench = wrench
 
     def close(self) -> None:
-        """See `Device`."""
+        """See `Device.close`."""
 
 
-def made(address: str, grip: str, depth: float) -> Device:
-    """The device of an address: `virtual`, or haply://HOST:PORT.
-
-    Raises:
-        DrakeTeleopError: for another one, or if it does not answer.
-    """
+def open_device(address: str, grip: str, depth: float) -> Device:
+    """Return the device of an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
-        return Simulated(VirtualDevice(tapping(depth), grip))
+        return RealTimeDevice(VirtualDevice(tapping(depth), grip))
     if address.startswith("haply://"):
         return HaplyDevice(address)
-    raise DrakeTeleopError("is no device", where=address, remedy="virtual, or haply://HOST:PORT")
+    raise DrakeTeleopError(
+        "is not a device", where=address, remedy="use virtual or haply://HOST:PORT"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Runs until the time is over, Ctrl-C, or the device is gone."""
+    """Run until the time is over, Ctrl-C, or the device disconnects."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")
-    parser.add_argument("--grip", choices=tuple(GRIPS), default="medium", help="of the virtual one")
-    parser.add_argument("--depth", type=float, default=0.08, help="how far its hand goes down [m]")
-    parser.add_argument("--seconds", type=float, default=float("inf"))
-    parser.add_argument("--no-observer", action="store_true")
-    parser.add_argument("--json", type=Path, help="figures, at the end")
+    parser.add_argument(
+        "--grip", choices=tuple(GRIPS), default="medium", help="of the virtual hand"
+    )
+    parser.add_argument("--depth", type=float, default=0.08, help="stroke of that hand [m]")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="duration")
+    parser.add_argument("--no-observer", action="store_true", help="no passivity observer")
+    parser.add_argument("--json", type=Path, help="output file of the figures")
     options = parser.parse_args(arguments)
-    device = made(options.device, options.grip, options.depth)
+    device = open_device(options.device, options.grip, options.depth)
     client = Client(device, options.station, observe=not options.no_observer)
     end, largest = time.perf_counter() + options.seconds, 0.0
     try:

@@ -1,19 +1,11 @@
-"""What stands between a force command and a haptic device's motors, beside the device.
+"""Safety functions between force commands and the motors of a haptic device.
 
-It knows which force was set and how far the device then moved, which nobody else knows in time:
-
-* silence: 20 ms after the last command the force fades, at 50 ms it is zero; afterwards it
-  may grow by 100 N/s;
-* the device's largest force and torque, and their largest slew;
-* a passivity observer (Hannaford and Ryu 2002): the energy that the hand has put in through this
-  port, E += -f_k . (x_k+1 - x_k). Before each tick the next motion is foreseen to be the last one,
-  and once again what it differed from the one before. What the force would give out along it
-  beyond E is taken off it, as by a damper of 100 N s/m at most. 30 uJ are kept back, once, for no
-  motion is foreseen exactly. Held from tick to tick a stiff wall gives out more than was put in;
-  so does one that is late.
-
-The energy that may come out again is bounded, so that a wall does not live on what was rubbed off
-long ago; E itself, from the beginning, is then never less than what is counted.
+* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms; its limit then
+  rises by 100 N/s.
+* Limits of force, torque and their slew rates.
+* Passivity observer (Hannaford and Ryu 2002) of the energy E += -f_k . (x_k+1 - x_k), at most
+  0.3 J. A force that would return more than E along the extrapolated displacement is reduced, by
+  at most a damper of 100 N s/m; a reserve of 30 uJ covers the extrapolation error.
 """
 
 from __future__ import annotations
@@ -22,18 +14,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-SILENT = 0.05  #: without a command the force is zero from then on [s]
-_FADES = 0.02  # s
-_RETURNS = 100.0  # N/s
-_MOST, _RESERVE = 0.3, 3e-5  # J
-_DAMPER = 100.0  # N s/m
+COMMAND_TIMEOUT_S = 0.05  #: age of a command at which the force is zero [s]
+_FADE_START_S = 0.02  # s
+_FORCE_RETURN_N_S = 100.0  # N/s
+_MAX_ENERGY_J, _RESERVE_J = 0.3, 3e-5  # J
+_MAX_DAMPING_NS_M = 100.0  # N s/m
 
 _Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of a device: force [N], torque [N m], slew of the force [N/s] and of the torque [N m/s]."""
+    """Limits of force [N], torque [N m] and their slew rates [N/s, N m/s]."""
 
     force: float
     torque: float = 0.0
@@ -42,88 +34,86 @@ class Limits:
 
 
 class DeviceGuard:
-    """One tick after another; see the module.
+    """Safety functions of one device.
 
     Attributes:
-        energy: that the hand has put in since the beginning [J].
-        slowed: how often the observer has changed the force.
-
-    Args:
-        limits: of the device.
-        observe: whether passivity is observed.
+        energy: of the hand into the device since the start [J].
+        slowed: number of forces that the observer has changed.
     """
 
     def __init__(self, limits: Limits, *, observe: bool = True) -> None:
         self.energy, self.slowed = 0.0, 0
         self._limits, self._observe = limits, observe
-        self._available, self._allowed, self._quiet = 0.0, limits.force, True
+        self._stored_energy, self._force_limit, self._was_silent = 0.0, limits.force, True
         self._force: _Vector = (0.0, 0.0, 0.0)
         self._torque: _Vector = (0.0, 0.0, 0.0)
         self._position: _Vector | None = None
-        self._speed: _Vector = (0.0, 0.0, 0.0)
+        self._velocity: _Vector = (0.0, 0.0, 0.0)
 
     def tick(
         self, position: Sequence[float], wrench: Sequence[float], age: float, period: float
     ) -> tuple[float, ...]:
-        """The wrench to be set now (6,) [N, N m].
+        """Return the wrench to display (6,) [N, N m].
 
         Args:
-            position: (3,) where the device is [m].
-            wrench: (6,) the last command [N, N m].
-            age: of that [s].
+            position: (3,) [m].
+            wrench: (6,) last command [N, N m], with its age [s].
             period: since the last tick [s].
         """
         x = (float(position[0]), float(position[1]), float(position[2]))
         last = self._position or x
-        moved = (x[0] - last[0], x[1] - last[1], x[2] - last[2])
-        given = -_dot(self._force, moved)
-        self.energy += given
-        self._available = min(self._available + given, _MOST)
-        # As fast as it was, and faster by as much as it has become; for as long as now.
-        speed, before = _times(1.0 / period, moved), self._speed
-        coming = (
-            period * (2.0 * speed[0] - before[0]),
-            period * (2.0 * speed[1] - before[1]),
-            period * (2.0 * speed[2] - before[2]),
+        motion = (x[0] - last[0], x[1] - last[1], x[2] - last[2])
+        work = -_dot(self._force, motion)
+        self.energy += work
+        self._stored_energy = min(self._stored_energy + work, _MAX_ENERGY_J)
+        # Extrapolate the speed linearly, over a period of the same length.
+        velocity, last_velocity = _times(1.0 / period, motion), self._velocity
+        next_motion = (
+            period * (2.0 * velocity[0] - last_velocity[0]),
+            period * (2.0 * velocity[1] - last_velocity[1]),
+            period * (2.0 * velocity[2] - last_velocity[2]),
         )
-        self._position, self._speed = x, speed
+        self._position, self._velocity = x, velocity
 
-        share = self._share(age, period)
-        force, torque = _sound(wrench[:3]), _sound(wrench[3:])
+        share = self._command_share(age, period)
+        force, torque = _finite_or_zero(wrench[:3]), _finite_or_zero(wrench[3:])
         limits = self._limits
-        force = _shortened(_times(share, force), min(limits.force, self._allowed))
-        torque = _shortened(_times(share, torque), limits.torque)
-        force = _slewed(self._force, force, limits.slew * period)
-        torque = _slewed(self._torque, torque, limits.torque_slew * period)
-        if share == 0.0:  # whatever the slew: at 50 ms there is none
+        force = _limit_norm(_times(share, force), min(limits.force, self._force_limit))
+        torque = _limit_norm(_times(share, torque), limits.torque)
+        force = _limit_slew(self._force, force, limits.slew * period)
+        torque = _limit_slew(self._torque, torque, limits.torque_slew * period)
+        if share == 0.0:  # the timeout overrides the slew limit
             force, torque = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
         elif self._observe:
-            force = _shortened(self._passive(force, coming, period), limits.force)
+            force = _limit_norm(self._limit_energy(force, next_motion, period), limits.force)
         self._force, self._torque = force, torque
         return (*force, *torque)
 
-    def _share(self, age: float, period: float) -> float:
-        """Of a command of that age; counts how much force is allowed after silence."""
-        if not age < SILENT:
-            self._quiet = True
-        elif self._quiet:
-            self._quiet, self._allowed = False, 0.0
-        self._allowed = min(self._allowed + _RETURNS * period, self._limits.force)
-        return min(max((SILENT - age) / (SILENT - _FADES), 0.0), 1.0) if age < SILENT else 0.0
+    def _command_share(self, age: float, period: float) -> float:
+        if not age < COMMAND_TIMEOUT_S:
+            self._was_silent = True
+        elif self._was_silent:
+            self._was_silent, self._force_limit = False, 0.0
+        self._force_limit = min(self._force_limit + _FORCE_RETURN_N_S * period, self._limits.force)
+        return (
+            min(max((COMMAND_TIMEOUT_S - age) / (COMMAND_TIMEOUT_S - _FADE_START_S), 0.0), 1.0)
+            if age < COMMAND_TIMEOUT_S
+            else 0.0
+        )
 
-    def _passive(self, force: _Vector, coming: _Vector, period: float) -> _Vector:
-        distance, there = math.hypot(*coming), self._available - _RESERVE
-        out = _dot(force, coming)
-        if out <= there or distance < 1e-12 or force == (0.0, 0.0, 0.0):
+    def _limit_energy(self, force: _Vector, next_motion: _Vector, period: float) -> _Vector:
+        distance, available = math.hypot(*next_motion), self._stored_energy - _RESERVE_J
+        returned = _dot(force, next_motion)
+        if returned <= available or distance < 1e-12 or force == (0.0, 0.0, 0.0):
             return force
         self.slowed += 1
-        along = out / distance
-        most = max(there / distance, -_DAMPER * math.hypot(*self._speed))
-        off = max(along - most, 0.0) / distance
+        force_along = returned / distance
+        max_force = max(available / distance, -_MAX_DAMPING_NS_M * math.hypot(*self._velocity))
+        reduction = max(force_along - max_force, 0.0) / distance
         return (
-            force[0] - off * coming[0],
-            force[1] - off * coming[1],
-            force[2] - off * coming[2],
+            force[0] - reduction * next_motion[0],
+            force[1] - reduction * next_motion[1],
+            force[2] - reduction * next_motion[2],
         )
 
 
@@ -135,18 +125,17 @@ def _times(share: float, a: _Vector) -> _Vector:
     return (share * a[0], share * a[1], share * a[2])
 
 
-def _sound(a: Sequence[float]) -> _Vector:
-    """It, or zero if it is not finite."""
+def _finite_or_zero(a: Sequence[float]) -> _Vector:
     x, y, z = float(a[0]), float(a[1]), float(a[2])
     return (x, y, z) if math.isfinite(x + y + z) else (0.0, 0.0, 0.0)
 
 
-def _shortened(a: _Vector, longest: float) -> _Vector:
+def _limit_norm(a: _Vector, longest: float) -> _Vector:
     length = math.hypot(*a)
     return a if length <= longest else _times(longest / length, a)
 
 
-def _slewed(last: _Vector, wanted: _Vector, most: float) -> _Vector:
+def _limit_slew(last: _Vector, wanted: _Vector, max_force: float) -> _Vector:
     step = (wanted[0] - last[0], wanted[1] - last[1], wanted[2] - last[2])
-    step = _shortened(step, most)
+    step = _limit_norm(step, max_force)
     return (last[0] + step[0], last[1] + step[1], last[2] + step[2])

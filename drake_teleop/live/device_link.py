@@ -1,12 +1,10 @@
-"""The station's end of a haptic device: the newest pose in, a force out, and how late they are.
-
-One device at a time: whoever sends first, until it has been silent for 50 ms. What is no packet,
-repeats an earlier one or was overtaken by a later one changes nothing but a counter.
-"""
+"""Station side of a haptic device: receives poses and sends forces."""
 
 from __future__ import annotations
 
 import ipaddress
+import subprocess
+import sys
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
@@ -15,10 +13,10 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.quaternions import conjugate, logarithm, multiply
-from drake_teleop.live.device_guard import SILENT
+from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
-    LONGEST,
+    MAX_PACKET_BYTES,
     DeviceState,
     ForceCommand,
     packed_force,
@@ -26,37 +24,35 @@ from drake_teleop.live.device_packets import (
     unpacked_state,
 )
 from drake_teleop.live.inputs import ANGLE, LENGTH
-from drake_teleop.robots.udp import endpoint, listening
+from drake_teleop.robots.udp import THIS_MACHINE, endpoint, listening
 
-_MOST = 256  # packets at once
-_REMEMBERED = 2000  # packets, of which lateness is told
-# After silence the hand's place is taken anew, with the clutch open for so long [s].
-_SETTLES = 0.05
+_CLIENT_TIMEOUT_S = 2.0  # s
+_MAX_PACKETS = 256  # packets per poll
+_STATISTICS_PACKETS = 2000  # packets in the statistics of lateness
+# Duration of the open clutch after silence, while the hand moves to the device's pose [s].
+_CLUTCH_OPEN_S = 0.05
 
 
 class DeviceLink:
-    """Listens on a port of this machine for a device; see the module.
+    """UDP link to one device client on this machine; 50 ms of silence admit another one.
 
     Attributes:
-        refused: packets that were none, or another sender's.
-        refusal: why the last of them was.
-        lost: packets that never came, or came too late.
-        port: that it listens on.
-
-    Args:
-        address: udp://127.0.0.1:PORT.
+        refused: number of invalid packets and packets of other senders.
+        refusal: last reason.
+        lost: number of missing or overtaken packets.
+        port: UDP port.
 
     Raises:
-        DrakeTeleopError: for another machine's address, or a port that is taken.
+        DrakeTeleopError: for an address of another machine, or a port in use.
     """
 
     def __init__(self, address: str) -> None:
         host, port = endpoint(address)
-        if not _is_here(host):
+        if not _is_loopback(host):
             raise DrakeTeleopError(
-                "is not this machine: whoever can send there moves the arm",
+                "is not an address of this machine (other senders could move the arm)",
                 where=address,
-                remedy="give udp://127.0.0.1:PORT, and run the device's client here",
+                remedy="use udp://127.0.0.1:PORT, and run the device's client on this machine",
             )
         self._socket = listening(host, port)
         self._socket.setblocking(False)
@@ -65,69 +61,62 @@ class DeviceLink:
         self.refusal = ""
         self._peer: Any = None
         self._state: DeviceState | None = None
-        self._heard, self._since, self._now = -np.inf, np.inf, 0.0
+        self._last_arrival, self._connected_at, self._polled_at = -np.inf, np.inf, 0.0
         self._origin: DeviceState | None = None
-        # Arrival less the device's time, whose least is the difference of the clocks; `behind`.
-        self._waited: deque[float] = deque(maxlen=_REMEMBERED)
-        self._behind: deque[float] = deque(maxlen=_REMEMBERED)
+        # Arrival minus the device's time; the minimum is the clock offset.
+        self._latencies: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
+        self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
     def poll(self, now: float) -> DeviceState | None:
-        """Takes what has come; the newest state, None if there is none or it is silent.
-
-        Args:
-            now: a steady clock [s].
-        """
-        self._now = now
-        for _ in range(_MOST):
+        """Receive waiting packets; return the newest state, None after silence."""
+        self._polled_at = now
+        for _ in range(_MAX_PACKETS):
             try:
-                packet, peer = self._socket.recvfrom(LONGEST + 1)
+                packet, peer = self._socket.recvfrom(MAX_PACKET_BYTES + 1)
             except (BlockingIOError, ConnectionError):
                 break
-            self._take(packet, peer, now)
+            self._handle_packet(packet, peer, now)
         return None if self.silent(now) else self._state
 
-    def _take(self, packet: bytes, peer: Any, now: float) -> None:
+    def _handle_packet(self, packet: bytes, peer: Any, now: float) -> None:
         state, silent = unpacked_state(packet), self.silent(now)
         if state is None or (peer != self._peer and not silent):
             self.refused += 1
             self.refusal = refusal(packet) if state is None else "is from a second device"
             return
-        if silent:  # a new one, or the same one again
-            self._peer, self._since, self._state = peer, now, None
-            self._waited.clear()
+        if silent:  # a new device, or the same one after a pause
+            self._peer, self._connected_at, self._state = peer, now, None
+            self._latencies.clear()
         elif self._state is not None:
-            if state.number <= self._state.number:  # was counted as lost
+            if state.number <= self._state.number:  # already counted as lost
                 self.lost -= state.number < self._state.number
                 return
             self.lost += state.number - self._state.number - 1
-        self._state, self._heard = state, now
+        self._state, self._last_arrival = state, now
         self._origin = self._origin or state
-        self._waited.append(now - state.t)
-        self._behind.append(state.behind)
+        self._latencies.append(now - state.t)
+        self._force_ages.append(state.behind)
 
     def silent(self, now: float) -> bool:
-        """Whether nothing has come for 50 ms."""
-        return now - self._heard > SILENT
+        """Return whether no valid packet has come for 50 ms."""
+        return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:
-        """Answers the newest state with the wrench (6,) that the hand shall feel [N, N m]."""
+        """Answer the newest state with the wrench (6,) [N, N m]."""
         if self._state is None or self._peer is None:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
         try:
             self._socket.sendto(packed_force(command), self._peer)
-        except OSError:  # what cannot be sent now is too old later
+        except OSError:  # a later attempt would send an old force
             return
 
-    def begin_anew(self, now: float) -> None:
-        """Where the device is next is where the station's device starts."""
-        self._origin, self._since = self._state, now
+    def reset_origin(self, now: float) -> None:
+        """Map the device's present pose to the station's start pose."""
+        self._origin, self._connected_at = self._state, now
 
-    def lead(self, now: float) -> Mapping[str, float]:
-        """What the device makes of the `Inputs`: it holds the hand's place, or nobody does.
-
-        Where it was first is where the station's device starts. Its clutch counts if it is open.
-        """
+    def hand_inputs(self, now: float) -> Mapping[str, float]:
+        """Return the `Inputs` of the pose; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -137,56 +126,95 @@ class DeviceLink:
         for k, name in enumerate("xyz"):
             values[name] = (state.position[k] - first.position[k]) / LENGTH
             values["r" + name] = turn[k] / ANGLE
-        if state.flags & CLUTCH_OPEN or now - self._since < _SETTLES:
+        if state.flags & CLUTCH_OPEN or now - self._connected_at < _CLUTCH_OPEN_S:
             values["clutch"] = 0
         return values
 
     def figures(self, now: float) -> dict[str, float]:
-        """Packets a second, lateness of packets and of the force at the hand, p99 [ms]; lost."""
-        late = np.array(self._waited or [0.0])
-        behind = np.array(self._behind or [0.0])
-        spent = min(now - self._since, 1e-3 * _REMEMBERED) if len(self._waited) > 1 else np.inf
+        """Return packet rate, losses, and lateness of packets and force [ms]."""
+        late = np.array(self._latencies or [0.0])
+        behind = np.array(self._force_ages or [0.0])
+        elapsed = (
+            min(now - self._connected_at, 1e-3 * _STATISTICS_PACKETS)
+            if len(self._latencies) > 1
+            else np.inf
+        )
         return {
-            "rate_hz": float(len(late) / max(spent, 1e-3)),
+            "rate_hz": float(len(late) / max(elapsed, 1e-3)),
             "late_p99_ms": float(1e3 * (np.percentile(late, 99) - late.min())),
             "behind_p50_ms": float(1e3 * np.median(behind)),
             "behind_p99_ms": float(1e3 * np.percentile(behind, 99)),
             "lost": float(max(self.lost, 0)),
         }
 
-    def text(self) -> str:
-        """The same at the last `poll` in words, for the page, and what was refused."""
-        return self._heard_text() + self.refused_text()
-
-    def refused_text(self) -> str:
-        """Return how many packets were refused, and why the last was; "" if none was."""
+    def status_text(self) -> str:
+        """Return the state at the last `poll` in words."""
         if not self.refused:
-            return ""
-        return f". Refused packets: {self.refused}; the last one {self.refusal}"
+            return self._lateness_text()
+        reason = f"the last one {self.refusal}"
+        return f"{self._lateness_text()}. Refused packets: {self.refused}; {reason}"
 
-    def _heard_text(self) -> str:
-        now = self._now
+    def _lateness_text(self) -> str:
+        now = self._polled_at
         if self.silent(now):
             what = "The device is silent: no force" if self._peer else "No device yet"
             return f"{what} (udp://127.0.0.1:{self.port})"
-        found = self.figures(now)
-        said = f"Device: packets arrive up to {found['late_p99_ms']:.1f} ms late (99 of 100)"
-        if found["behind_p99_ms"] > 0.0:
-            said += (
-                f"; its force belongs to its position {found['behind_p50_ms']:.1f} ms ago"
-                f" (99 of 100: up to {found['behind_p99_ms']:.1f} ms)"
+        figures = self.figures(now)
+        text = f"Device: packets arrive up to {figures['late_p99_ms']:.1f} ms late (99 of 100)"
+        if figures["behind_p99_ms"] > 0.0:
+            text += (
+                f"; its force belongs to its position {figures['behind_p50_ms']:.1f} ms ago"
+                f" (99 of 100: up to {figures['behind_p99_ms']:.1f} ms)"
             )
-        return said + (f"; {found['lost']:.0f} packets lost" if found["lost"] else "")
+        return text + (f"; {figures['lost']:.0f} packets lost" if figures["lost"] else "")
 
     def close(self) -> None:
-        """Frees the port."""
+        """Close the port."""
         self._socket.close()
 
 
-def _is_here(host: str) -> bool:
+def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+class DeviceConnection:
+    """Link to a haptic device, and its client process if started here.
+
+    Args:
+        address: udp://127.0.0.1:PORT of a client, or haply://HOST:PORT of an Inverse3.
+
+    Raises:
+        DrakeTeleopError: for another address, or a port in use.
+    """
+
+    def __init__(self, address: str) -> None:
+        kind = address.partition("://")[0]
+        if kind not in ("udp", "haply"):
+            raise DrakeTeleopError(
+                "is not a haptic device address",
+                where=address,
+                remedy="use udp://127.0.0.1:PORT or haply://localhost:10001",
+            )
+        self.link = DeviceLink(address if kind == "udp" else f"udp://{THIS_MACHINE}:0")
+        self._client: subprocess.Popen[bytes] | None = None
+        if kind == "haply":
+            station = f"udp://{THIS_MACHINE}:{self.link.port}"
+            client = [sys.executable, "-m", "drake_teleop.live.device_client", address, station]
+            self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
+
+    def close(self) -> None:
+        """Close the link and end the client."""
+        self.link.close()
+        if self._client is None:
+            return
+        self._client.terminate()
+        try:
+            self._client.wait(_CLIENT_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            self._client.kill()
+            self._client.wait()

@@ -1,9 +1,8 @@
-"""What a haptic device and the station tell each other, as `drake_teleop_device.h` has it in C.
+"""Packets between a haptic device and the station; in C: `drake_teleop_device.h`.
 
 Little-endian, without padding, in the device's base frame B. From the device: "DTD1", flags,
-number, time [s], position (3) [m], orientation (4) [w, x, y, z], behind [s]. To it: "DTF1", 0,
-number and time of the packet that it answers, force and torque on the hand (6) [N, N m]. The last
-letter of the four is the version.
+number, time [s], position (3) [m], orientation (4) [w, x, y, z], behind [s]. To the device:
+"DTF1", 0, number and time of the answered packet, [f; tau] (6) [N, N m].
 """
 
 from __future__ import annotations
@@ -15,24 +14,24 @@ from typing import NamedTuple
 
 _STATE, _FORCE = struct.Struct("<4sIQd8d"), struct.Struct("<4sIQd6d")
 _FROM_DEVICE, _TO_DEVICE = b"DTD1", b"DTF1"
-LONGEST = _STATE.size  #: of both kinds [bytes]
-_FARTHEST, _LARGEST = 10.0, 1e3  # m; N, N m
+MAX_PACKET_BYTES = _STATE.size  #: of both packets [bytes]
+_MAX_POSITION_M, _MAX_WRENCH = 10.0, 1e3  # m; N, N m
 
 
-#: From the device: its motion shall not go to the slave.
+#: Flag of the device: its motion is not transmitted to the slave.
 CLUTCH_OPEN = 1
 
 
 class DeviceState(NamedTuple):
-    """Where a device is.
+    """Pose of a device at a time.
 
     Attributes:
-        number: one more in each packet.
-        t: when it was there, on its own steady clock [s].
+        number: of the packet, increasing.
+        t: on the device's clock [s].
         position: p_BE [m].
-        orientation: R_BE as a quaternion of unit length; the identity if it does not turn.
-        flags: `CLUTCH_OPEN` or none.
-        behind: how old the position is that its present force answers [s]; 0 if it has none.
+        orientation: R_BE, unit quaternion.
+        flags: 0 or `CLUTCH_OPEN`.
+        behind: age of the position that the force answers [s]; 0 without one.
     """
 
     number: int
@@ -43,8 +42,8 @@ class DeviceState(NamedTuple):
     behind: float = 0.0
 
 
-class Place(NamedTuple):
-    """Where a device is: p_BE [m], R_BE (w, x, y, z), flags as of `DeviceState`."""
+class DevicePose(NamedTuple):
+    """p_BE [m], R_BE [w, x, y, z] and flags of `DeviceState`."""
 
     position: Sequence[float]
     orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
@@ -52,7 +51,7 @@ class Place(NamedTuple):
 
 
 class ForceCommand(NamedTuple):
-    """The wrench that a hand shall feel: of which state, and [f; tau] in B [N, N m]."""
+    """Wrench [f; tau] in B [N, N m] for a state."""
 
     number: int
     t: float
@@ -60,28 +59,30 @@ class ForceCommand(NamedTuple):
 
 
 def packed_state(state: DeviceState) -> bytes:
-    """Its packet."""
+    """Return the packet of a state."""
     numbers = (*state.position, *state.orientation, state.behind)
     return _STATE.pack(_FROM_DEVICE, state.flags, state.number, state.t, *numbers)
 
 
 def unpacked_state(packet: bytes) -> DeviceState | None:
-    """What is in a packet, None if it is none, or no place where a device can be. Never raises."""
+    """Return the state in a packet, None if implausible. Never raises."""
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
-    return believable(number, t, flags, numbers)
+    return plausible_state(number, t, flags, numbers)
 
 
-def believable(number: int, t: float, flags: int, numbers: Sequence[float]) -> DeviceState | None:
-    """The state with position, orientation and `behind` (8), None if no device can be there."""
+def plausible_state(
+    number: int, t: float, flags: int, numbers: Sequence[float]
+) -> DeviceState | None:
+    """Return the state of position, orientation and `behind`; None if implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
-    # So written that what is not a number is refused; infinite is the length of what is.
+    # Comparisons with nan are False, so that nan is refused, too.
     if not (
-        -_FARTHEST <= x <= _FARTHEST
-        and -_FARTHEST <= y <= _FARTHEST
-        and -_FARTHEST <= z <= _FARTHEST
+        -_MAX_POSITION_M <= x <= _MAX_POSITION_M
+        and -_MAX_POSITION_M <= y <= _MAX_POSITION_M
+        and -_MAX_POSITION_M <= z <= _MAX_POSITION_M
         and 0.5 < length < 2.0
         and -1e12 <= t <= 1e12
         and math.isfinite(behind)
@@ -93,7 +94,7 @@ def believable(number: int, t: float, flags: int, numbers: Sequence[float]) -> D
 
 
 def refusal(packet: bytes) -> str:
-    """Return why a packet is no state of a device: its length, kind, version or values."""
+    """Return why a packet is refused."""
     if len(packet) != _STATE.size:
         length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
         return f"is {length} bytes long, not {_STATE.size}"
@@ -105,15 +106,15 @@ def refusal(packet: bytes) -> str:
 
 
 def packed_force(command: ForceCommand) -> bytes:
-    """Its packet."""
+    """Return the packet of a force command."""
     return _FORCE.pack(_TO_DEVICE, 0, command.number, command.t, *command.wrench)
 
 
 def unpacked_force(packet: bytes) -> ForceCommand | None:
-    """What is in a packet, None if it is none, or no force that a device gives. Never raises."""
+    """Return the command in a packet, None if invalid. Never raises."""
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None
     _, _, number, t, *wrench = _FORCE.unpack(packet)
-    if not (math.isfinite(t) and all(abs(f) < _LARGEST for f in wrench)):  # nan is not
+    if not (math.isfinite(t) and all(abs(f) < _MAX_WRENCH for f in wrench)):  # refuses nan, too
         return None
     return ForceCommand(number, t, tuple(wrench))

@@ -1,7 +1,6 @@
-"""A haptic device that is not simulated, in the place of operator, device and force display.
+"""Master side of a real haptic device, in place of operator, simulated device and force display.
 
-Its pose comes in between slices, and goes over to the new one on a straight line within a tick; the
-force for it goes out. So the slave's command has no steps, and the twist is that of the way.
+The pose moves to the newest one on a straight line, so that the slave's command has no steps.
 """
 
 from __future__ import annotations
@@ -23,105 +22,103 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.fault import Fault, sound
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.live.handing_on import GoesOver
-from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
+from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD
 from drake_teleop.station.operator.operator import HandImpedance
 from drake_teleop.station.passivity.packet import limit
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
-from drake_teleop.station.scenario import Scenario, replace
+from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.plant import start_pose
 from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 
-#: In which it takes poses [s], and [ms].
+#: Period of the poses [s], and [ms].
 TICK, TICK_MS = 2e-3, 2
-# Of what is displayed: it fades within FADE [s] and comes back by so much a second [1/s], of the
-# largest; it changes by SLEW of the largest a second at most [1/s].
-_FADE, _RETURN, _SLEW = 0.05, 4.0, 150.0
-# Of the path: whether it is held, its start [s], from where (7,), by which way (3,) and turn (3,).
-_HELD, _START, _FROM, _WAY, _TURN, _PATH = 0, 1, 2, 9, 12, 15
-# Of what is displayed: the wrench (6,), a `Fault`, the share of the largest that is allowed.
+# Displayed wrench, relative to its limit: duration of the fade [s], rate of its return [1/s],
+# largest slew rate [1/s].
+_FADE_S, _RETURN, _SLEW = 0.05, 4.0, 150.0
+# Path: held flag, start time [s], start pose (7,), displacement (3,), rotation vector (3,).
+_HELD, _START_TIME, _START_POSE, _DISPLACEMENT, _ROTATION, _PATH = 0, 1, 2, 9, 12, 15
+# Displayed state: wrench (6,), a `Fault`, allowed share of the limit.
 _FAULT, _ALLOWED, _DISPLAY = 6, 7, 8
 _WRENCH = float(Fault.WRENCH)
 
 
 @njit(cache=True)
-def _on_way(path, time, out):
-    """Writes pose (7,) and twist (6,) into `out` (13,)."""
-    share = min(max((time - path[_START]) / TICK, 0.0), 1.0)
-    r = (share * path[_TURN], share * path[_TURN + 1], share * path[_TURN + 2])
-    start = (path[_FROM], path[_FROM + 1], path[_FROM + 2], path[_FROM + 3])
-    turned = multiply(exponential(r), start)
+def _pose_on_path(path, time, out):
+    """Write pose (7,) and twist (6,) at `time` into `out` (13,)."""
+    share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
+    r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
+    start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
+    rotation = multiply(exponential(r), start)
     moves = 1.0 / TICK if share < 1.0 else 0.0
     for k in range(4):
-        out[k] = turned[k]
+        out[k] = rotation[k]
     for k in range(3):
-        out[4 + k] = path[_FROM + 4 + k] + share * path[_WAY + k]
-        out[7 + k] = moves * path[_WAY + k]
-        out[10 + k] = moves * path[_TURN + k]
+        out[4 + k] = path[_START_POSE + 4 + k] + share * path[_DISPLACEMENT + k]
+        out[7 + k] = moves * path[_DISPLACEMENT + k]
+        out[10 + k] = moves * path[_ROTATION + k]
 
 
 @njit(cache=True)
-def _display(wrench, held, period, most, last, now):
-    """One period of what is displayed, `now` (8,) after `last`; `most` (2,) [N, N m]."""
+def _display_step(wrench, held, period, limits, last, now):
+    """Write the displayed wrench after a period; `limits` (2,) [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
-    wanted = held and fault == 0.0
-    change = _RETURN if wanted else -1.0 / _FADE
+    enabled = held and fault == 0.0
+    change = _RETURN if enabled else -1.0 / _FADE_S
     allowed = min(max(last[_ALLOWED] + period * change, 0.0), 1.0)
     target, step = np.zeros(6), np.empty(6)
-    if wanted:
+    if enabled:
         target[:] = wrench
     for g in range(2):
-        limit(target, g, allowed * most[g])
+        limit(target, g, allowed * limits[g])
     for i in range(6):
         step[i] = target[i] - last[i]
     for g in range(2):
-        limit(step, g, _SLEW * period * most[g])
+        limit(step, g, _SLEW * period * limits[g])
     for i in range(6):
         now[i] = last[i] + step[i]
     now[_FAULT], now[_ALLOWED] = fault, allowed
 
 
 class ExternalMaster(LeafSystem):
-    """Pose in, force out; see the module.
+    """Haptic device with pose input and force output.
 
-    While the device is not held the force fades within 50 ms. It comes back over a quarter of a
-    second, and never changes by more than its largest in 7 ms. What comes to the hand and is no
-    wrench is a fault, and fades it too.
+    The force fades within 50 ms while released or after a non-finite command, and returns within
+    0.25 s.
 
     .. pydrake_system::
 
         name: ExternalMaster
         input_ports:
-        - wrench_command: (6,) F_E_B, what the hand shall feel [N, N m]
+        - wrench_command: (6,) F_E_B [N, N m]
         output_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - master_state: (12,) place [m], yaw, pitch, roll [rad] as in `task_space`; no speeds
+        - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
         - force_to_master: (6,) for the device [N, N m]
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two side by side
-        - hand_wrench_E: (6,) minus the force: all that is known of the hand
+        - hand_wrench_E: (6,) minus the displayed force
 
     Args:
         start: (7,) X_BE.
         period: of the hand [s].
-        most: (2,) largest force and torque [N, N m].
+        limits: (2,) of force and torque [N, N m].
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, start: Array, period: float, most: Array) -> None:
+    def __init__(self, start: Array, period: float, limits: Array) -> None:
         super().__init__()
         path = np.zeros(_PATH)
-        path[_HELD], path[_START], path[_FROM:_WAY] = 1.0, -TICK, start
+        path[_HELD], path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = 1.0, -TICK, start
         self._path = self.DeclareNumericParameter(BasicVector(path))
-        self._period, self._most, self._now = period, most, np.zeros(13)
+        self._period, self._limits, self._pose_and_twist = period, limits, np.zeros(13)
         self._command = self.DeclareVectorInputPort("wrench_command", 6)
         self.DeclareDiscreteState(np.zeros(_DISPLAY))
         moves = {self.all_parameters_ticket(), self.time_ticket()}
@@ -137,33 +134,37 @@ class ExternalMaster(LeafSystem):
             self.DeclareVectorOutputPort(name, size, weak_callback(calc), needed)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def Lead(self, context: Context, target: Array | None) -> None:
-        """From now on the device is on its way to `target` (7,) X_BE, or with None not held."""
-        now, path = self._at(context), np.zeros(_PATH)
-        path[_START], path[_FROM:_WAY] = context.get_time(), now[:7]
+    def SetTarget(self, context: Context, target: Array | None) -> None:
+        """Move the device to `target` (7,) X_BE; None releases it."""
+        now, path = self._present(context), np.zeros(_PATH)
+        path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
-            path[_HELD], path[_WAY:_TURN] = 1.0, target[4:] - now[4:7]
-            path[_TURN:] = logarithm(multiply(tuple(target[:4]), conjugate(tuple(now[:4]))))
+            path[_HELD], path[_DISPLACEMENT:_ROTATION] = 1.0, target[4:] - now[4:7]
+            path[_ROTATION:] = logarithm(multiply(tuple(target[:4]), conjugate(tuple(now[:4]))))
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """A real hand is what it is: as of `LiveHand`, for nothing."""
+    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+        """Do nothing: a real hand has no setting."""
 
-    def _at(self, context: Context) -> Array:
-        _on_way(context.get_numeric_parameter(self._path).value(), context.get_time(), self._now)
-        return self._now
+    def _present(self, context: Context) -> Array:
+        _pose_on_path(
+            context.get_numeric_parameter(self._path).value(),
+            context.get_time(),
+            self._pose_and_twist,
+        )
+        return self._pose_and_twist
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._at(context)[:7])
+        output.SetFromVector(self._present(context)[:7])
 
     def _calc_twist(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._at(context)[7:])
+        output.SetFromVector(self._present(context)[7:])
 
     def _calc_state(self, context: Context, output: BasicVector) -> None:
-        pose = self._at(context)
-        turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
-        turns = (turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle())
-        output.SetFromVector([*pose[4:7], *turns, *([0.0] * 6)])
+        pose = self._present(context)
+        rotation = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
+        angles = (rotation.yaw_angle(), rotation.pitch_angle(), rotation.roll_angle())
+        output.SetFromVector([*pose[4:7], *angles, *([0.0] * 6)])
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[:_FAULT])
@@ -178,31 +179,21 @@ class ExternalMaster(LeafSystem):
         output.SetFromVector(-context.get_discrete_state_vector().value()[:_FAULT])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        _display(
+        _display_step(
             self._command.Eval(context),
             context.get_numeric_parameter(self._path).value()[_HELD] > 0.5,
             self._period,
-            self._most,
+            self._limits,
             context.get_discrete_state_vector().value(),
             discrete_state.get_mutable_value(0),
         )
 
 
-def with_device(scenario: Scenario) -> Scenario:
-    """The scenario with a device whose place is all that is known, in the place of an arm's."""
-    if scenario.master.model not in (PHANTOM, LEADER):
-        return scenario
-    return replace(scenario, master=Master(model="haply_inverse3"))
-
-
-def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
-    """A master side (docs/station.md) of a real device and `kinematic_scaling`.
-
-    Its blocks have the names that they have in `MakeLiveMasterSide`; `goes_over` as there.
-    """
+def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
+    """Return a master side of a real device, like `MakeLiveMasterSide`."""
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
-    most = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
+    limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
     builder, inner = DiagramBuilder(), DiagramBuilder()
     scaling = inner.AddNamedSystem(
         "kinematic_scaling",
@@ -211,19 +202,17 @@ def MakeExternalMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Di
     for name in ("pose_master", "clutch"):
         inner.ExportInput(scaling.GetInputPort(name), name)
     export(inner, scaling, "pose_command")
-    led = builder.AddNamedSystem("led", inner.Build())
+    inner_side = builder.AddNamedSystem("inner_side", inner.Build())
     master = builder.AddNamedSystem(
-        "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, most)
+        "live_hand", ExternalMaster(start, 1 / scenario.rates.hand_hz, limits)
     )
-    builder.Connect(master.GetOutputPort("pose_master"), led.GetInputPort("pose_master"))
-    felt = master.GetInputPort("wrench_command")
-    if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
-        builder.Connect(block.get_output_port(), felt)
-        felt = block.get_input_port()
-    builder.ExportInput(felt, "wrench_command")
-    builder.ExportInput(led.GetInputPort("clutch"), "clutch")
-    export(builder, led, "pose_command")
+    builder.Connect(master.GetOutputPort("pose_master"), inner_side.GetInputPort("pose_master"))
+    wrench = master.GetInputPort("wrench_command")
+    if cross_fade:
+        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
+    builder.ExportInput(wrench, "wrench_command")
+    builder.ExportInput(inner_side.GetInputPort("clutch"), "clutch")
+    export(builder, inner_side, "pose_command")
     for index in range(master.num_output_ports()):
         export(builder, master, master.get_output_port(index).get_name())
     return builder.Build()

@@ -1,4 +1,4 @@
-"""Where a live hand wants the stylus: a smooth path from wherever it is to its newest target."""
+"""Simulated hand of a drive, on a smooth path to the newest target."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
 from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
-from drake_teleop.live.handing_on import GoesOver
+from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (
     HandImpedance,
@@ -28,52 +28,52 @@ from drake_teleop.station.operator.operator import (
     hand_wrench_into,
 )
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 
-# Of the ways to a target [rad/s]: along it with three equal poles, so that the force that it takes
-# has no steps; turning, with two. A step of the target by 10 mm takes 12 N of a firm hand for a
-# moment, and the tool is half way after 46 ms. Where nobody moves anything it goes gently.
-_SPEED, _GENTLY, _TURNING = 2 * math.pi * 16.0, 2 * math.pi * 5.0, 2 * math.pi * 5.0
-#: How far a target should be ahead of what moves evenly [s], so that the hand neither hangs back
-#: when it begins nor goes on when it ends: by no more than it makes in 5 ms, and it returns.
-BEHIND = 2.5 / _SPEED
-# A path: whether the stylus is held, when it began [s], its poles [rad/s], its target X_BE (7,);
-# then how far the start was from there (3,), its velocity (3,), its acceleration (3,), and how far
-# as a rotation vector in B (3,), its rate (3,).
-_HELD, _START, _POLES, _TARGET, _AWAY, _TURNED, _PATH = 0, 1, 2, 3, 10, 19, 25
-_WANTED = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
+# Poles of the path to a target [rad/s]: three for translation, so that the force has no steps, two
+# for rotation. After a target step of 10 mm a firm hand exerts at most 12 N, and the tool covers
+# half the distance in 46 ms. After a change of the grip the path is slower.
+_TRANSLATION_POLE = 2 * math.pi * 16.0
+_SLOW_POLE = _ROTATION_POLE = 2 * math.pi * 5.0
+#: Lead time of a target at constant speed that compensates the lag of the hand [s]. At start and
+#: stop the error is at most the distance of 5 ms.
+LEAD_TIME_S = 2.5 / _TRANSLATION_POLE
+# Path: held flag, start time [s], poles [rad/s], target X_BE (7,); at the start, relative to the
+# target: position, velocity, acceleration (3,) each, rotation vector in B and its rate (3,) each.
+_HELD, _START_TIME, _POLES, _TARGET, _OFFSET, _ROTATION, _PATH = 0, 1, 2, 3, 10, 19, 25
+_INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3,)
 
 
 @njit(cache=True)
-def _wanted_into(path, time, pose, out):
-    """Writes the wanted X_BE (7,), its twist [v; omega] (6,) and acceleration (3,) into `out`.
+def _intention_into(path, time, pose, out):
+    """Write the intended X_BE (7,), twist [v; omega] (6,) and acceleration (3,).
 
-    Each axis obeys (d/dt + w)^3 x = 0, and each rotation (d/dt + w)^2 r = 0, whose solutions are
-    exact at any time: nothing depends on how a simulation is cut into slices. Who lets go wants the
-    stylus where it is, `pose` (7,).
+    (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, independent of the slices. A
+    released hand intends the present `pose` (7,).
     """
     if path[_HELD] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
         return
-    t = time - path[_START]
+    t = time - path[_START_TIME]
     w = path[_POLES]
-    decay, turning_decay = math.exp(-w * t), math.exp(-_TURNING * t)
+    decay, turning_decay = math.exp(-w * t), math.exp(-_ROTATION_POLE * t)
     r, rate = np.empty(3), np.empty(3)
     for k in range(3):
         # x = (a + b t + c t^2) e^(-w t), and its derivatives
-        a, v = path[_AWAY + k], path[_AWAY + 3 + k]
+        a, v = path[_OFFSET + k], path[_OFFSET + 3 + k]
         b = v + w * a
-        c = 0.5 * (path[_AWAY + 6 + k] + w * (b + v))
+        c = 0.5 * (path[_OFFSET + 6 + k] + w * (b + v))
         x = a + t * (b + t * c)
         slope = b + 2.0 * c * t
         out[4 + k] = path[_TARGET + 4 + k] + x * decay
         out[7 + k] = (slope - w * x) * decay
         out[13 + k] = (2.0 * c - w * (2.0 * slope - w * x)) * decay
-        turning = path[_TURNED + 3 + k] + _TURNING * path[_TURNED + k]
-        r[k] = (path[_TURNED + k] + turning * t) * turning_decay
-        rate[k] = (path[_TURNED + 3 + k] - _TURNING * turning * t) * turning_decay
+        turning = path[_ROTATION + 3 + k] + _ROTATION_POLE * path[_ROTATION + k]
+        r[k] = (path[_ROTATION + k] + turning * t) * turning_decay
+        rate[k] = (path[_ROTATION + 3 + k] - _ROTATION_POLE * turning * t) * turning_decay
     target = (path[_TARGET], path[_TARGET + 1], path[_TARGET + 2], path[_TARGET + 3])
     orientation = multiply(exponential((r[0], r[1], r[2])), target)
     for k in range(4):
@@ -93,8 +93,8 @@ def _wanted_into(path, time, pose, out):
 
 
 @njit(cache=True)
-def _rate_of(r, omega):
-    """The rate of a rotation vector r [rad] that turns with omega [rad/s], three numbers each."""
+def _rotation_vector_rate(r, omega):
+    """Return the rate of a rotation vector r [rad] from omega [rad/s]."""
     square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     c = 1.0 / 12.0 + square / 720.0
     if square > 1e-4:
@@ -105,33 +105,29 @@ def _rate_of(r, omega):
 
 
 @njit(cache=True)
-def _led_into(path, time, now, target, poles):
-    """Writes the path to `target` (7,), which begins at `time` as what is wanted `now` (16,)."""
-    path[_HELD], path[_START], path[_POLES] = 1.0, time, poles
+def _path_into(path, time, now, target, poles):
+    """Write the path from the intention `now` (16,) to `target` (7,)."""
+    path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
-    turned = logarithm(multiply(now, conjugate(target)))
-    rate = _rate_of(turned, three(now, 10))
+    rotation = logarithm(multiply(now, conjugate(target)))
+    rate = _rotation_vector_rate(rotation, three(now, 10))
     for k in range(3):
-        path[_AWAY + k], path[_AWAY + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
-        path[_AWAY + 6 + k] = now[13 + k]
-        path[_TURNED + k], path[_TURNED + 3 + k] = turned[k], rate[k]
+        path[_OFFSET + k], path[_OFFSET + 3 + k] = now[4 + k] - target[4 + k], now[7 + k]
+        path[_OFFSET + 6 + k] = now[13 + k]
+        path[_ROTATION + k], path[_ROTATION + 3 + k] = rotation[k], rate[k]
 
 
 @njit(cache=True, borrows=True)
-def _wrench_into(path, time, impedance, mass, pose, twist, wanted, wrench):
-    """Writes the wrench (6,) of the hand on the stylus; `wanted` (16,) is scratch.
-
-    Who moves on purpose knows the hand's own mass [kg], and draws its spring beyond what is wanted
-    by what accelerates that.
-    """
-    _wanted_into(path, time, pose, wanted)
+def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
+    """Write the wrench (6,) of the hand; an extra spring force accelerates its mass [kg]."""
+    _intention_into(path, time, pose, intention)
     for k in range(3):
-        wanted[4 + k] += mass / impedance[0] * wanted[13 + k]
-    hand_wrench_into(impedance, wanted[:7], wanted[7:13], pose, twist, wrench)
+        intention[4 + k] += mass / impedance[0] * intention[13 + k]
+    hand_wrench_into(impedance, intention[:7], intention[7:13], pose, twist, wrench)
 
 
 class LiveHand(Operator):
-    """The hand of an operator whose intention is led from outside, on a smooth way to a target.
+    """Hand of an operator that follows external targets.
 
     .. pydrake_system::
 
@@ -141,66 +137,59 @@ class LiveHand(Operator):
         - twist_master: (6,) [v; omega] of E in B
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - intent: (7,) X_BE that it wants
-
-    Args:
-        config: the grip.
-        start: (7,) X_BE that it holds until it is led elsewhere.
+        - intent: (7,) intended X_BE
     """
 
     __slots__ = ONE_DICT
 
     def __init__(self, config: OperatorConfig, start: Array) -> None:
         super().__init__(dataclasses.replace(config, intent=[], task=None), start)
-        self._now, self._mass = np.empty(_WANTED), config.hand.mass
+        self._scratch, self._mass = np.empty(_INTENTION_SIZE), config.hand.mass
 
     def _declare_intention(self) -> set[DependencyTicket]:
         path = np.zeros(_PATH)
-        path[_HELD], path[_POLES], path[_TARGET:_AWAY] = 1.0, _SPEED, self._intent[1]
+        path[_HELD], path[_POLES], path[_TARGET:_OFFSET] = 1.0, _TRANSLATION_POLE, self._intent[1]
         self._path = self.DeclareNumericParameter(BasicVector(path))
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
-    def Lead(self, context: Context, target: Array | None) -> None:
-        """From now on it wants the stylus at `target` (7,) X_BE, or with None lets go of it.
-
-        The way begins where it is, as fast as it is. A hand that lets go pulls nowhere; only its
-        damping is left.
-        """
+    def SetTarget(self, context: Context, target: Array | None) -> None:
+        """Start a path to `target` (7,) X_BE; None releases the stylus."""
         path = np.zeros(_PATH)
         if target is not None:
-            _led_into(path, context.get_time(), self._wants(context), target, _SPEED)
+            _path_into(
+                path,
+                context.get_time(),
+                self._present_intention(context),
+                target,
+                _TRANSLATION_POLE,
+            )
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def Hold(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """The hand's impedance becomes another one, and it goes on to pull as it did.
-
-        What it wants is as much nearer to the stylus as the hand has become stiffer, as much
-        nearer to its speed as it has become more damped, and accelerates as much less as it has
-        become heavier; from there it goes gently to where it was led.
-        """
+    def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
+        """Change the impedance and scale the intention, without a wrench step."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD] < 0.5:
             return
         pose, twist = self._pose.Eval(context), self._twist.Eval(context)
-        wanted = self._wants(context)
-        turn = np.array(logarithm(multiply(tuple(wanted[:4]), conjugate(tuple(pose[:4])))))
-        turn *= before.rotational_stiffness / after.rotational_stiffness
-        way = before.stiffness / after.stiffness * (wanted[4:7] - pose[4:])
+        intention = self._present_intention(context)
+        rotation = np.array(logarithm(multiply(tuple(intention[:4]), conjugate(tuple(pose[:4])))))
+        rotation *= before.rotational_stiffness / after.rotational_stiffness
+        displacement = before.stiffness / after.stiffness * (intention[4:7] - pose[4:])
         damping = np.repeat(
             [before.damping / after.damping, before.rotational_damping / after.rotational_damping],
             3,
         )
-        wanted[:4] = multiply(exponential(tuple(turn)), tuple(pose[:4]))
-        wanted[4:7] = pose[4:] + way
-        wanted[7:13] = twist + damping * (wanted[7:13] - twist)
-        wanted[13:] *= before.mass / after.mass
-        _led_into(path, context.get_time(), wanted, path[_TARGET:_AWAY].copy(), _GENTLY)
+        intention[:4] = multiply(exponential(tuple(rotation)), tuple(pose[:4]))
+        intention[4:7] = pose[4:] + displacement
+        intention[7:13] = twist + damping * (intention[7:13] - twist)
+        intention[13:] *= before.mass / after.mass
+        _path_into(path, context.get_time(), intention, path[_TARGET:_OFFSET].copy(), _SLOW_POLE)
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
-    def _wants(self, context: Context) -> Array:
+    def _present_intention(self, context: Context) -> Array:
         path = context.get_numeric_parameter(self._path).value()
-        _wanted_into(path, context.get_time(), self._pose.Eval(context), self._now)
-        return self._now
+        _intention_into(path, context.get_time(), self._pose.Eval(context), self._scratch)
+        return self._scratch
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_into(
@@ -210,31 +199,25 @@ class LiveHand(Operator):
             self._mass,
             self._pose.Eval(context),
             self._twist.Eval(context),
-            self._now,
+            self._scratch,
             output.get_mutable_value(),
         )
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._wants(context)[:7])
+        output.SetFromVector(self._present_intention(context)[:7])
 
 
-def MakeLiveMasterSide(scenario: Scenario, *, goes_over: bool = False) -> Diagram:
-    """`MakeMasterSide` with a hand that is led while the station runs: `LiveHand.Lead`.
-
-    The scenario's operator gives the grip; it should intend nothing, and have no task. One that
-    follows another station goes over to what is felt now: `GoesOver`.
-    """
+def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
+    """Return `MakeMasterSide` with a `LiveHand`, optionally with a `CrossFade`."""
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)
-    side = builder.AddNamedSystem("led", MakeMasterSide(scenario, hand))
-    felt = side.GetInputPort("wrench_command")
-    if goes_over:
-        block = builder.AddNamedSystem("goes_over", GoesOver(1 / scenario.rates.hand_hz))
-        builder.Connect(block.get_output_port(), felt)
-        felt = block.get_input_port()
-    builder.ExportInput(felt, "wrench_command")
+    side = builder.AddNamedSystem("inner_side", MakeMasterSide(scenario, hand))
+    wrench = side.GetInputPort("wrench_command")
+    if cross_fade:
+        wrench = add_cross_fade(builder, wrench, 1 / scenario.rates.hand_hz)
+    builder.ExportInput(wrench, "wrench_command")
     builder.ExportInput(side.GetInputPort("clutch"), "clutch")
     for index in range(side.num_output_ports()):
-        builder.ExportOutput(side.get_output_port(index), side.get_output_port(index).get_name())
+        export(builder, side, side.get_output_port(index).get_name())
     return builder.Build()

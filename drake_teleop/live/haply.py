@@ -1,11 +1,9 @@
-"""The Haply Inverse3, by the websocket of Haply's service on this machine (Inverse Service 3).
+"""The Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
-Its messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], the grip's
-`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}, in `wireless_verse_grip` or
-`verse_grip`. Each is answered by a force, `inverse3[0].commands.set_cursor_force.values`; else the
-service sends no next one. Its axes, x to the right, y away from the operator, z up, are turned into
-B. Button a opens the clutch. Written from public clients of the service, and tried with a virtual
-one alone, not with the device.
+Messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], and the grip's
+`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. Each is answered by
+`inverse3[0].commands.set_cursor_force.values`. Axes: x right, y forward, z up. Button a opens the
+clutch. Tested only with a virtual service, not with the device.
 """
 
 from __future__ import annotations
@@ -18,33 +16,29 @@ from urllib.parse import urlsplit
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live.device_guard import Limits
-from drake_teleop.live.device_packets import CLUTCH_OPEN, DeviceState, Place, believable
+from drake_teleop.live.device_packets import CLUTCH_OPEN, DevicePose, DeviceState, plausible_state
 
-_LONGEST, _TIMEOUT = 65536, 0.5  # bytes of a message, s
+_MAX_MESSAGE_BYTES, _TIMEOUT_S = 65536, 0.5  # bytes of a message, s
 _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse_grip")
 
 
-class Heard(NamedTuple):
-    """What a message says: which device, and where it is in B."""
+class Message(NamedTuple):
+    """Name of a device, and its state in B."""
 
     device: str
     state: DeviceState
 
 
-def read_message(text: Any) -> Heard | None:
-    """What is in a message, None if no device is, or none at a place where it can be. Never raises.
-
-    Args:
-        text: as it came.
-    """
-    if not isinstance(text, (str, bytes)) or len(text) > _LONGEST:
+def read_message(text: Any) -> Message | None:
+    """Return the content of a message, None without a plausible pose. Never raises."""
+    if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
-        said = json.loads(text)
-        cursor = said["inverse3"][0]
+        content = json.loads(text)
+        cursor = content["inverse3"][0]
         place, name = cursor["state"]["cursor_position"], cursor["device_id"]
         x, y, z = (_number(place[axis]) for axis in "xyz")
-        grip: Any = next((said[kind][0]["state"] for kind in _GRIPS if said.get(kind)), {})
+        grip: Any = next((content[kind][0]["state"] for kind in _GRIPS if content.get(kind)), {})
         turn = grip.get("orientation") or {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
         w, i, j, k = (_number(turn[axis]) for axis in "wxyz")
         pressed = (grip.get("buttons") or {}).get("a") is True
@@ -53,12 +47,12 @@ def read_message(text: Any) -> Heard | None:
     if not isinstance(name, str):
         return None
     flags = CLUTCH_OPEN if pressed else 0
-    state = believable(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
-    return None if state is None else Heard(name, state)
+    state = plausible_state(0, 0.0, flags, (-y, x, z, w, -j, i, k, 0.0))
+    return None if state is None else Message(name, state)
 
 
-def written_force(device: str, wrench: Sequence[float]) -> str:
-    """The message that displays a force (its first three numbers, in B)."""
+def force_message(device: str, wrench: Sequence[float]) -> str:
+    """Return the message that displays the force of a wrench in B."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -73,16 +67,13 @@ def _number(value: Any) -> float:
 
 
 class HaplyDevice:
-    """An Inverse3 at a service.
-
-    Args:
-        address: haply://HOST:PORT, 10001 if there is none.
+    """Inverse3 at haply://HOST:PORT.
 
     Raises:
-        DrakeTeleopError: if nobody answers there.
+        DrakeTeleopError: if the service does not answer.
     """
 
-    limits = Limits(force=8.0)  # of 10 N at its peak (D)
+    limits = Limits(force=8.0)  # N; the peak of the device is 10 N (data sheet)
 
     def __init__(self, address: str) -> None:
         from websockets.sync.client import connect
@@ -93,7 +84,7 @@ class HaplyDevice:
             url = f"ws://{parts.hostname or 'localhost'}:{parts.port or 10001}"
             opened = connect(
                 url,
-                max_size=_LONGEST,
+                max_size=_MAX_MESSAGE_BYTES,
                 open_timeout=2,
                 close_timeout=1,
                 compression=None,
@@ -106,29 +97,31 @@ class HaplyDevice:
             ) from error
         self._device = ""
 
-    def read(self) -> Place | None:
-        """See `Device`."""
+    def read(self) -> DevicePose | None:
+        """See `Device.read`."""
         from websockets.exceptions import ConnectionClosed
 
         try:
-            heard = read_message(self._socket.recv(timeout=_TIMEOUT))
+            message = read_message(self._socket.recv(timeout=_TIMEOUT_S))
         except TimeoutError:
             return None
         except ConnectionClosed as error:
-            raise DrakeTeleopError("the service has gone", where="haply") from error
-        if heard is None:
+            raise DrakeTeleopError(
+                "the service has closed the connection", where="haply"
+            ) from error
+        if message is None:
             return None
-        self._device = heard.device
-        return Place(heard.state.position, heard.state.orientation, heard.state.flags)
+        self._device = message.device
+        return DevicePose(message.state.position, message.state.orientation, message.state.flags)
 
     def set(self, wrench: Sequence[float]) -> None:
-        """See `Device`."""
+        """See `Device.set`."""
         from websockets.exceptions import ConnectionClosed
 
-        with contextlib.suppress(ConnectionClosed):  # `read` says so
-            self._socket.send(written_force(self._device, wrench) if self._device else "{}")
+        with contextlib.suppress(ConnectionClosed):  # `read` reports it
+            self._socket.send(force_message(self._device, wrench) if self._device else "{}")
 
     def close(self) -> None:
-        """See `Device`."""
+        """See `Device.close`."""
         self.set((0.0,) * 6)
         self._open.close()

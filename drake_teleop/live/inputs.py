@@ -1,8 +1,7 @@
-"""What a driver does, as whole numbers: what is recorded is exactly what was simulated.
+"""Inputs of a driver as integers, so that the record is exactly the simulated input.
 
-A recorded drive is a table `inputs.csv`: one row for each change, with its time in ms since the
-start and every input; the last row is the end of the drive, so far as it was recorded. Choices are
-written by name. A comment above has what else the motion depends on, such as versions.
+`inputs.csv` has a row for each change, with its time [ms] and choices by name. The last row is the
+end. A comment contains versions on which the motion depends.
 """
 
 from __future__ import annotations
@@ -21,39 +20,58 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.quaternions import exponential, logarithm
 from drake_teleop.common.texts import read_text
 from drake_teleop.common.version import __version__
-from drake_teleop.live.choice_names import NAMES, NETWORKS, SENSORS, first_choices
+from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 
 Array = NDArray[np.float64]
 
-#: The file of a drive's inputs.
+OWN = "as in the scenario"
+NETWORKS = (OWN, *NETWORK_PRESETS, "custom")
+SENSORS = (OWN, *SENSOR_PRESETS)
+#: Names of each choice; a choice is the index of its name.
+NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
+
+#: File of a drive's inputs.
 INPUTS = "inputs.csv"
-#: The inputs change between slices of this length [ms], and a slice is simulated at once.
+#: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
-LENGTH, ANGLE = 1e-5, 1e-4  #: units of place [m] and rotation [rad]
-_SHARE, _SCALE = 1e-2, 1e-5
-_LONGEST = 36_000_000  # ms; ten hours, as of a scenario
+LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
+_SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
+MAX_DURATION_MS = 36_000_000  # ms; ten hours, as of a scenario
+
+
+def initial_choices(scenario: Scenario) -> dict[str, int]:
+    """Return the choices that leave a scenario unchanged."""
+    return {
+        "network": 0,
+        "method": METHODS.index(scenario.passivity.method),
+        "grip": list(GRIPS).index(scenario.operator.grip),
+        "object": int(scenario.slave.payload.mass > 0.0),
+        "detection": int(scenario.contact_detection is not None),
+        "sensor": 0,
+    }
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that a driver may change, in whole numbers.
+    """Inputs that a driver may change.
 
     Attributes:
-        x, y, z: where the hand wants the stylus, from its start, along the axes of B [10 um].
-        rx, ry, rz: the wanted turn from the start as a rotation vector in B [0.1 mrad].
-        held: 1 while the hand holds the stylus, 0 when it has let go.
-        clutch: 1 while the motion goes to the slave.
-        sigma: share of the gripper's non-contact wrench, of all of it if it is not told apart [%].
-        sigma_object: share of a gripped object's [%].
+        x, y, z: intended displacement of the stylus in B [10 um].
+        rx, ry, rz: intended rotation vector in B [0.1 mrad].
+        held: 1 while the hand holds the stylus.
+        clutch: 1 while motion is transmitted.
+        sigma: scale of the gripper's (or whole) non-contact wrench [%].
+        sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
-        force_scale: of force and torque, slave to master [1e-5].
-        network, method, grip, sensor: which of `choices.NAMES`.
-        delay, jitter, loss: of the network that is "custom" [0.1 ms, %, 0.1 %].
-        object: 1 while the tool holds an object.
-        detection: 1 if contact is detected.
+        force_scale: slave to master [1e-5].
+        network, method, grip, sensor: index into `NAMES`.
+        delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
+        object: 1 with a gripped object.
+        detection: 1 with contact detection.
     """
 
     x: int = 0
@@ -80,14 +98,16 @@ class Inputs:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Inputs:
-        """Those with which a scenario starts."""
-        sigma, sigma_object, gamma = (round(s / _SHARE) for s in scenario.force_scaling.scales())
-        scale = round(scenario.force_scaling.force_scale / _SCALE)
+        """Return the initial inputs of a scenario."""
+        sigma, sigma_object, gamma = (
+            round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()
+        )
+        scale = round(scenario.force_scaling.force_scale / _SCALE_UNIT)
         started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)
-        return started.changed(first_choices(scenario))
+        return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """With other values, each brought into its range; what is no finite number is left out."""
+        """Return inputs with new values, clipped, without non-finite ones."""
         changes = {}
         for name in values.keys() & RANGES.keys():
             value, (low, high) = values[name], RANGES[name]
@@ -97,30 +117,30 @@ class Inputs:
 
     @property
     def target(self) -> tuple[int, ...]:
-        """What leads the hand."""
+        """Inputs that move the hand."""
         return self.x, self.y, self.z, self.rx, self.ry, self.rz, self.held
 
     @property
     def station(self) -> tuple[int, ...]:
-        """What decides which station it is."""
+        """Inputs on which the station depends."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
 
     @property
     def channel(self) -> tuple[int, ...]:
-        """What of that decides about network and method."""
+        """Inputs on which channel and passivity method depend."""
         return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
-        """The wanted X_BE (7,), of (3,) the stylus' position at the start [m]; None: let go."""
+        """Return the intended X_BE (7,) for a start position (3,) [m]; None if released."""
         if not self.held:
             return None
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
-    def held_at(self, pose: Array, start: Array) -> Inputs:
-        """With the hand that wants the stylus at `pose` (7,) X_BE, as nearly as numbers allow."""
+    def holding(self, pose: Array, start: Array) -> Inputs:
+        """Return inputs that hold the stylus at `pose` (7,) X_BE."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -128,16 +148,16 @@ class Inputs:
 
     @property
     def scales(self) -> dict[str, float]:
-        """As `ForceScaling.SetScales` takes them."""
+        """Arguments of `ForceScaling.SetScales`."""
         return {
-            "sigma_gripper": _SHARE * self.sigma,
-            "sigma_object": _SHARE * self.sigma_object,
-            "gamma": _SHARE * self.gamma,
-            "force_scale": _SCALE * self.force_scale,
+            "sigma_gripper": _SHARE_UNIT * self.sigma,
+            "sigma_object": _SHARE_UNIT * self.sigma_object,
+            "gamma": _SHARE_UNIT * self.gamma,
+            "force_scale": _SCALE_UNIT * self.force_scale,
         }
 
 
-_CHOICES = {
+_CHOICE_RANGES = {
     "network": (0, len(NETWORKS) - 1),
     "delay": (0, 20_000),
     "jitter": (0, 100),
@@ -147,71 +167,60 @@ _CHOICES = {
     **dict.fromkeys(("object", "detection"), (0, 1)),
     "sensor": (0, len(SENSORS) - 1),
 }
-#: The inputs that another station follows from.
-CHOICES = frozenset(_CHOICES)
-#: Of each input. The hand's box is 0.3 m wide: beyond it the device has its end stops.
+#: Inputs whose change requires another station.
+CHOICES = frozenset(_CHOICE_RANGES)
+#: Range of each input. The end stops of the device are outside the hand's 0.3 m wide box.
 RANGES = {
     **dict.fromkeys(("x", "y", "z"), (-15_000, 15_000)),
     **dict.fromkeys(("rx", "ry", "rz"), (-10_000, 10_000)),
     **dict.fromkeys(("held", "clutch"), (0, 1)),
     **dict.fromkeys(("sigma", "sigma_object", "gamma"), (0, 300)),
     "force_scale": (0, 100_000),
-    **_CHOICES,
+    **_CHOICE_RANGES,
 }
 _COLUMNS = ("ms", *RANGES)
 _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the first lines of a file of inputs.
-
-    Args:
-        made_by: what the motion depends on besides: versions by the name of the package, and so on.
-    """
+    """Return the first lines, with versions and digests by name."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
-    """A line of it: what holds from this time on [ms]."""
+    """Return the line of the inputs at a time [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
     values |= {name: names[values[name]] for name, names in NAMES.items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """The changes in a file of inputs, with their times [ms]; the last one is the end.
-
-    A last line that was being written when its process was killed is left out.
-
-    Args:
-        path: of the file.
-        made_by: as of `header`, of this process.
+    """Return the changes with their times [ms]; the last one is the end.
 
     Raises:
-        DrakeTeleopError: naming file and line, for whatever else is wrong; or if the drive cannot
-            be repeated exactly.
+        DrakeTeleopError: with file and line; or if the drive cannot be repeated exactly.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]
     if tuple(lines[0]) == _COLUMNS:
-        raise _cannot_repeat("has numbers for names, and no version that gives them meaning", path)
+        raise _cannot_repeat("has choices as numbers and no version of this package", path)
     if tuple(lines[1:2]) != (list(_COLUMNS),) or not complete.startswith("# "):
         raise DrakeTeleopError(
-            "is no record of a drive",
+            "is not a record of a drive",
             where=str(path),
-            remedy=f"its columns are {', '.join(_COLUMNS)}",
+            remedy=f"use the columns {', '.join(_COLUMNS)}",
         )
-    before = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
+    recorded_with = dict(re.findall(r"(\w+) ([^,\s]+)", complete.split("\n")[0]))
     for name, value in made_by.items():
-        if before.get(name) != value:
-            found = before.get(name, "unknown")
+        if recorded_with.get(name) != value:
+            found = recorded_with.get(name, "unknown")
             what = f"was recorded with {name} {found}, and this is {value}"
             changed = "the models or other files that its scenario names have changed"
             raise _cannot_repeat(changed if name == "files" else what, path)
-    changes = list(_checked(lines[2:], path))
+    changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError("ends when it begins", where=str(path))
+        raise DrakeTeleopError("contains no simulated time", where=str(path))
     return changes
 
 
@@ -220,7 +229,7 @@ def _cannot_repeat(what: str, path: Path) -> DrakeTeleopError:
     return DrakeTeleopError(what, where=str(path), remedy=remedy)
 
 
-def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
+def _parse_rows(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]:
     earlier = -1
     for number, line in enumerate(lines, start=3):
         where = f"{path}:{number}"
@@ -234,12 +243,12 @@ def _checked(lines: list[list[str]], path: Path) -> Iterator[tuple[int, Inputs]]
         try:
             ms, *values = map(int, line)
         except ValueError:
-            raise DrakeTeleopError("has something other than whole numbers", where=where) from None
-        if not max(earlier, 0) <= ms <= _LONGEST or (earlier < 0 and ms):
+            raise DrakeTeleopError("has a value that is not a whole number", where=where) from None
+        if not max(earlier, 0) <= ms <= MAX_DURATION_MS or (earlier < 0 and ms):
             raise DrakeTeleopError(
-                f"{ms} ms is no time here",
+                f"{ms} ms is not a valid time",
                 where=where,
-                remedy="times are whole milliseconds, from 0 on, in order",
+                remedy="use increasing times in whole milliseconds from 0",
             )
         earlier, inputs = ms, dict(zip(RANGES, values, strict=True))
         for name, (low, high) in RANGES.items():

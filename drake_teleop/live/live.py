@@ -1,13 +1,13 @@
-"""A drive with its driver and watchers, in the time of any clock; without any page.
+"""A drive with its driver and spectators, independent of page and clock.
 
-One client drives, the others watch; when the driver goes the next client that asks drives. A hand
-that nobody leads lets go at once, with the clutch open; a quarter of a second later simulated time
-stands still and the record is complete on the disk.
+Without a driver the hand lets go, and after 0.25 s the simulation stops with a complete record.
 """
 
 from __future__ import annotations
 
 import itertools
+import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,56 +18,54 @@ from pydrake.math import RollPitchYaw
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.writing import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
-from drake_teleop.live.choice_names import NAMES
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.external_master import TICK_MS
-from drake_teleop.live.following import Follower, Steering
-from drake_teleop.live.inputs import CHOICES, RANGES, SLICE_MS, Inputs
-from drake_teleop.live.messages import parse
+from drake_teleop.live.inputs import CHOICES, MAX_DURATION_MS, NAMES, RANGES, SLICE_MS, Inputs
+from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.scenes import SCENES
+from drake_teleop.live.scenarios import SCENES
 from drake_teleop.live.session import Session
 from drake_teleop.station.scenario import Scenario
 
 Show = Callable[[dict[str, np.ndarray]], dict[str, Any]]
-"""Returns what a frame contains of the 3D scene, at the newest of some rows of a log."""
+"""Function from rows of a log to the 3D scene's part of a frame."""
 
-#: Frames for the page [s].
+#: Period of the frames for the page [s].
 FRAME = 1 / 60
-_SHORTEST = 0.25 * FRAME  # between two of them
-#: The contact force at the hand from which a gamepad vibrates [N].
-TOUCH = 0.12
-# How long it goes on when nobody drives [s]; slices in a row before messages are listened to.
-_ALONE, _IN_A_ROW = 0.25, 4
-_KEPT_BACK = 0.05  # N of which it is said
-_LONGEST_MS = 36_000_000
-_LIMP = {"held": 0, "clutch": 0}
-# Of this package, of Drake, and of Drake's assertions.
+_MIN_FRAME_PERIOD_S = 0.25 * FRAME  # s, shortest time between two frames
+#: Smallest contact force at the hand that a gamepad displays [N].
+TOUCH_FORCE_N = 0.12
+# Time without a driver until the simulation stops [s]; most slices between two polls of messages.
+_SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
+_MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
+_RELEASED = {"held": 0, "clutch": 0}
+# Errors of this package and of Drake; SystemExit is a failed assertion of Drake.
 _FAILURES = (DrakeTeleopError, RuntimeError, SystemExit)
+
+#: Largest message [bytes]; a longer one closes the connection.
+MAX_MESSAGE_BYTES = 4096
+#: Largest clock time per simulated time.
+MAX_SLOWDOWN = 20.0
 
 
 class Live:
-    """What happens when messages and the clock's ticks come in.
+    """Event handler of a drive: messages of pages and ticks of a clock.
 
     Attributes:
-        refused: how many messages were none.
-        stopped: why simulated time stands still until a reset; "" if nothing has failed.
-        asked: the scene that is asked for, "" for none; time stands still until `change`.
-        scene: that is driven.
-        pace: when slices are due.
-        recorded: folders of the drives that are over.
+        refused: number of invalid messages.
+        stopped: failure that stops the simulation, or "".
+        requested_scene: of a page, or ""; the simulation waits for `change_scene`.
+        scene: present scene.
+        pace: timing of the slices.
+        recorded: folders of completed drives.
 
     Args:
-        scenario: as `live_scenario` makes it.
-        load: what the station knows of its load.
-        record: the folder of the record; None for none. If it is not empty, as after a reset, the
-            record goes into the next free one beside it.
-        show: what shows the scene.
+        record: folder, or if it is not empty the next free one; None for none.
+        show: returns the scene's part of a frame.
         now: the clock [s].
-        link: to a haptic device that is the hand; None for that of a page.
-        log: whether the log is recorded, too, or the inputs that it follows from alone.
-        begin: inputs with which it begins, other than the scenario's.
+        link: to a haptic device; None for a page's hand.
+        begin: initial inputs.
     """
 
     def __init__(
@@ -82,73 +80,71 @@ class Live:
         log: bool = True,
         begin: Mapping[str, int] | None = None,
     ) -> None:
-        self._log, self._first = log, begin or {}
+        self._log, self._initial = log, begin or {}
         self._link, self._slice_ms = link, SLICE_MS if link is None else TICK_MS
-        self.refused, self.asked, self.scene = 0, "", SCENES[0]
-        self._scenario, self._load, self._record, self._show = scenario, load, record, show
-        self._clients: list[int] = []
+        self.refused, self.requested_scene, self.scene = 0, "", SCENES[0]
+        self._scenario, self._load, self._record, self._scene_part = scenario, load, record, show
         self._driver: int | None = None
         self._drives, self._paused, self.stopped = 0, False, ""
         self.recorded: list[str] = []
-        self._unwritten = ""
+        self._write_error = ""
         self._alone_since = now
         self.pace = Pace(1e-3 * self._slice_ms, now)
-        self._frame_due, self._framed, self._heeded = now, now, False
-        self._begin(now)
+        self._frame_due, self._last_frame_at, self._show_now = now, now, False
+        self._start_drive(now)
 
-    def _begin(self, now: float) -> None:
-        """A drive from the scenario's start."""
-        folder = None if self._record is None else _free(self._record)
+    def _start_drive(self, now: float) -> None:
+        folder = None if self._record is None else _free_folder(self._record)
         self._drives += 1
         log = folder / "log.parquet" if folder is not None and self._log else None
+        by_device = self._link is not None
         self._session = Session(
-            self._scenario, self._load, log=log, record=folder, device=self._link is not None
+            self._scenario, self._load, log=log, record=folder, device=by_device
         )
         self._folder = "" if folder is None else str(folder)
-        self._session.apply(self._session.inputs.changed(self._first))
+        self._session.apply(self._session.inputs.changed(self._initial))
         if self._link is not None:
-            self._link.begin_anew(now)
-        scaling, by_device = self._scenario.kinematic_scaling, self._link is not None
+            self._link.reset_origin(now)
+        scaling = self._scenario.kinematic_scaling
         scales = scaling.translation_scale, scaling.rotation_scale
-        self._follower = Follower(1e-3 * self._slice_ms, scales, device=by_device)
+        self._limiter = MotionLimiter(1e-3 * self._slice_ms, scales, device=by_device)
         self._cockpit, self.stopped = Cockpit(self._scenario), ""
         self._asleep = self._driver is None
         self._refusal, self._pressed = "", False
-        self._wanted, self._steering = self._session.inputs, Steering()
-        self._led = self._wanted.target
-        self._frame: dict[str, Any] = {}
+        self._requested, self._rates = self._session.inputs, RateInputs()
+        self._last_target = self._requested.target
+        self._last_frame: dict[str, Any] = {}
         self.pace.start(now)
 
-    def change(
+    def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
     ) -> None:
-        """A drive of another scenario, the scene that was asked for."""
-        self._scenario, self._load, self._show = scenario, load, show
-        self.scene, self.asked = self.asked, ""
+        """Start a drive of the requested scene."""
+        self._scenario, self._load, self._scene_part = scenario, load, show
+        self.scene, self.requested_scene = self.requested_scene, ""
         self._restart(now)
 
     def _restart(self, now: float) -> None:
-        """Close the record and begin again. What fails stops the drive, or is said in it."""
         self.stopped = ""
         self._try(self.end)
         failure = self.stopped
-        self._try(lambda: self._begin(now))
+        self._try(lambda: self._start_drive(now))
         self._refusal = failure
 
-    def refuse(self, why: str, now: float) -> None:
-        """The scene that was asked for cannot be driven; the present one goes on."""
-        self.asked, self._refusal = "", why
+    def reject_scene(self, why: str, now: float) -> None:
+        """Continue the present scene, and report why."""
+        self.requested_scene, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know of the scenario."""
+        """Return the scenario's constants for a page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
             "ranges": RANGES,
             "names": NAMES,
             "object": self._scenario.force_scaling.gripper_phi is not None,
-            "touch": TOUCH,
+            "touch": TOUCH_FORCE_N,
             "known": self._load is not None,
             "noise": self._load is not None and self._load.noise_floor is not None,
             "scale": scaling.translation_scale,
@@ -157,50 +153,48 @@ class Live:
         }
 
     def join(self, client: int, now: float) -> None:
-        """A page has connected; the first one drives."""
-        self._clients.append(client)
+        """Add a page; the first one drives."""
         if self._driver is None:
-            self._hand_over(client, now)
+            self._set_driver(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """A page has gone. If it was the driver, the hand lets go."""
-        self._clients.remove(client)
+        """Remove a page; the driver's hand lets go."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
-            self._wanted, self._steering = self._wanted.changed(_LIMP), Steering()
+            self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
 
-    def hear(self, client: int, text: Any, now: float) -> None:
-        """A message of a page; what is not one changes nothing but a counter."""
-        said = parse(text)
-        if said is None:
+    def handle_message(self, client: int, text: Any, now: float) -> None:
+        """Handle a message of a page; count an invalid one."""
+        message = parse(text)
+        if message is None:
             self.refused += 1
             return
-        if "drive" in said and client != self._driver:
-            self._hand_over(client, now)
+        if "drive" in message and client != self._driver:
+            self._set_driver(client, now)
         if client != self._driver:
             return
-        if "set" in said:
-            if not CHOICES.isdisjoint(said["set"]):
+        if "set" in message:
+            if not CHOICES.isdisjoint(message["set"]):
                 self._refusal = ""
-            self._wanted = self._wanted.changed(said["set"])
-            self._steering = Steering()
-        if "rates" in said:
-            self._wanted = self._steering.begin(said["rates"], self._wanted, now)
-        if "slow" in said:
-            self.pace.slow = said["slow"]
+            self._requested = self._requested.changed(message["set"])
+            self._rates = RateInputs()
+        if "rates" in message:
+            self._requested = self._rates.begin(message["rates"], self._requested, now)
+        if "slow" in message:
+            self.pace.slow = message["slow"]
             self.pace.start(now)
-        if "pause" in said and said["pause"] != self._paused:
-            self._paused = said["pause"]
+        if "pause" in message and message["pause"] != self._paused:
+            self._paused = message["pause"]
             self.pace.start(now)
-        if "scene" in said and not self.asked:
-            self.asked = said["scene"]
-        if "reset" in said:
+        if "scene" in message and not self.requested_scene:
+            self.requested_scene = message["scene"]
+        if "reset" in message:
             self._restart(now)
 
-    def _hand_over(self, client: int, now: float) -> None:
-        """The client takes hold of the stylus where it is."""
+    def _set_driver(self, client: int, now: float) -> None:
         self._driver = client
-        self._wanted, self._steering = self._session.stylus().changed({"clutch": 1}), Steering()
+        self._requested = self._session.inputs_at_stylus().changed({"clutch": 1})
+        self._rates = RateInputs()
         if self._asleep:
             self.pace.start(now)
         self._asleep = False
@@ -211,38 +205,38 @@ class Live:
         return self._session.ms
 
     @property
-    def still(self) -> bool:
-        """Whether simulated time stands still."""
-        return self._paused or self._asleep or bool(self.stopped or self.asked)
+    def is_idle(self) -> bool:
+        """Whether simulated time is stopped."""
+        return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """How long there is nothing to do [s]."""
+        """Return the time until the next slice or frame [s]."""
         frame = self._frame_due - now
-        return max(0.0, frame if self.still else min(frame, self.pace.wait(now)))
+        return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulates what is due, at most four slices; gives a frame when one is due."""
-        for _ in range(_IN_A_ROW):
+        """Simulate at most four due slices; return a due frame."""
+        for _ in range(_SLICES_PER_TICK):
             now = clock()
-            if self.still or self.pace.wait(now) > 0:
+            if self.is_idle or self.pace.wait(now) > 0:
                 break
             self.pace.begin(now)
-            self._slice(now)
+            self._simulate_slice(now)
         now = clock()
-        self._listen(now)
-        if self._driver is None and not self._asleep and now - self._alone_since >= _ALONE:
+        self._poll_device(now)
+        if self._driver is None and not self._asleep and now - self._alone_since >= _SLEEP_AFTER_S:
             self._asleep = True
-            self._try(self._session.keep)
-        # What the driver has just done or touched is shown at once; frames then go along with it.
-        heeded = self._heeded and now >= self._framed + _SHORTEST
-        if now < self._frame_due and not heeded:
+            self._try(self._session.flush)
+        # A new input or contact is shown at once; the schedule of frames then restarts.
+        show_now = self._show_now and now >= self._last_frame_at + _MIN_FRAME_PERIOD_S
+        if now < self._frame_due and not show_now:
             return None
-        self._frame_due = now + 1.5 * FRAME if heeded else max(self._frame_due + FRAME, now - FRAME)
-        self._framed, self._heeded = now, False
+        scheduled = max(self._frame_due + FRAME, now - FRAME)
+        self._frame_due = now + 1.5 * FRAME if show_now else scheduled
+        self._last_frame_at, self._show_now = now, False
         return self.frame()
 
-    def _listen(self, now: float) -> None:
-        """A device that speaks drives without a page, too."""
+    def _poll_device(self, now: float) -> None:
         if self._link is None or self._link.poll(now) is None:
             return
         self._alone_since = now
@@ -251,60 +245,61 @@ class Live:
             self.pace.start(now)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Where the station or the disk cannot go on, the drive stops and says why."""
+        """Run an action; a failure stops the drive."""
         try:
             action()
         except _FAILURES as error:
             self.stopped = one_line(str(error))
 
-    def _slice(self, now: float) -> None:
-        by_device = {} if self._link is None else self._link.lead(now)
-        self._wanted = self._steering.step(self._wanted, 1e-3 * self._slice_ms, now)
-        self._heeded |= self._wanted.target != self._led
-        self._led = self._wanted.target
+    def _simulate_slice(self, now: float) -> None:
+        by_device = {} if self._link is None else self._link.hand_inputs(now)
+        self._requested = self._rates.step(self._requested, 1e-3 * self._slice_ms, now)
+        self._show_now |= self._requested.target != self._last_target
+        self._last_target = self._requested.target
         try:
-            self._session.apply(self._followed(self._wanted.changed(by_device)))
+            self._session.apply(self._limited(self._requested.changed(by_device)))
         except _FAILURES as error:
             present = self._session.inputs
-            if self._wanted.station == present.station:
+            if self._requested.station == present.station:
                 self.stopped = one_line(str(error))
-            else:  # there is no such station: the present one goes on
+            else:  # there is no such station: keep the present one
                 self._refusal = one_line(str(error))
-                kept = {name: getattr(present, name) for name in CHOICES}
-                self._wanted = self._wanted.changed(kept)
+                removed = {name: getattr(present, name) for name in CHOICES}
+                self._requested = self._requested.changed(removed)
         if not self.stopped:
             self._try(lambda: self._session.advance(self._slice_ms))
-            pressed = self._session.pressed() > TOUCH
-            self._heeded |= pressed and not self._pressed
+            pressed = self._session.contact_force() > TOUCH_FORCE_N
+            self._show_now |= pressed and not self._pressed
             self._pressed = pressed
         if self._link is not None and not self.stopped:
             self._link.send(self._session.force())
-        if self._session.ms >= _LONGEST_MS:
-            self.stopped = "ten hours are over"
+        if self._session.ms >= MAX_DURATION_MS:
+            self.stopped = "the limit of ten hours is reached"
 
-    def _followed(self, wanted: Inputs) -> Inputs:
-        """The inputs of this slice; what does not move the arm may jump."""
+    def _limited(self, wanted: Inputs) -> Inputs:
         by_device = self._link is not None
         free = not self._session.inputs.held or (by_device and not wanted.clutch)
-        return self._follower.step(wanted, free=free)
+        return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """What a page is shown now."""
-        rows = self._session.news()
+        """Return the present frame for pages."""
+        rows = self._session.new_rows()
         if len(rows["t"]):
-            self._frame = self._cockpit.frame(rows, self._session.inputs) | self._show(rows)
-        inputs = self._wanted
-        words = self._frame.get("words", [])
+            self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
+                rows
+            )
+        inputs = self._requested
+        words = self._last_frame.get("words", [])
         if self._session.filling:
             words = ["a new channel starts: the clutch is open until its packets arrive", *words]
-        kept = self._session.kept_back()
-        if kept > _KEPT_BACK:
-            words = [f"{kept:.1f} N are not rendered until the hand presses less", *words]
+        removed = self._session.removed_force()
+        if removed > _MIN_REMOVED_FORCE_N:
+            words = [f"{removed:.1f} N are not rendered until the hand presses less", *words]
         if self._refusal:
             words = [self._refusal, *words]
-        return self._frame | {
+        return self._last_frame | {
             "words": words,
-            "device": "" if self._link is None else self._link.text(),
+            "device": "" if self._link is None else self._link.status_text(),
             "speed": round(self.pace.factor, 4),
             "slow": self.pace.slow,
             "factor": round(self.pace.factor * self.pace.slow, 3),
@@ -313,51 +308,85 @@ class Live:
             "state": self._state(),
             "driver": self._driver,
             "drive": self._drives,
-            "scene": self.asked or self.scene,
+            "scene": self.requested_scene or self.scene,
             "record": self._folder,
             "stopped": self.stopped,
             "inputs": {name: getattr(inputs, name) for name in RANGES},
         }
 
     def _state(self) -> str:
-        if self.asked:
+        if self.requested_scene:
             return "preparing"
         if self.stopped:
             return "stopped"
         return "paused" if self._paused else "waiting" if self._asleep else "running"
 
     def end(self) -> None:
-        """Completes its record; a device may go on in another drive.
+        """Complete the record.
 
         Raises:
-            CannotWrite: if the record cannot be completed.
+            CannotWrite: if that fails.
         """
         try:
             self._session.close()
         except DrakeTeleopError as error:
-            self._unwritten = self._unwritten or str(error)
+            self._write_error = self._write_error or str(error)
             raise
         if self._folder and self._session.ms:
             self.recorded.append(self._folder)
         self._folder = ""
 
     def close(self) -> None:
-        """Ends the drive, and the link to a device.
+        """End the drive and the device link.
 
         Raises:
-            CannotWrite: if the record of any of its drives is incomplete.
+            CannotWrite: if any record is incomplete.
         """
         self._try(self.end)
         if self._link is not None:
             self._link.close()
-        if self._unwritten:
-            raise CannotWrite(self._unwritten)
+        if self._write_error:
+            raise CannotWrite(self._write_error)
 
 
-def _free(folder: Path) -> Path:
-    """Return the folder if it is absent or empty, else the first absent one of DIR-2, DIR-3, ..."""
-    folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no neighbour
+def _free_folder(folder: Path) -> Path:
+    """Return the folder if absent or empty, else DIR-2, DIR-3, ..."""
+    folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
     names = (folder.with_name(f"{folder.name}-{k}") for k in itertools.count(2))
     return next(name for name in names if not name.exists())
+
+
+def parse(text: Any) -> dict[str, Any] | None:
+    """Return the valid requests of a message; None without any.
+
+    "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
+    """
+    if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
+        return None
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(message, dict):
+        return None
+    found: dict[str, Any] = {}
+    for kind in ("set", "rates"):
+        values = message.get(kind)
+        if isinstance(values, dict):
+            found[kind] = {name: value for name, value in values.items() if _is_number(value)}
+    if isinstance(message.get("pause"), bool):
+        found["pause"] = message["pause"]
+    if _is_number(message.get("slow")):
+        found["slow"] = min(max(float(message["slow"]), 1.0), MAX_SLOWDOWN)
+    if isinstance(message.get("scene"), str) and message["scene"] in SCENES:
+        found["scene"] = message["scene"]
+    found |= {name: True for name in ("reset", "drive") if message.get(name) is True}
+    return found or None
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 1e15 and math.isfinite(value)

@@ -1,4 +1,4 @@
-"""When slices are due: simulated time keeps up with a clock, or falls behind visibly."""
+"""Timing of slices: simulated time follows a clock, or visibly falls behind."""
 
 from __future__ import annotations
 
@@ -7,64 +7,62 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: Beyond this, lost time is given up instead of caught up with [s].
-_GIVE_UP = 0.1
-_REMEMBERED = 400  # slices
+#: Lateness above which lost time is not caught up [s].
+_MAX_LATENESS_S = 0.1
+_STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
-    """Says when the next slice is due. Times are those of any clock, [s].
+    """Schedule of the slices [s].
 
     Attributes:
-        slow: seconds of the clock for one of the simulation.
-        given_up: lost time that was not caught up with [s].
-
-    Args:
-        slice_s: length of a slice [s].
-        now: the clock.
+        slow: clock time per simulated time.
+        given_up: lost time [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
         self.slow, self.given_up = 1.0, 0.0
         self._slice = slice_s
-        self._late: deque[float] = deque(maxlen=_REMEMBERED)
-        self._begun: deque[float] = deque(maxlen=_REMEMBERED)
+        self._lateness: deque[float] = deque(maxlen=_STATISTICS_SLICES)
+        self._starts: deque[float] = deque(maxlen=_STATISTICS_SLICES)
         self.start(now)
 
     def start(self, now: float) -> None:
-        """The next slice is due now: at the beginning, or after a pause."""
+        """Make the next slice due now."""
         self._due = now
-        self._begun.clear()
+        self._starts.clear()
 
     def wait(self, now: float) -> float:
-        """How long there is nothing to do [s]; 0 or less: a slice is due."""
+        """Return the time until the next slice [s]."""
         return self._due - now
 
     def begin(self, now: float) -> None:
-        """A slice that is due is simulated now."""
+        """Record the start of the due slice."""
         late = now - self._due
-        if late > _GIVE_UP:
+        if late > _MAX_LATENESS_S:
             self.given_up += late
             self._due = now
-        self._late.append(late)
-        self._begun.append(now)
+        self._lateness.append(late)
+        self._starts.append(now)
         self._due += self._slice * self.slow
 
     @property
     def factor(self) -> float:
-        """Simulated over elapsed time, of the last two seconds or so; 0 before there are any."""
-        if len(self._begun) < 2 or self._begun[-1] <= self._begun[0]:
+        """Simulated over elapsed time of 400 slices; 0 at first."""
+        if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
-        return (len(self._begun) - 1) * self._slice / (self._begun[-1] - self._begun[0])
+        return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
     def lateness(self) -> float:
-        """How late slices were begun in the same time [s]: 99 % of them were so late or less."""
-        return sorted(self._late)[(99 * len(self._late) - 1) // 100] if self._late else 0.0
+        """Return the 99 % quantile of lateness [s]."""
+        return (
+            sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0
+        )
 
 
 @contextmanager
-def without_collections() -> Iterator[None]:
-    """Python's garbage is not looked for: a full search takes as long as ten slices."""
+def without_garbage_collection() -> Iterator[None]:
+    """Disable the garbage collector, which takes ten slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

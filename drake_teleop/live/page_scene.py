@@ -1,7 +1,6 @@
-"""3D scene of a drive for its page: the objects once, and then where they are.
+"""3D scene of a drive for its page: the objects once, then their poses.
 
-Meshcat makes the objects before the drive listens, and is closed at once: its port accepts input
-from any page, and malformed input ends the process.
+Meshcat is closed before the drive listens: malformed input from any page would end the process.
 """
 
 from __future__ import annotations
@@ -23,25 +22,20 @@ from drake_teleop.station.scenario import Scenario
 
 Rows = dict[str, NDArray[np.float64]]
 
-_ANY = (Exception, SystemExit)  # the second is a failed assertion of Drake
+_FAILURES = (Exception, SystemExit)  # SystemExit is a failed assertion of Drake
 
-# Of the page that Meshcat writes: its commands in base64, and files that they name.
+# Commands in base64 and their files in the static page of Meshcat.
 _COMMAND = re.compile(r'fetch\("data:application/octet-binary;base64,([^"]*)"\)')
 _FILE = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
-    """3D scene of one scenario. A drive whose scene fails goes on without it.
+    """3D scene of a scenario; its failure does not end the drive.
 
     Attributes:
-        name: of the scene in the page's addresses.
-        objects: JSON for the page: {"commands": [base64], "files": {address: data URL}}.
-        failure: why there is no scene; "" if there is one.
-
-    Args:
-        name: as above.
-        scenario: that is driven.
-        forces: whether arrows show the forces.
+        name: in the page's addresses.
+        objects: JSON {"commands": [base64], "files": {address: data URL}}.
+        failure: why there is no scene, or "".
     """
 
     def __init__(self, name: str, scenario: Scenario, *, forces: bool = True) -> None:
@@ -53,16 +47,14 @@ class PageScene:
                 meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
             self._scene = ReplayScene(meshcat, scenario, recorded)
             self.objects = _objects(meshcat.StaticHtml())
-            self._scene.canvas = _Moves()  # Meshcat may be destroyed by this thread only: now
-        except _ANY as error:
+            self._scene.canvas = _Moves()  # only this thread may destroy Meshcat
+        except _FAILURES as error:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return what a frame contains of the scene, at the last of some rows of a log.
+        """Return the scene's part of a frame at the last row.
 
-        Returns:
-            "view": the name, "no_view": the failure, and "moves" with "poses" {path: 4x4 matrix by
-            columns} and "sizes" {path: [x, y, z]} of everything that moves.
+        "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
         """
         moves = {} if self.failure else self._moves(rows)
         return {"view": self.name, "no_view": self.failure, "moves": moves}
@@ -72,7 +64,7 @@ class PageScene:
         try:
             self._scene.canvas = moves
             self._scene.show(0.0, rows, -1)
-        except _ANY as error:
+        except _FAILURES as error:
             if all(np.isfinite(values[-1]).all() for values in rows.values()):
                 self._fail(error)
             return {}
@@ -84,7 +76,7 @@ class PageScene:
 
 
 class _Moves:
-    """Collects poses and sizes in the place of Meshcat."""
+    """Recorder with the interface of Meshcat."""
 
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}
@@ -97,7 +89,6 @@ class _Moves:
         self._sizes[path] = [round(x, 4) for x in value]
 
     def rounded(self) -> dict[str, Any]:
-        """Return both for JSON; nothing if a pose is not finite."""
         matrices = np.array([*self._poses.values()]).round(5)
         if not np.isfinite(matrices).all():
             return {}
@@ -106,7 +97,6 @@ class _Moves:
 
 
 def _objects(html: str) -> bytes:
-    """Return the scene of a static page of Meshcat."""
     commands = _COMMAND.findall(html)
     if not commands:
         raise ValueError("Drake's Meshcat writes its static page in an unknown form")

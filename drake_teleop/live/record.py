@@ -1,32 +1,35 @@
-"""The folder of a recorded drive, while it is driven."""
+"""Folder of a recorded drive: scenario, load, inputs and log."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from importlib.metadata import version
 from io import TextIOWrapper
 from pathlib import Path
 
+from pydrake.systems.analysis import Simulator
+
 from drake_teleop.common.version import __version__
 from drake_teleop.common.writing import make_folder, naming, write_text
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
 from drake_teleop.live.inputs import INPUTS, Inputs, header, row
+from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.simulation import LogOnDisk
 
 LOAD, SCENARIO = "load.npz", "scenario.yaml"
-#: If this file exists, the hand's place in the inputs is that of a device.
+#: Marker file: the positions in the inputs are those of a haptic device.
 DEVICE = "device.txt"
 
 
 def made_by(scenario: Scenario) -> dict[str, str]:
-    """Return what the motion of a drive depends on besides its inputs, by name.
-
-    Versions, and a digest of the files that the scenario names, such as models.
-    """
+    """Return versions and a digest of the scenario's files, by name."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
         value = left.pop()
@@ -39,15 +42,10 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """The folder of a drive without its log.
-
-    Args:
-        folder: absent, or without a drive.
-        scenario, load, device: as of `Session`.
-        inputs: at the start.
+    """Folder of a drive without its log.
 
     Raises:
-        CannotWrite: if there is a drive, or no room.
+        CannotWrite: if it contains a drive, or the disk is full.
     """
 
     def __init__(
@@ -61,7 +59,7 @@ class Record:
     ) -> None:
         make_folder(folder)
         self._folder, path, self._last = folder, folder / INPUTS, ""
-        with naming(path):  # never that of another drive
+        with naming(path):  # mode x never overwrites another drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
             write_scenario(folder / SCENARIO, scenario)
@@ -76,7 +74,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Records a change at once: it outlives the process."""
+        """Write a change at once, which survives a kill."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -88,7 +86,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end of the drive; remove the record of a drive that never began."""
+        """Write the end; remove the record of a drive that never started."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)
@@ -98,7 +96,39 @@ class Record:
     def _remove(self) -> None:
         with suppress(OSError):
             self._file.close()
-        with suppress(OSError):  # a file of somebody else is in the folder
+        with suppress(OSError):  # the folder contains other files
             for name in (INPUTS, SCENARIO, LOAD, DEVICE):
                 (self._folder / name).unlink(missing_ok=True)
             self._folder.rmdir()
+
+
+class LogBeside(LogOnDisk):
+    """Log on a thread, which waits for the disk only in `finish` and the next part."""
+
+    def __init__(
+        self,
+        folder: Path,
+        simulator: Simulator,
+        start: float,
+        form: Callable[[SimulationResult], SimulationResult],
+    ) -> None:
+        super().__init__(folder, simulator, start, form)
+        self._thread = ThreadPoolExecutor(1, "log of a drive")
+        self._writing: Future[None] = self._thread.submit(_import_polars)
+
+    def finish(self) -> None:
+        """Wait until all rows are on the disk.
+
+        Raises:
+            DrakeTeleopError: if that fails.
+        """
+        self._writing.result()
+
+    def _write(self, part: SimulationResult) -> None:
+        self.finish()
+        self._writing = self._thread.submit(part.write_part, self._folder, self._rows)
+
+
+def _import_polars() -> None:
+    """Import polars on the thread, which takes 0.1 s."""
+    import polars  # noqa: F401

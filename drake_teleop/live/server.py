@@ -1,7 +1,6 @@
-"""`drake-teleop drive`: one page on this machine, and the socket that drives.
+"""Server of `drake-teleop drive`: one page on this machine and its socket.
 
-One port of 127.0.0.1 serves page, 3D viewer, scenes and socket, to clients that send the token of
-the address; the socket, to this page alone. Nothing else listens.
+One port of 127.0.0.1 serves clients with the token of the address; the socket only this page.
 """
 
 from __future__ import annotations
@@ -39,38 +38,36 @@ from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.common.writing import make_folder
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
-from drake_teleop.live.device import DrivenBy
-from drake_teleop.live.external_master import with_device
-from drake_teleop.live.live import Live
-from drake_teleop.live.messages import LONGEST
-from drake_teleop.live.pace import without_collections
+from drake_teleop.live.device_link import DeviceConnection
+from drake_teleop.live.live import MAX_MESSAGE_BYTES, Live
+from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.scenes import SCENES, scene
-from drake_teleop.live.session import Session, live_scenario
+from drake_teleop.live.scenarios import SCENES, live_scenario, scene, with_device
+from drake_teleop.live.session import Session
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.scenario import LoadScenario, Scenario, check_scenario
 
 _HOST = "127.0.0.1"
-_MOST_CLIENTS = 8
-# Turns of the loop from a socket that can be read to what has been said: one wakes its reader.
-_STEPS_OF_A_MESSAGE = 3
-_BEHIND = 2**18  # bytes that wait for a slow page, before it misses frames
-# s: for the clients, for the thread of the drive.
-_CLOSES, _ENDS = 1.0, 4.0
+_MAX_PAGES = 8
+# Iterations of asyncio's loop from a readable socket to a handled message.
+_LOOP_ITERATIONS = 3
+_MAX_UNSENT_BYTES = 2**18  # unsent bytes above which a slow page misses frames
+# Timeouts of the clients and of the drive's thread [s].
+_CLOSE_TIMEOUT_S, _END_TIMEOUT_S = 1.0, 4.0
 _OR_DEVICE = ("", " or until the device sends")
-# Of websockets' log everything else is about connections that failed, which a client causes.
+# All other log entries of websockets are failed connections, which clients cause.
 _LOGGER = logging.getLogger("drake_teleop.live.server")
 _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
 
 
 class LiveDrive:
-    """A station that is being driven, in a thread of its own.
+    """A drive on its own thread.
 
     Attributes:
-        url: of the page; whoever has it may drive.
-        recorded: folders of the drives that are over.
-        ended: afterwards, why simulated time had stopped; "" if it had not.
-        ms: afterwards, the simulated time [ms].
+        url: of the page, with its token.
+        recorded: folders of completed drives.
+        ended: after the end, why the simulation had stopped, or "".
+        ms: after the end, simulated time [ms].
     """
 
     def __init__(
@@ -86,10 +83,10 @@ class LiveDrive:
         self._pages: dict[ServerConnection, int] = {}
         self.recorded: list[str] = []
         self.url, self._port, self._token = "", port, secrets.token_urlsafe(16)
-        self._device = None if device is None else DrivenBy(device)
+        self._device = None if device is None else DeviceConnection(device)
         self._failed: BaseException | None = None
         self._ready, self._over, self._stop = (threading.Event() for _ in range(3))
-        self._numbers = itertools.count(1)  # of pages
+        self._page_numbers = itertools.count(1)  # of pages
         self._threads: list[threading.Thread] = []
         self._start(self._run, setup, record)
         try:
@@ -100,31 +97,29 @@ class LiveDrive:
         self._check()
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> None:
-        """Start a thread that ends with the drive."""
         self._threads.append(threading.Thread(target=work, args=arguments, daemon=True))
         self._threads[-1].start()
 
     def _prepare(self, scenario: Scenario, device: bool) -> None:
-        """Identify the load, and make the 3D scenes before anything listens."""
         with show_progress(True) as stage:
             self._load = _load_of(scenario, stage)
             self._make_scenes(scenario, device, stage("Prepare the station and its 3D scenes"))
 
-    def _make_scenes(self, scenario: Scenario, device: bool, told: Progress) -> None:
-        self._offered = {name: scene(name, scenario) for name in SCENES}
-        if device:
-            self._offered = {name: with_device(each) for name, each in self._offered.items()}
-        for name, each in self._offered.items():
-            self._views[name] = PageScene(name, each)
-            told(len(self._views) / (1 + len(SCENES)))
+    def _make_scenes(self, scenario: Scenario, device: bool, progress: Progress) -> None:
+        self._scene_scenarios: dict[str, Scenario] = {}
+        for name in SCENES:
+            setup = scene(name, scenario)
+            self._scene_scenarios[name] = with_device(setup) if device else setup
+            self._views[name] = PageScene(name, self._scene_scenarios[name])
+            progress(len(self._views) / (1 + len(SCENES)))
         warm_up(scenario, self._load, device)
-        told(1.0)
+        progress(1.0)
 
     def wait(self) -> None:
-        """Wait until the drive is over: after `stop`, or Ctrl-C.
+        """Wait for the end, by `stop` or Ctrl-C.
 
         Raises:
-            DrakeTeleopError: if the record is not complete.
+            DrakeTeleopError: if the record is incomplete.
         """
         try:
             while not self._over.wait(0.2):
@@ -134,10 +129,10 @@ class LiveDrive:
         self._check()
 
     def until_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM, and return which.
+        """Wait for Ctrl-C or SIGTERM and return its name.
 
         Raises:
-            DrakeTeleopError: if the record is not complete.
+            DrakeTeleopError: if the record is incomplete.
         """
         try:
             self.wait()
@@ -147,30 +142,26 @@ class LiveDrive:
             return str(signal) or "Ctrl-C"
 
     def _check(self) -> None:
-        """Raise what ended the drive, if it was an error."""
         if self._failed is not None:
             raise self._failed
 
     def stop(self) -> None:
-        """End the drive; its record is then complete on the disk."""
+        """End the drive and complete its record."""
         self._stop.set()
         for thread in self._threads:
             thread.join()
 
     def _end(self) -> None:
-        """Stop within 4 s, whatever further signals come.
-
-        Compiled code in another thread cannot be ended, and Python may crash at its exit then.
-        """
+        """Stop within 4 s; Python may crash at its exit while compiled code runs."""
         self._stop.set()
-        end = time.monotonic() + _ENDS
+        end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:
             while thread.is_alive() and (rest := end - time.monotonic()) > 0.0:
                 with contextlib.suppress(KeyboardInterrupt):
                     thread.join(rest)
         if any(thread.is_alive() for thread in self._threads):
             lost = "; its record may lack two seconds" if self._threads[0].is_alive() else ""
-            print(f"error: drive: does not end within {_ENDS:g} s{lost}", file=sys.stderr)
+            print(f"error: drive: does not end within {_END_TIMEOUT_S:g} s{lost}", file=sys.stderr)
             sys.stdout.flush()
             os._exit(2)
 
@@ -178,11 +169,10 @@ class LiveDrive:
         return f'<iframe src="{self.url}" style="width:100%;height:44rem;border:0"></iframe>'
 
     def _run(self, scenario: Scenario, record: Path | None) -> None:
-        """Run the drive on its thread."""
         try:
             self._live = self._make(scenario, record)
             asyncio.run(self._serve())
-        except (Exception, SystemExit) as error:  # the second is a failed assertion of Drake
+        except (Exception, SystemExit) as error:  # SystemExit is a failed assertion of Drake
             self._failed = error
         finally:
             if self._device is not None:
@@ -200,21 +190,21 @@ class LiveDrive:
     async def _serve(self) -> None:
         try:
             server = await serve(
-                self._meet,
+                self._serve_page,
                 _HOST,
                 self._port,
                 process_request=self._request,
-                max_size=LONGEST,
+                max_size=MAX_MESSAGE_BYTES,
                 max_queue=8,
                 compression=None,
                 ping_interval=5,
                 ping_timeout=5,
-                close_timeout=_CLOSES,
+                close_timeout=_CLOSE_TIMEOUT_S,
                 logger=_LOGGER,
             )
         except OSError as error:
-            what = f"cannot be listened to ({error.strerror})"
-            remedy = "give another --port"
+            what = f"cannot be opened ({error.strerror})"
+            remedy = "use another --port"
             raise DrakeTeleopError(what, where=f"port {self._port}", remedy=remedy) from error
         self._port = server.sockets[0].getsockname()[1]
         self.url = f"http://{_HOST}:{self._port}/?token={self._token}"
@@ -228,45 +218,43 @@ class LiveDrive:
             finally:
                 server.close()
                 with contextlib.suppress(asyncio.TimeoutError):
-                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSES)
+                    await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
 
     async def _drive(self, server: Server) -> None:
-        """The one loop: slices and frames, and messages whenever there is time between them."""
         refusal = ""
-        with without_collections():
+        with without_garbage_collection():
             while not self._stop.is_set():
-                if self._live.asked:
+                if self._live.requested_scene:
                     await self._change_scene()
                 frame = self._live.tick(time.perf_counter)
                 if frame is not None:
                     ready = [
                         c
                         for c in server.connections
-                        if c.transport.get_write_buffer_size() < _BEHIND
+                        if c.transport.get_write_buffer_size() < _MAX_UNSENT_BYTES
                     ]
                     broadcast(ready, json.dumps({"frame": frame}))
                 if self._device is not None and self._device.link.refusal != refusal:
                     refusal = self._device.link.refusal
-                    _tell(f"a packet of the device was refused: it {refusal}")
+                    _print_note(f"a packet of the device was refused: it {refusal}")
                 await self._sleep()
 
     async def _sleep(self) -> None:
-        """Until there is something to do; then messages that have come are listened to.
-
-        As asyncio waits in whole milliseconds, the last one is slept through without it.
-        """
+        """Wait until the next event, then handle messages."""
         rest = self._live.wait(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
         time.sleep(self._live.wait(time.perf_counter()))
-        for _ in range(_STEPS_OF_A_MESSAGE):
+        for _ in range(_LOOP_ITERATIONS):
             await asyncio.sleep(0)
 
     async def _change_scene(self) -> None:
-        """Identify the load on another thread, which may take minutes."""
         live, found = self._live, Future[IdentifiedLoad | None]()
         broadcast(self._pages, json.dumps({"frame": live.frame()}))
-        scenario, show = self._offered[live.asked], self._views[live.asked].show
+        scenario, show = (
+            self._scene_scenarios[live.requested_scene],
+            self._views[live.requested_scene].show,
+        )
 
         def identify() -> None:
             try:
@@ -280,17 +268,15 @@ class LiveDrive:
                 return
             await asyncio.sleep(0.05)
         try:
-            live.change(scenario, found.result(), show, time.perf_counter())
+            live.change_scene(scenario, found.result(), show, time.perf_counter())
         except DrakeTeleopError as error:
-            live.refuse(str(error), time.perf_counter())
+            live.reject_scene(str(error), time.perf_counter())
             return
         for page in tuple(self._pages):
             with contextlib.suppress(ConnectionClosed):
                 await page.send(self._hello(page))
 
     def _until_stopped(self, name: str) -> Progress:
-        """A stage that ends its computation when the drive ends."""
-
         def progress(fraction: float, words: str = "") -> None:
             if self._stop.is_set():
                 raise DrakeTeleopError("the drive has ended")
@@ -304,52 +290,61 @@ class LiveDrive:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Serve a file, or let a socket be opened; refuse everything that is not our own page's."""
+        """Serve a file or open a socket, only for our page."""
         host = f"{_HOST}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
         ours = secrets.compare_digest(token, self._token.encode())
         if request.headers.get_all("Host") != [host] or not ours:
-            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"The address needs its token.\n")
+            return _response(
+                HTTPStatus.FORBIDDEN, "text/plain", b"The address requires its token.\n"
+            )
         if path == "/socket":
             origin = request.headers.get_all("Origin")
             if origin != [f"http://{host}"]:
-                return _response(HTTPStatus.FORBIDDEN, "text/plain", b"Another page's.\n")
+                return _response(
+                    HTTPStatus.FORBIDDEN,
+                    "text/plain",
+                    b"Only this server's page may open the socket.\n",
+                )
             return None
         if path == "/":
             page = self._page()
-            own = policy(page, host)
-            return _response(HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), own)
+            content_policy = policy(page, host)
+            return _response(
+                HTTPStatus.OK, "text/html; charset=utf-8", page.encode(), content_policy
+            )
         if path.startswith("/scene/") and (view := self._views.get(path[len("/scene/") :])):
             return _response(HTTPStatus.OK, "application/json", view.objects)
         if path == "/meshcat.js":
             script = Path(FindResourceOrThrow("drake/geometry/meshcat.js")).read_bytes()
             return _response(HTTPStatus.OK, "text/javascript; charset=utf-8", script)
-        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Nothing is here.\n")
+        return _response(HTTPStatus.NOT_FOUND, "text/plain", b"Not found.\n")
 
-    async def _meet(self, connection: ServerConnection) -> None:
-        """A page, from its first message to its last."""
+    async def _serve_page(self, connection: ServerConnection) -> None:
         live = self._live
-        if len(connection.server.connections) > _MOST_CLIENTS:
+        if len(connection.server.connections) > _MAX_PAGES:
             await connection.close(1013, "too many pages")
             return
-        you = self._pages[connection] = next(self._numbers)
-        live.join(you, time.perf_counter())
+        number = self._pages[connection] = next(self._page_numbers)
+        live.join(number, time.perf_counter())
         try:
             await connection.send(self._hello(connection))
             async for text in connection:
-                live.hear(you, text, time.perf_counter())
+                live.handle_message(number, text, time.perf_counter())
         except ConnectionClosed:
             pass
         finally:
             del self._pages[connection]
-            live.leave(you, time.perf_counter())
+            live.leave(number, time.perf_counter())
             if not (self._pages or self._stop.is_set()):
-                _tell("no page is open: nothing runs" + _OR_DEVICE[self._device is not None])
+                _print_note(
+                    "no page is open: the simulation waits" + _OR_DEVICE[self._device is not None]
+                )
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
-    """What the station is told of its load; with its noise, so that contact may be detected."""
+    """Return the load with its noise floor, None if it is estimated online."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -357,16 +352,16 @@ def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | Non
 
 
 def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile what the first slices need before anybody waits for them: a minute, once."""
+    """Compile the functions of the first slices, a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
-    for z in (-1, -2):  # one row first, then several: to numba they are of different types
-        cockpit.frame(session.news(), session.inputs)
+    for z in (-1, -2):  # numba compiles one and several rows separately
+        cockpit.frame(session.new_rows(), session.inputs)
         session.apply(session.inputs.changed({"z": z}))
         session.advance()
-    session.stylus()
+    session.inputs_at_stylus()
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes, own: str = "") -> Response:
+def _response(status: HTTPStatus, kind: str, body: bytes, content_policy: str = "") -> Response:
     headers = Headers(
         {
             "Content-Type": kind,
@@ -375,7 +370,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes, own: str = "") -> Resp
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
             "Connection": "close",
-            "Content-Security-Policy": own or "default-src 'none'",
+            "Content-Security-Policy": content_policy or "default-src 'none'",
         }
     )
     return Response(status.value, status.phrase, headers, body)
@@ -389,21 +384,20 @@ def drive(
     browser: bool = False,
     device: str | None = None,
 ) -> LiveDrive:
-    """Drives a station in the browser: its hand by mouse, keys, gamepad or touch.
+    """Drive a station in the browser: its hand by mouse, keys, gamepad or touch.
 
-    The drive goes on in a thread of its own. In a notebook the page is shown where the value of
-    this call is; elsewhere open its `url`. `wait()` returns when it is over, `stop()` ends it.
+    `wait()` returns at the end of the drive, `stop()` ends it. A notebook shows the page as the
+    value of this call; elsewhere open its `url`.
 
     Args:
-        scenario: or the name of a shipped one, or a YAML file. Its operator gives the grip alone.
-        record: a folder for the drive, which `run --inputs` repeats; None for none.
-        port: of 127.0.0.1; 0 for any that is free.
-        browser: whether to open the page in the user's browser.
-        device: a haptic device that is the hand: udp://127.0.0.1:PORT, on which one is listened
-            to, or haply://localhost:10001.
+        scenario: or a shipped name, or a YAML file; its operator gives only the grip.
+        record: folder for `run --inputs`; None for none.
+        port: of the page on 127.0.0.1; 0 for any free port.
+        browser: whether to open the page.
+        device: haptic device: udp://127.0.0.1:PORT of a client, or haply://localhost:10001.
 
     Raises:
-        DrakeTeleopError: if the scenario cannot be used, or a port is taken.
+        DrakeTeleopError: if the scenario is invalid, or the port is in use.
     """
     if not isinstance(scenario, Scenario):
         scenario = LoadScenario(scenario)
@@ -417,13 +411,13 @@ def drive(
 def drive_command(
     scenario: str, *, record: Path | None, port: int, browser: bool, device: str | None = None
 ) -> None:
-    """`drake-teleop drive`: until Ctrl-C or SIGTERM.
+    """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: as `drive`; if the record is not complete; or with what had stopped it.
+        DrakeTeleopError: as `drive`, or for a stopped drive or incomplete record.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
-    print(f"drive it at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
     reason = live.until_signal()
     print(f"\nended by {reason} after {1e-3 * live.ms:.1f} s of simulated time")
     for folder in live.recorded:
@@ -432,11 +426,11 @@ def drive_command(
         raise DrakeTeleopError(f"had stopped: {live.ended}", where="drive")
 
 
-def waits(device: str | None) -> str:
-    """Return what a drive waits for, for the terminal."""
-    return "nothing runs until that page is open" + _OR_DEVICE[device is not None]
+def start_condition(device: str | None) -> str:
+    """Return for which event a drive waits."""
+    return "the simulation waits until this page is open" + _OR_DEVICE[device is not None]
 
 
-def _tell(text: str) -> None:
-    """Tell on the terminal what no page may show."""
+def _print_note(text: str) -> None:
+    """Print on stderr, not on a page."""
     print(text, file=sys.stderr, flush=True)

@@ -1,8 +1,6 @@
-"""A haptic device that is none: a mass in a simulated hand, for tests and for trying a link.
+"""Simulated haptic device in a simulated hand, for tests and for trying a link.
 
-    device and hand: m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x')
-
-with f the force that was set at the last tick. Along each axis of B by itself.
+m x'' = f - b x' + k (x_hand - x) + d (x_hand' - x'), with the force f of the last tick.
 """
 
 from __future__ import annotations
@@ -12,23 +10,20 @@ from collections.abc import Callable, Sequence
 
 from drake_teleop.station.operator.operator import GRIPS
 
-_STEPS = 10  # a millisecond
+_STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
-    """Exactly as passive as its numbers: a light, lively device.
+    """Light device of given mass [kg] and damping [N s/m] in a moving hand.
 
     Attributes:
         position: [m].
         velocity: [m/s].
-        energy: that the port has taken from device and hand since the beginning [J]:
-            minus the integral of f . dx.
+        energy: of device and hand into the port [J].
 
     Args:
-        hand: where the hand wants it and how fast that moves, at a time [s]: [m], [m/s].
+        hand: intended position [m] and velocity [m/s] at a time [s].
         grip: of `GRIPS`.
-        mass: of the device [kg].
-        damping: likewise [N s/m].
     """
 
     def __init__(
@@ -45,8 +40,8 @@ class VirtualDevice:
         self.energy, self._t = 0.0, 0.0
 
     def move(self, force: Sequence[float], seconds: float) -> None:
-        """Goes on under a force on the hand that is held."""
-        steps = max(math.ceil(seconds * 1e3 * _STEPS - 1e-9), 1)
+        """Simulate `seconds` under a constant force on the hand [N]."""
+        steps = max(math.ceil(seconds * 1e3 * _STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):
             self._t += h
@@ -62,12 +57,7 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """A hand that goes `depth` below z = 0 and `lift` above it, and stays below for a while [m].
-
-    Args:
-        hertz: of going down and up.
-        hold: share of the time below.
-    """
+    """Return a hand motion from `lift` to -`depth` [m] and back, with a share `hold` below."""
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

@@ -1,4 +1,4 @@
-"""An experiment in virtual time, driven by the page's messages: what a page is told, and can do."""
+"""An experiment in virtual time, driven by messages of the page."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from drake_teleop.common.progress import silent
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.experiment.apparatus import make_apparatus
 from drake_teleop.live.experiment.design import Condition, ContactDetection, Experiment
-from drake_teleop.live.experiment.guided import Guided
-from drake_teleop.live.experiment.messages import HAND, parse_study
+from drake_teleop.live.experiment.guided import HAND, Guided, parse_study
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.session import read_drive, repeat
+from drake_teleop.live.session import read_drive
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
@@ -27,7 +26,7 @@ EXPERIMENT = Experiment(
 
 
 class Person:
-    """A participant with a clock of its own, who presses when something is asked."""
+    """Participant with a clock, who presses in each interval."""
 
     def __init__(self, folder) -> None:
         scenario = LoadScenario("contact_transition")
@@ -54,11 +53,11 @@ class Person:
         )
         self.guided.join(1, self.now)
 
-    def say(self, client: int = 1, **message) -> None:
-        self.guided.hear(client, json.dumps(message), self.now)
+    def send(self, client: int = 1, **message) -> None:
+        self.guided.handle_message(client, json.dumps(message), self.now)
 
     def wait(self, phase: str, seconds: float = 3.0) -> None:
-        """Until the procedure has come there; time goes by as fast as it is simulated."""
+        """Simulate until a phase of the procedure."""
         end = self.now + seconds
         while self.procedure.phase != phase and self.now < end:
             self.now += 0.005
@@ -69,52 +68,52 @@ class Person:
 
     def begin(self) -> None:
         for _ in range(3):
-            self.say(go=True)
+            self.send(go=True)
         assert self.procedure.phase == "interval"
 
 
 @pytest.mark.slow
-def test_a_trial_from_consent_to_the_table_and_its_drives_repeat(tmp_path):
+def test_trial_from_consent_to_results_and_its_drives_repeat(tmp_path):
     person = Person(tmp_path)
-    person.say(answer=1)  # nobody asked
+    person.send(answer=1)  # not in the phase of an answer
     person.begin()
-    person.say(set={"z": -1500, "sigma": 300, "gamma": 0})
+    person.send(set={"z": -1500, "sigma": 300, "gamma": 0})
     person.wait("gap")
     person.wait("interval")
-    person.say(set={"z": -2500})
+    person.send(set={"z": -2500})
     person.wait("answer")
-    person.say(client=2, answer=1)  # who only watches
+    person.send(client=2, answer=1)  # a spectator
     assert person.procedure.phase == "answer"
-    person.say(answer=2)
+    person.send(answer=2)
     (row,) = person.store.rows(1)
     assert row.answer == 2 and row.force_N > 1.0 and row.level > 0.0
     assert person.procedure.phase == "end"
     person.guided.close()
     drive = read_drive(tmp_path / "drives" / "01" / "0000-1")
     assert all(inputs.sigma == 37 for ms, inputs in drive.changes[1:])
-    assert repeat(drive, silent).t[-1] == pytest.approx(0.5, abs=0.03)
-    told = json.dumps(person.frames) + json.dumps(person.guided.hello())
-    assert "secret" not in told
+    assert drive.repeat(silent).t[-1] == pytest.approx(0.5, abs=0.03)
+    messages = json.dumps(person.frames) + json.dumps(person.guided.hello())
+    assert "secret" not in messages
     assert all(f["inputs"]["sigma"] == 0 and f["inputs"]["gamma"] == 100 for f in person.frames)
-    felt = [f["f"] for f in person.frames]
-    assert all(f[0] == f[1] == f[2] for f in felt)
+    forces = [f["f"] for f in person.frames]
+    assert all(f[0] == f[1] == f[2] for f in forces)
 
 
 @pytest.mark.slow
-def test_when_the_page_is_closed_the_trial_begins_again(tmp_path):
+def test_trial_restarts_after_the_page_is_closed(tmp_path):
     person = Person(tmp_path)
     person.begin()
-    person.say(set={"z": -1500})
+    person.send(set={"z": -1500})
     person.wait("gap")
     person.guided.leave(1, person.now)
     assert (person.procedure.phase, person.procedure.interval) == ("ready", 1)
-    person.say(client=2, go=True)  # is not there
+    person.send(client=2, go=True)  # has left
     person.guided.join(3, person.now)
-    person.say(client=3, go=True)
+    person.send(client=3, go=True)
     assert person.procedure.phase == "interval" and person.store.participants() == []
 
 
-def test_10000_messages_change_nothing_but_what_they_may():
+def test_10000_random_messages_change_only_permitted_inputs():
     rng = np.random.default_rng(0)
     pieces = [
         "{",

@@ -1,4 +1,4 @@
-"""A participant's way through an experiment: its order, what it learns, and what a kill leaves."""
+"""Sequence of an experiment: order, estimates, and continuation after a kill."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.live.experiment.design import (
     LoadExperiment,
     PegInSlot,
 )
-from drake_teleop.live.experiment.procedure import Felt, Procedure, trials_of
+from drake_teleop.live.experiment.procedure import IntervalResult, Procedure, trials_of
 from drake_teleop.live.experiment.psychometrics import correct_probability
 from drake_teleop.live.experiment.store import Store, open_results
 
@@ -39,13 +39,13 @@ SHORT = dataclasses.replace(
 
 
 def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) -> None:
-    """A participant whose answers come from the level; or until a number of trials is done."""
+    """Run a participant whose answers depend on the level, or until a number of trials."""
     while procedure.phase != "end" and procedure.number < most:
         if procedure.phase == "interval":
-            felt = Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0)
-            procedure.finished(felt)
+            result = IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+            procedure.finish_interval(result)
         elif procedure.phase == "gap":
-            procedure.second()
+            procedure.start_second_interval()
         elif procedure.phase == "answer":
             p = correct_probability(procedure.level, threshold, 1.5, 0.0)
             signal = procedure.trial.signal
@@ -54,7 +54,7 @@ def go_through(procedure: Procedure, rng, threshold: float, most: int = 10_000) 
             procedure.go()
 
 
-def test_order_is_drawn_for_each_participant_and_each_round_has_every_condition_once():
+def test_order_is_random_and_each_round_has_every_condition_once():
     one, other = trials_of(SMALL, 1), trials_of(SMALL, 2)
     assert one == trials_of(SMALL, 1) != other
     counted = [t.condition for t in one if t.task == 0 and not t.practice]
@@ -66,15 +66,15 @@ def test_order_is_drawn_for_each_participant_and_each_round_has_every_condition_
     assert 0.4 < np.mean(np.array(signals) == 1) < 0.6
 
 
-def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
-    """A kill is a new process, which has nothing but the folder; an unfinished trial is lost."""
+def test_participant_continues_with_the_same_levels(tmp_path):
+    """A new process has only the folder; an unfinished trial is lost."""
     whole, cut = Store(tmp_path / "whole"), Store(tmp_path / "cut")
     go_through(Procedure(SMALL, 3, whole), np.random.default_rng(1), 2.0)
     rng = np.random.default_rng(1)
     first = Procedure(SMALL, 3, cut)
     go_through(first, rng, 2.0, most=17)
     first.go()
-    first.finished(Felt(first.shown))
+    first.finish_interval(IntervalResult(first.present_level))
     again = Procedure(SMALL, 3, cut)
     assert (again.phase, again.number) == ("consent", 17)
     go_through(again, rng, 2.0)
@@ -83,7 +83,7 @@ def test_a_participant_goes_on_where_it_stopped_with_the_same_levels(tmp_path):
 
 
 def goes_through(folder: str) -> None:
-    """A participant with answers that a trial's number tells, who says each trial that is over."""
+    """Run a participant with answers by trial number, and print each trial."""
     with open_results(Path(folder), SHORT) as store:
         procedure = Procedure(SHORT, 1, store)
         while procedure.phase != "end":
@@ -93,48 +93,48 @@ def goes_through(folder: str) -> None:
                 procedure.answer(signal if right else 3 - signal, 0.5)
                 print(procedure.number, flush=True)
             elif procedure.phase == "interval":
-                procedure.finished(Felt(procedure.shown, force_N=5.0, done=True, time_s=1.0))
+                procedure.finish_interval(
+                    IntervalResult(procedure.present_level, force_N=5.0, done=True, time_s=1.0)
+                )
             elif procedure.phase == "gap":
-                procedure.second()
+                procedure.start_second_interval()
             else:
                 procedure.go()
 
 
 @pytest.mark.slow
-def test_a_killed_experiment_has_all_trials_that_were_over_and_goes_on(tmp_path):
+def test_killed_experiment_keeps_finished_trials_and_continues(tmp_path):
     code = "import sys; from test_procedure import goes_through; goes_through(sys.argv[1])"
     command = [sys.executable, "-c", code, str(tmp_path / "cut")]
     folder = Path(__file__).parent
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    said = next(int(line) for line in process.stdout if int(line) >= 4)
+    message = next(int(line) for line in process.stdout if int(line) >= 4)
     process.kill()
     process.communicate()
     cut = Store(tmp_path / "cut")
     left = len(cut.rows(1))
-    assert said <= left < len(trials_of(SHORT, 1))
+    assert message <= left < len(trials_of(SHORT, 1))
     goes_through(str(tmp_path / "cut"))
     goes_through(str(tmp_path / "whole"))
     assert cut.rows(1) == Store(tmp_path / "whole").rows(1)
 
 
-def test_practice_does_not_count_and_what_touched_nothing_is_done_again(tmp_path):
+def test_practice_is_not_evaluated_and_a_trial_without_contact_is_repeated(tmp_path):
     procedure = Procedure(SMALL, 1, Store(tmp_path))
     before = procedure.number
     procedure.go(), procedure.go(), procedure.go()
     assert procedure.phase == "interval"
-    procedure.answer(1, 0.1)  # nobody was asked
-    procedure.finished(Felt(valid=False))
+    procedure.answer(1, 0.1)  # not in the phase of an answer
+    procedure.finish_interval(IntervalResult(valid=False))
     assert (procedure.phase, procedure.again, procedure.number) == ("ready", True, before)
     go_through(procedure, np.random.default_rng(0), 2.0)
     counted = [row for row in Store(tmp_path).rows(1) if not row.practice]
     assert len(counted) == 3 * (6 + 5 + 2)
 
 
-def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
-    """Blind: with each condition in place of every other, the page is told the same."""
-
-    def told(names: list[int]) -> list[dict]:
+def test_view_of_a_trial_is_independent_of_the_condition(tmp_path):
+    def views(names: list[int]) -> list[dict]:
         conditions = [SMALL.conditions[k] for k in names]
         other = dataclasses.replace(SMALL, conditions=conditions)
         procedure = Procedure(other, 1, Store(tmp_path / str(names)))
@@ -142,20 +142,20 @@ def test_what_is_shown_of_a_trial_is_the_same_for_all_conditions(tmp_path):
         while procedure.phase != "end" and procedure.number < 12:
             seen.append(procedure.view())
             if procedure.phase == "interval":
-                procedure.finished(Felt(procedure.shown))
+                procedure.finish_interval(IntervalResult(procedure.present_level))
             elif procedure.phase == "gap":
-                procedure.second()
+                procedure.start_second_interval()
             elif procedure.phase == "answer":
                 procedure.answer(procedure.trial.signal, 0.5)
             else:
                 procedure.go()
         return seen
 
-    assert told([0, 1, 2]) == told([2, 0, 1])
-    assert not {"condition", "level", "signal"} & set(told([0, 1, 2])[0])
+    assert views([0, 1, 2]) == views([2, 0, 1])
+    assert not {"condition", "level", "signal"} & set(views([0, 1, 2])[0])
 
 
-def test_a_folder_is_one_experiments_and_a_damaged_file_is_named(tmp_path):
+def test_folder_of_another_experiment_and_damaged_file_are_errors(tmp_path):
     with open_results(tmp_path, SMALL) as store:
         with pytest.raises(DrakeTeleopError, match="another process"):
             open_results(tmp_path, SMALL).__enter__()
@@ -171,20 +171,23 @@ def test_a_folder_is_one_experiments_and_a_damaged_file_is_named(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
-        ("tasks: []", "tasks: there is none"),
-        ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "nothing of a slot"),
+        ("tasks: []", "tasks: is empty"),
+        ("tasks: [!PegInSlot {scenario: touch}]\nconditions: [{name: a}]", "has no slot"),
         ("tasks: [!Juggling {}]\nconditions: [{name: a}]", "Juggling"),
-        ("tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]", "no range"),
-        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "its own name"),
+        (
+            "tasks: [!ApparentMass {low: 0.1, high: 0.1}]\nconditions: [{name: a}]",
+            "too small a range",
+        ),
+        ("tasks: [!ApparentMass {}]\nconditions: [{name: a}, {name: a}]", "not unique"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, sigma: 1, eta: 0.5}]", "eta"),
         ("tasks: [!ApparentMass {}]\nconditions: [{name: a, network: moon}]", "moon"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_field(tmp_path, text, said):
+def test_invalid_file_is_an_error_with_its_field(tmp_path, text, message):
     (tmp_path / "e.yaml").write_text(text)
-    with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{said}|{said}.*e\.yaml"):
+    with pytest.raises(DrakeTeleopError, match=rf"e\.yaml.*{message}|{message}.*e\.yaml"):
         LoadExperiment(tmp_path / "e.yaml")
 
 

@@ -1,4 +1,4 @@
-"""What answers say about a threshold, held against known thresholds and a slow calculation."""
+"""Thresholds from answers, compared with known thresholds and a direct calculation."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ def test_the_threshold_is_where_d_prime_is_1():
     assert correct_probability(1e6, 2.0, 1.7, 0.04) == pytest.approx(0.98)
 
 
-def test_the_level_asked_for_tells_most_about_the_threshold():
+def test_next_level_minimises_the_expected_entropy():
     psi = Psi(0.2, 20.0)
     for level, correct in ((2.0, True), (1.0, False), (0.9, True)):
-        psi.answered(level, correct)
+        psi.update(level, correct)
 
     def expected(level: float) -> float:
-        """Entropy of the threshold after the answer, by what each answer makes of the grid."""
-        likely = psi._likely
-        p = float((psi._probability(level) * likely).sum())
+        """Return the expected entropy of the threshold, by explicit updates of the grid."""
+        posterior = psi._posterior
+        p = float((psi._probability(level) * posterior).sum())
         after = []
         for correct in (True, False):
             other = Psi(0.2, 20.0)
-            other._likely = likely.copy()
-            other.answered(level, correct)
-            share = other._likely.sum(axis=(1, 2))
+            other._posterior = posterior.copy()
+            other.update(level, correct)
+            share = other._posterior.sum(axis=(1, 2))
             after.append(-float(share @ np.log(share)))
         return p * after[0] + (1.0 - p) * after[1]
 
     assert psi.next_level() == min(psi.levels, key=expected)
 
 
-def test_thresholds_are_found_and_lie_in_their_intervals():
-    """Of 200 participants 96 % (benchmarks/participants.py); of these 30 all but two."""
+def test_intervals_contain_the_true_thresholds():
+    """96 % of 200 participants (benchmarks/participants.py), 28 of these 30."""
     rng = np.random.default_rng(0)
     held, off = [], []
     for _ in range(30):
@@ -44,7 +44,7 @@ def test_thresholds_are_found_and_lie_in_their_intervals():
         psi = Psi(0.2, 20.0)
         for _ in range(40):
             level = psi.next_level()
-            psi.answered(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
+            psi.update(level, rng.random() < correct_probability(level, truth, 1.5, 0.02))
         found, d = psi.threshold(), psi.d_prime(truth)
         held.append(found.low <= truth <= found.high and d.low <= 1.0 <= d.high)
         off.append(abs(np.log(found.value / truth)))

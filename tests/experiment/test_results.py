@@ -1,4 +1,4 @@
-"""The table of an experiment, of participants whose threshold is known."""
+"""Results of participants with a known threshold."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drake_teleop.live.experiment.store import Store
 CONTACT = "threshold of contact [N at the tool]"
 
 
-def test_thresholds_come_back_through_order_store_and_table(tmp_path):
+def test_table_contains_the_true_thresholds(tmp_path):
     experiment = Experiment(tasks=[ContactDetection(trials=40)], conditions=[Condition(name="a")])
     store, rng = Store(tmp_path), np.random.default_rng(2)
     for number in range(1, 6):
@@ -32,7 +32,7 @@ def test_thresholds_come_back_through_order_store_and_table(tmp_path):
 
 
 @pytest.mark.pictures
-def test_the_folder_has_table_trials_and_picture(tmp_path):
+def test_folder_contains_table_trials_and_picture(tmp_path):
     store = Store(tmp_path)
     assert write_results(SMALL, store).is_empty()
     go_through(Procedure(SMALL, 4, store), np.random.default_rng(0), 2.0)
@@ -46,16 +46,16 @@ def test_the_folder_has_table_trials_and_picture(tmp_path):
 
 
 @pytest.mark.parametrize("least, most", [(27.0, 42.0), (0.03, 0.11), (0.4, 5.0), (0.1, 40.0)])
-def test_the_axis_of_a_quantity_has_numbers(least, most):
+def test_axis_of_a_quantity_has_tick_labels(least, most):
     axes = Picture(figsize=(2.9, 2.0)).subplots()
     _draw(axes, ["a"], [Result("t", "a", 1, 9, CONTACT, (least * most) ** 0.5, least, most)])
     low, high = axes.get_xlim()
-    told = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
-    told = [label for label in told if low <= label.get_position()[0] <= high]
-    assert 2 <= sum(bool(label.get_text()) for label in told) <= 7
+    labels = [*axes.xaxis.get_majorticklabels(), *axes.xaxis.get_minorticklabels()]
+    labels = [label for label in labels if low <= label.get_position()[0] <= high]
+    assert 2 <= sum(bool(label.get_text()) for label in labels) <= 7
 
 
-def test_whose_turn_it_is(tmp_path):
+def test_next_participant_has_trials_left_or_is_new(tmp_path):
     store, trials = Store(tmp_path), len(trials_of(SMALL, 1))
     assert whose_turn(store, trials) == 1
     go_through(Procedure(SMALL, 1, store), np.random.default_rng(0), 2.0)

@@ -1,4 +1,4 @@
-"""What all drives here are of: a leaf 6 mm below the tool, and a load that is known."""
+"""Fixtures of drives: a leaf 6 mm below the tool, and its true load."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live import server
-from drake_teleop.live.session import live_scenario
+from drake_teleop.live.scenarios import live_scenario
 from drake_teleop.load.identification import Identification
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
@@ -17,7 +17,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 @pytest.fixture(scope="session")
 def scenario() -> Scenario:
-    """A leaf 6 mm below the tool, and a sensor without errors."""
+    """Return a scenario with a leaf 6 mm below the tool and a sensor without errors."""
     setup = live_scenario(LoadScenario("contact_transition"))
     place = [0.55, 0.0, 0.233]
     return replace(setup, sheet_spring__position=place, wrist_sensor__ideal=True)
@@ -25,7 +25,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="session")
 def load(scenario: Scenario) -> IdentifiedLoad:
-    """The truth."""
+    """Return the true load."""
     phi = NominalSlave(scenario.slave).arm.phi_load
     truth = Identification(
         phi=phi, offsets=np.zeros(6), covariance=np.eye(16), identifiable=np.ones(16, bool),
@@ -37,7 +37,7 @@ def load(scenario: Scenario) -> IdentifiedLoad:
 
 @pytest.fixture(scope="session")
 def live(scenario: Scenario, load: IdentifiedLoad) -> Iterator[server.LiveDrive]:
-    """A drive that listens."""
+    """Yield a drive with an open port."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, "identified_load", lambda *_: load)
         drive = server.drive(scenario)

@@ -1,4 +1,4 @@
-"""What a page is told of rows of the log: forces at the hand, and in words what is not right."""
+"""Frames of the page from rows of the log."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ N = 6  # joints
 
 @pytest.fixture
 def rows(scenario, load):
-    """Of a station at rest, with nothing to say about it."""
+    """Return rows of a station at rest without warnings."""
     session = Session(scenario, load)
     session.advance()
-    rows = session.news()
+    rows = session.new_rows()
     assert Cockpit(scenario).frame(rows, Inputs())["words"] == []
     return rows
 
@@ -30,7 +30,6 @@ def words(scenario, rows, inputs=Inputs()):  # noqa: B008 (it does not change)
 
 
 def test_joints_at_their_limits_are_named(scenario, rows):
-    """Either way, in whichever row, each at its own limit, and as many as there are."""
     arm = slave_arm(scenario)
     speeds, torques = arm.velocity_limit, arm.effort_limit
     rows["slave_state"][0, N + 1], rows["slave_state"][2, N + 3] = -speeds[1], speeds[3]
@@ -45,7 +44,7 @@ def test_joints_at_their_limits_are_named(scenario, rows):
     assert words(scenario, rows) == []
 
 
-def test_all_else_that_is_not_right_is_said(scenario, rows):
+def test_limits_faults_and_silence_are_reported_in_words(scenario, rows):
     peak = scenario.master.device(0.0, 0.0).peak_force
     strongest = f"the device renders its largest force, {peak:g} N"
     for name, change, said in (
@@ -63,8 +62,7 @@ def test_all_else_that_is_not_right_is_said(scenario, rows):
     assert words(scenario, rows, edge) == ["the hand is at the edge of its box, 0.3 m wide"]
 
 
-def test_forces_are_at_the_hand_without_the_sensors_offset(scenario, rows):
-    """Least and largest: measured, of the contact, felt."""
+def test_forces_are_at_the_hands_scale_without_sensor_offset(scenario, rows):
     n = len(rows["t"])
     for name, first, last in (
         ("measured_wrench_S", [13.0, 0.0, 4.0], [10.0, 5.0, 12.0]),

@@ -1,4 +1,4 @@
-"""A haptic device as the hand: packets, silence, limits, passivity; what a session makes of it."""
+"""Link to a haptic device: packets, silence, limits and passivity."""
 
 from __future__ import annotations
 
@@ -14,25 +14,24 @@ from websockets.sync.server import serve
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
-from drake_teleop.live.device import DrivenBy
 from drake_teleop.live.device_client import Client
 from drake_teleop.live.device_guard import DeviceGuard, Limits
-from drake_teleop.live.device_link import DeviceLink
+from drake_teleop.live.device_link import DeviceConnection, DeviceLink
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,
+    DevicePose,
     DeviceState,
     ForceCommand,
-    Place,
     packed_force,
     packed_state,
     unpacked_force,
     unpacked_state,
 )
-from drake_teleop.live.external_master import with_device
-from drake_teleop.live.haply import HaplyDevice, read_message, written_force
+from drake_teleop.live.haply import HaplyDevice, force_message, read_message
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
-from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
 from drake_teleop.station.result import SimulationResult
 
@@ -40,7 +39,7 @@ MS = 1e-3
 
 
 class Sender:
-    """A device that sends what it is told to."""
+    """Device that sends given packets."""
 
     def __init__(self, port):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -59,12 +58,12 @@ class Sender:
 
 @pytest.fixture
 def link():
-    made = DeviceLink("udp://127.0.0.1:0")
-    yield made
-    made.close()
+    opened = DeviceLink("udp://127.0.0.1:0")
+    yield opened
+    opened.close()
 
 
-def test_packets_are_as_the_header_says():
+def test_packets_match_the_c_header():
     text = resources.files("drake_teleop.live").joinpath("drake_teleop_device.h").read_text()
     sizes = [int(size) for size in re.findall(r"device: (\d+) bytes", text)]
     state = DeviceState(7, 1.5, (0.1, -0.2, 0.3), (0.0, 0.6, 0.8, 0.0), CLUTCH_OPEN, 0.004)
@@ -75,7 +74,7 @@ def test_packets_are_as_the_header_says():
     assert packed_state(state)[24:32] == np.array([0.1], "<f8").tobytes()  # after 4 + 4 + 8 + 8
 
 
-def test_messages_that_are_none_change_nothing_but_a_counter(link):
+def test_invalid_packets_only_change_a_counter(link):
     random, good = np.random.default_rng(0), packed_state(DeviceState(1, 0.0, (0.01, 0.0, 0.0)))
     said = json.dumps(
         {"inverse3": [{"device_id": "a", "state": {"cursor_position": {"x": 1, "y": 2, "z": 3}}}]}
@@ -84,7 +83,7 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
     for place in range(16, 88, 8):
         for value in (1e308, 1e30, np.nan, np.inf, -np.inf):
             odd.append(good[:place] + np.array([value], "<f8").tobytes() + good[place + 8 :])
-            # `behind`, the last one, is for a page alone: any number is brought into its range.
+            # `behind` is only displayed: it is clipped to its range.
             assert unpacked_state(odd[-1]) is None or (place == 80 and np.isfinite(value))
     far = DeviceState(1, 0.0, (0.0, 0.0, 0.0), (0.0, 1.8, 0.0, 0.0), 7, 1e9)
     near = far._replace(orientation=(0.0, 1.0, 0.0, 0.0), flags=CLUTCH_OPEN, behind=1.0)
@@ -100,9 +99,11 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
     for k, packet in enumerate(odd):
         sender.raw(packet)
         if k % 40 == 0:
-            led = link.lead(1e-4 * k)
-            assert all(np.isfinite(value) for value in led.values())
-            assert np.isfinite(Inputs().changed(led).pose(np.zeros(3))[0] if led["held"] else 0.0)
+            inputs = link.hand_inputs(1e-4 * k)
+            assert all(np.isfinite(value) for value in inputs.values())
+            assert np.isfinite(
+                Inputs().changed(inputs).pose(np.zeros(3))[0] if inputs["held"] else 0.0
+            )
     assert link.refused > 40
     assert read_message(said).state.position == (-2.0, 1.0, 3.0)
     texts = ["", "[]", "{}", "null", "[" * 9000, '{"inverse3":[]}', said[:-1], "1e999", 7, None]
@@ -119,8 +120,8 @@ def test_messages_that_are_none_change_nothing_but_a_counter(link):
         assert heard is None or np.isfinite(heard.state.position).all()
 
 
-def test_a_force_goes_to_haply_as_its_place_came():
-    said = json.loads(written_force("a", (1.0, 2.0, 3.0)))
+def test_force_and_position_of_haply_use_the_same_axes():
+    said = json.loads(force_message("a", (1.0, 2.0, 3.0)))
     device = {"device_id": "a", "state": {"cursor_position": {"x": 2, "y": -1, "z": 3}}}
     assert said["inverse3"][0]["commands"]["set_cursor_force"]["values"] == {
         "x": 2.0, "y": -1.0, "z": 3.0,
@@ -153,45 +154,45 @@ def test_a_force_goes_to_haply_as_its_place_came():
         ),
     ],
 )
-def test_a_packet_that_is_refused_is_counted_with_the_reason(link, packet, reason):
+def test_refused_packet_is_counted_with_the_reason(link, packet, reason):
     sender = Sender(link.port)
     for _ in range(3):
         sender.raw(packet)
     link.poll(0.0)
-    assert link.text().startswith("No device yet (udp://127.0.0.1:")
-    assert f". Refused packets: 3; the last one {reason}" in link.text()
+    assert link.status_text().startswith("No device yet (udp://127.0.0.1:")
+    assert f". Refused packets: 3; the last one {reason}" in link.status_text()
 
 
-def test_one_device_leads_until_it_is_silent_and_late_packets_do_not(link):
+def test_first_device_is_followed_until_silent_and_late_packets_are_ignored(link):
     one, other = Sender(link.port), Sender(link.port)
     one.send(1, (0.1, 0.0, 0.0))
-    assert link.lead(0.0) == {"held": 1, "clutch": 0} | dict.fromkeys(
+    assert link.hand_inputs(0.0) == {"held": 1, "clutch": 0} | dict.fromkeys(
         ("x", "y", "z", "rx", "ry", "rz"), 0.0
     )
     one.send(4, (0.11, 0.0, 0.0))
     one.send(3, (0.2, 0.0, 0.0))
     one.send(4, (0.2, 0.0, 0.0))
     other.send(9, (0.3, 0.0, 0.0))
-    led = link.lead(0.049)
-    assert led["x"] == pytest.approx(1000.0)
+    inputs = link.hand_inputs(0.049)
+    assert inputs["x"] == pytest.approx(1000.0)
     assert (link.lost, link.refused) == (1, 1)
-    assert ". Refused packets: 1; the last one is from a second device" in link.text()
+    assert ". Refused packets: 1; the last one is from a second device" in link.status_text()
     link.send(np.arange(6.0))
     assert one.force() == ForceCommand(4, 0.004, (0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
-    assert link.lead(0.0991) == {"held": 0, "clutch": 0}
-    assert "silent" in link.text()
+    assert link.hand_inputs(0.0991) == {"held": 0, "clutch": 0}
+    assert "silent" in link.status_text()
     other.send(1, (0.1, 0.02, 0.0))
-    assert link.lead(0.2)["clutch"] == 0
+    assert link.hand_inputs(0.2)["clutch"] == 0
     other.send(2, (0.1, 0.02, 0.0))
-    led = link.lead(0.2401)
-    assert led["y"] == pytest.approx(2000.0)
+    inputs = link.hand_inputs(0.2401)
+    assert inputs["y"] == pytest.approx(2000.0)
     other.send(3, (0.1, 0.02, 0.0))
-    assert "clutch" not in link.lead(0.2801)
+    assert "clutch" not in link.hand_inputs(0.2801)
     other.send(4, (0.1, 0.02, 0.0), flags=CLUTCH_OPEN)
-    assert link.lead(0.29)["clutch"] == 0
+    assert link.hand_inputs(0.29)["clutch"] == 0
 
 
-def test_whatever_is_commanded_a_hand_gets_no_more_than_the_limits_and_nothing_in_silence():
+def test_force_stays_within_limits_and_is_zero_after_50_ms_without_commands():
     guard, last = DeviceGuard(Limits(5.0, 0.1, slew=1000.0, torque_slew=10.0)), np.zeros(6)
     for k in range(300):
         wrench = (np.nan,) * 6 if k % 50 == 7 else (40.0, -30.0, 0.0, 1.0, 0.0, 0.0)
@@ -215,8 +216,8 @@ def test_whatever_is_commanded_a_hand_gets_no_more_than_the_limits_and_nothing_i
         last = now
 
 
-def pressed(stiffness, grip, delay, *, observe):
-    """A hand taps on a wall once; the least energy of the port, and the speed when it rests."""
+def tap_on_wall(stiffness, grip, delay, *, observe):
+    """Return the least energy of the port and the final speed after one tap on a wall."""
     virtual = VirtualDevice(tapping(0.02, hertz=1.0), grip)
     guard, heights = DeviceGuard(Limits(37.5), observe=observe), [virtual.position[2]] * delay
     energy, speed = [], []
@@ -232,18 +233,18 @@ def pressed(stiffness, grip, delay, *, observe):
     return min(energy), max(speed)
 
 
-def test_a_leaf_gives_out_no_energy_even_five_samples_late():
-    assert pressed(291.0, "light", 5, observe=True)[0] >= -1e-6
-    assert pressed(291.0, "light", 5, observe=False)[0] < -1e-3
+def test_leaf_is_passive_with_a_delay_of_five_samples():
+    assert tap_on_wall(291.0, "light", 5, observe=True)[0] >= -1e-6
+    assert tap_on_wall(291.0, "light", 5, observe=False)[0] < -1e-3
 
 
 def test_a_stiff_wall_comes_to_rest():
-    assert pressed(6000.0, "medium", 3, observe=True)[1] < 0.05
-    assert pressed(6000.0, "medium", 3, observe=False)[1] > 0.3
+    assert tap_on_wall(6000.0, "medium", 3, observe=True)[1] < 0.05
+    assert tap_on_wall(6000.0, "medium", 3, observe=False)[1] > 0.3
 
 
-class Still:
-    """A device that rests, and notes what is set."""
+class RestingDevice:
+    """Device at rest that records the displayed wrenches."""
 
     limits = Limits(10.0)
 
@@ -251,7 +252,7 @@ class Still:
         self.was_set = []
 
     def read(self):
-        return Place((0.0, 0.0, 0.0))
+        return DevicePose((0.0, 0.0, 0.0))
 
     def set(self, wrench):
         self.was_set.append(wrench)
@@ -260,16 +261,16 @@ class Still:
         self.set((0.0,) * 6)
 
 
-def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(link):
-    device = Still()
+def test_client_displays_the_stations_force_and_none_after_silence(link):
+    device = RestingDevice()
     client = Client(device, f"udp://127.0.0.1:{link.port}")
     for k in range(200):
         now = MS * k
         client.tick(lambda now=now: now)
         if k < 100:
-            link.lead(now)
+            link.hand_inputs(now)
             link.send(np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0]))
-        if k == 120:  # of a client that was here before
+        if k == 120:  # of an earlier client
             late = packed_force(ForceCommand(10**6, now, (0.0, 9.0, 9.0, 0.0, 0.0, 0.0)))
             link._socket.sendto(late, link._peer)
     force = [wrench[2] for wrench in device.was_set]
@@ -279,7 +280,7 @@ def test_a_client_displays_what_the_station_says_and_nothing_when_it_is_silent(l
     client.close()
 
 
-def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
+def test_inverse3_answers_every_message_of_its_service():
     heard = []
 
     def service(connection):
@@ -296,14 +297,14 @@ def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
         for k in range(3):
             places.append(device.read())
             device.set((float(k), 0.0, 0.0, 0.0, 0.0, 0.0))
-        with pytest.raises(DrakeTeleopError, match="gone"):
+        with pytest.raises(DrakeTeleopError, match="has closed the connection"):
             device.read()
         device.close()
         server.shutdown()
     assert places == [
         None,
-        Place((-0.2, 0.1, 0.3)),
-        Place((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
+        DevicePose((-0.2, 0.1, 0.3)),
+        DevicePose((-0.2, 0.1, 0.3), (0.0, 0.0, 1.0, 0.0), CLUTCH_OPEN),
     ]
     values = [said["inverse3"][0]["commands"]["set_cursor_force"]["values"] for said in heard[1:]]
     assert values == [{"x": 0.0, "y": -1.0, "z": 0.0}, {"x": 0.0, "y": -2.0, "z": 0.0}]
@@ -311,12 +312,12 @@ def test_an_inverse3_at_a_service_that_wants_an_answer_before_it_says_more():
 
 
 @pytest.mark.parametrize("address", ["udp://192.0.2.1:9", "tcp://127.0.0.1:9", "udp://127.0.0.1"])
-def test_a_device_elsewhere_or_of_another_kind_is_one_error(address):
+def test_device_address_of_another_machine_or_kind_is_an_error(address):
     with pytest.raises(DrakeTeleopError, match=re.escape(address)):
-        DrivenBy(address)
+        DeviceConnection(address)
 
 
-def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, load, link):
+def test_device_drives_without_a_page_and_releases_after_silence(scenario, load, link):
     live = Live(with_device(scenario), load, None, lambda rows: {}, 0.0, link)
     sender, seen = Sender(link.port), []
     for k in range(95):
@@ -324,7 +325,7 @@ def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, 
             sender.send(k + 1, (0.0, 0.0, -1e-4 * k))
         live.tick(lambda now=2 * MS * k: now)
         seen.append(live._session.inputs)
-    assert seen[10].clutch == 0  # the hand's place is taken anew first
+    assert seen[10].clutch == 0  # the hand first moves to the device's pose
     assert (seen[50].held, seen[50].clutch, seen[50].z) == (1, 1, -10 * 50)
     assert (seen[-1].held, seen[-1].clutch) == (0, 0)
     assert "silent" in live.frame()["device"]
@@ -333,23 +334,23 @@ def test_a_device_drives_without_a_page_and_lets_go_when_it_is_silent(scenario, 
 
 
 @pytest.mark.slow
-def test_a_drive_by_a_device_is_repeated_to_the_same_bytes(scenario, load, tmp_path):
+def test_drive_by_a_device_repeats_to_the_same_bytes(scenario, load, tmp_path):
     setup = with_device(scenario)
     session = Session(setup, load, log=tmp_path / "log.parquet", record=tmp_path, device=True)
-    felt = []
+    rendered = []
     for k in range(128):
         down = {"z": -20 * k, "rx": k, "held": k < 100, "clutch": k < 100}
         session.apply(session.inputs.changed(down))
         session.advance(2)
-        felt.append(np.linalg.norm(session.force()[:3]))
+        rendered.append(np.linalg.norm(session.force()[:3]))
     session.close()
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     drive = read_drive(tmp_path)
-    again = repeat(drive, silent(""))
+    again = drive.repeat(silent(""))
     assert all(np.array_equal(log[name], again[name], equal_nan=True) for name in ("t", *log))
-    assert max(felt) > 0.3
-    assert max(felt[80:101]) > 0.3
-    assert felt[127] == 0.0  # 54 ms after the hand has let go
+    assert max(rendered) > 0.3
+    assert max(rendered[80:101]) > 0.3
+    assert rendered[127] == 0.0  # 54 ms after the release
     steps = np.diff(log["pose_command"][:, 6])
     assert np.abs(steps).max() < 1.2e-4 * setup.kinematic_scaling.translation_scale
     assert set(RANGES) == set(vars(drive.changes[0][1]))

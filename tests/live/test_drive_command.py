@@ -1,4 +1,4 @@
-"""`drake-teleop drive` as the pages have it typed, with a client in the place of the browser."""
+"""Documented shell commands of `drake-teleop drive`, with a client in place of the browser."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
-    """What the browser does when it is told to open the page, and then Ctrl-C; it keeps frames."""
+    """Replace the browser by a client that collects frames and then sends Ctrl-C."""
     monkeypatch.chdir(tmp_path)
-    for room in ("live.server", "experiment.apparatus"):
-        monkeypatch.setattr(f"drake_teleop.{room}.identified_load", lambda *_: load)
-    for painted in ("write_replay", "write_picture", "overview"):
-        monkeypatch.setattr(f"drake_teleop.lab.run.{painted}", lambda *_: None)
+    for module in ("live.server", "live.experiment.apparatus"):
+        monkeypatch.setattr(f"drake_teleop.{module}.identified_load", lambda *_: load)
+    for name in ("write_replay", "write_picture", "overview"):
+        monkeypatch.setattr(f"drake_teleop.lab.run.{name}", lambda *_: None)
 
-    def opens(
-        says: str = '{"set": {"z": -3000}}',
+    def open_page(
+        first_message: str = '{"set": {"z": -3000}}',
         until: Callable[[dict], bool] = lambda frame: frame["t"] > 0.3,
-        does: Callable[[], None] = lambda: None,
+        action: Callable[[], None] = lambda: None,
         stop: signal.Signals = signal.SIGINT,
     ) -> list[dict]:
         frames: list[dict] = []
@@ -47,11 +47,11 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
                 with connect(address, origin=url.partition("/?")[0]) as socket:
                     end = time.monotonic() + 20.0
                     while time.monotonic() < end and not (frames and until(frames[-1])):
-                        said = json.loads(socket.recv(20.0))
-                        if "frame" in said and not frames:
-                            socket.send(says)
-                            does()
-                        frames.extend([said["frame"]] if "frame" in said else [])
+                        message = json.loads(socket.recv(20.0))
+                        if "frame" in message and not frames:
+                            socket.send(first_message)
+                            action()
+                        frames.extend([message["frame"]] if "frame" in message else [])
             finally:
                 press_ctrl_c(stop)
 
@@ -60,7 +60,7 @@ def page(monkeypatch, tmp_path, load) -> Callable[..., list[dict]]:
         )
         return frames
 
-    return opens
+    return open_page
 
 
 def log(folder: str) -> list[bytes]:
@@ -70,10 +70,10 @@ def log(folder: str) -> list[bytes]:
 def test_a_drive_is_recorded_and_repeated(page, capsys):
     frames = page()
     type_in("docs/live.md", "drake-teleop drive contact_transition --record")
-    said, stages = capsys.readouterr()
+    message, stages = capsys.readouterr()
     assert stages.startswith("Prepare the station and its 3D scenes ...\n")
-    assert "nothing runs until that page is open; Ctrl-C ends it" in said
-    assert "repeat it: drake-teleop run --inputs out/drive" in said
+    assert "the simulation waits until this page is open; Ctrl-C ends it" in message
+    assert "repeat it: drake-teleop run --inputs out/drive" in message
     assert frames[-1]["inputs"]["z"] == -3000
     type_in("docs/live.md", "drake-teleop run --inputs")
     assert log("out/again") == log("out/drive")
@@ -93,7 +93,7 @@ def test_a_virtual_device_is_the_hand(page, capfd):
         places.add(frame["tool"][2])
         return len(places) > 100
 
-    page(says="{}", until=tapped, does=device.start)
+    page(first_message="{}", until=tapped, action=device.start)
     type_in("docs/live.md", "drake-teleop drive contact_transition --device")
     enough.set()
     device.join()
@@ -103,8 +103,8 @@ def test_a_virtual_device_is_the_hand(page, capfd):
     assert json.loads(figures)["largest_force_n"] > 0.0
 
 
-def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, monkeypatch):
-    monkeypatch.setattr(replay, "Arrow", None)  # eyes would tell, were it called
+def test_experiment_starts_with_consent_and_draws_no_force(page, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "Arrow", None)  # fails if an arrow is drawn
     before, opened = ports(), list[int]()
     frames = page(
         '{"go": true}',
@@ -113,32 +113,32 @@ def test_an_experiment_asks_for_consent_first_and_shows_no_force(page, capsys, m
     )
     type_in("docs/experiment.md", "drake-teleop drive --study", status=130)
     assert [frame["study"]["phase"] for frame in (frames[0], frames[-1])] == ["consent", "task"]
-    said = capsys.readouterr()
-    assert "written out/experiment/results.csv" in said.out
-    assert "interrupted: Ctrl-C: participant 1 has done 0 of " in said.err
+    message = capsys.readouterr()
+    assert "written out/experiment/results.csv" in message.out
+    assert "interrupted: Ctrl-C: participant 1 has done 0 of " in message.err
     assert opened == [1]
 
 
 def drive(*arguments: str) -> object:
-    """The exit status."""
+    """Return the exit status."""
     with hearing_ctrl_c(), pytest.raises(SystemExit) as ended:
         main(["drive", "contact_transition", *arguments])
     return ended.value.code
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_drive_says_what_ended_it(page, capsys, stop):
+def test_drive_reports_the_signal_that_ended_it(page, capsys, stop):
     frames = page(stop=stop)
     assert drive("--record", "here") == 0
-    said = capsys.readouterr().out
+    message = capsys.readouterr().out
     name = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}[stop]
-    (seconds,) = re.findall(rf"ended by {name} after (\S+) s of simulated time", said)
+    (seconds,) = re.findall(rf"ended by {name} after (\S+) s of simulated time", message)
     assert float(seconds) >= round(frames[-1]["t"], 1)
-    assert said.endswith("repeat it: drake-teleop run --inputs here\n")
+    assert message.endswith("repeat it: drake-teleop run --inputs here\n")
     assert read_drive("here").changes[-1][0] == pytest.approx(1e3 * float(seconds), abs=51)
 
 
-def test_a_drive_that_had_stopped_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
+def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypatch):
     def fail(self, ms=5):
         raise RuntimeError("joint 2\nleaves its range")
 
@@ -146,17 +146,17 @@ def test_a_drive_that_had_stopped_ends_with_the_reason_and_status_2(page, capsys
     monkeypatch.setattr("drake_teleop.live.server.warm_up", lambda *_: None)
     monkeypatch.setattr(Session, "advance", fail)
     assert drive() == 2
-    said = capsys.readouterr().err
-    assert said.endswith("error: drive: had stopped: joint 2 leaves its range\n")
+    message = capsys.readouterr().err
+    assert message.endswith("error: drive: had stopped: joint 2 leaves its range\n")
 
 
-def test_a_record_that_is_not_complete_is_no_success(page, capsys, monkeypatch):
+def test_incomplete_record_has_status_2(page, capsys, monkeypatch):
     def fail(self):
         raise DrakeTeleopError("no space left on device", where="here/log.parquet")
 
     page()
     monkeypatch.setattr(Session, "close", fail)
     assert drive("--record", "here") == 2
-    said = capsys.readouterr()
-    assert said.err.endswith("error: here/log.parquet: no space left on device\n")
-    assert "recorded" not in said.out
+    message = capsys.readouterr()
+    assert message.err.endswith("error: here/log.parquet: no space left on device\n")
+    assert "recorded" not in message.out

@@ -1,4 +1,4 @@
-"""The led hand: whatever turns follow, its way has no jump, and its rates are those of its pose."""
+"""Paths of the simulated hand are continuous, and their rates consistent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drake_teleop.live.hand import LiveHand
 from drake_teleop.station.operator.operator import OperatorConfig
 
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
-#: When, and where to: a turn [rad] and a place [m], both about and along other axes each time.
+#: Time [s], rotation vector [rad] and position [m] of targets, with different axes.
 TARGETS = (
     (0.0, (1.5, 0.0, 0.0), (0.2, 0.2, 0.3)),
     (0.05, (0.0, -2.0, 0.7), (0.1, 0.3, 0.3)),
@@ -18,8 +18,8 @@ TARGETS = (
 )
 
 
-class Led:
-    """A hand on a stylus that rests, and what it wants."""
+class MovingHand:
+    """Hand on a stylus at rest."""
 
     def __init__(self) -> None:
         self.hand = LiveHand(OperatorConfig(), START)
@@ -27,51 +27,56 @@ class Led:
         self.hand.GetInputPort("pose_master").FixValue(self.context, START)
         self.hand.GetInputPort("twist_master").FixValue(self.context, np.zeros(6))
 
-    def wants(self, time: float) -> list[np.ndarray]:
-        """Quaternion (4,), place (3,) [m], twist [v; omega] (6,) and acceleration (3,) then."""
+    def intention(self, time: float) -> list[np.ndarray]:
+        """Return the intended quaternion (4,), position [m], twist (6,) and acceleration (3,)."""
         self.context.SetTime(time)
-        return np.split(self.hand._wants(self.context).copy(), [4, 7, 13])
+        return np.split(self.hand._present_intention(self.context).copy(), [4, 7, 13])
 
-    def lead(self, time: float, orientation: tuple[float, ...], place: tuple[float, ...]) -> None:
+    def move_to(
+        self, time: float, orientation: tuple[float, ...], position: tuple[float, ...]
+    ) -> None:
         self.context.SetTime(time)
-        self.hand.Lead(self.context, np.array([*orientation, *place]))
+        self.hand.SetTarget(self.context, np.array([*orientation, *position]))
 
 
-def turned(to: np.ndarray, since: np.ndarray) -> np.ndarray:
-    """(3,) rotation vector in B [rad] from one orientation to another."""
+def rotation_between(to: np.ndarray, since: np.ndarray) -> np.ndarray:
+    """Return the rotation vector (3,) in B [rad] between two orientations."""
     return np.array(logarithm(multiply(tuple(to), conjugate(tuple(since)))))
 
 
 @pytest.fixture
-def led() -> Led:
-    """On its way to the last of the targets."""
-    led = Led()
-    for time, turn, place in TARGETS:
-        led.lead(time, exponential(turn), place)
-    return led
+def moving_hand() -> MovingHand:
+    """Return a hand on its way to the last of several targets."""
+    moving_hand = MovingHand()
+    for time, turn, position in TARGETS:
+        moving_hand.move_to(time, exponential(turn), position)
+    return moving_hand
 
 
 @pytest.mark.parametrize("angle", [2.5, 0.5, 9e-3, 1e-4])
-def test_to_another_target_it_goes_on_as_it_was(led, angle):
-    """About an axis across the one that it turns about."""
-    orientation, place, twist, acceleration = led.wants(0.11)
+def test_new_target_keeps_position_velocity_and_acceleration(moving_hand, angle):
+    orientation, position, twist, acceleration = moving_hand.intention(0.11)
     across = np.cross(twist[3:], [0.3, -0.2, 0.5])
     turn = exponential(tuple(angle / np.linalg.norm(across) * across))
-    led.lead(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
-    then = led.wants(0.11)
+    moving_hand.move_to(0.11, multiply(turn, tuple(orientation)), (0.1, 0.1, 0.1))
+    then = moving_hand.intention(0.11)
     assert np.linalg.norm(twist[3:]) > 5.0
-    np.testing.assert_allclose(turned(then[0], orientation), 0.0, atol=1e-12)
-    np.testing.assert_allclose(then[1], place, atol=1e-15)
+    np.testing.assert_allclose(rotation_between(then[0], orientation), 0.0, atol=1e-12)
+    np.testing.assert_allclose(then[1], position, atol=1e-15)
     np.testing.assert_allclose(then[2], twist, rtol=0, atol=1e-9)
     assert np.linalg.norm(acceleration) > 5.0
     np.testing.assert_allclose(then[3], acceleration, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("time", [0.09, 0.12, 0.2, 0.4])
-def test_its_twist_is_the_rate_of_its_pose(led, time):
+def test_twist_is_the_derivative_of_the_pose(moving_hand, time):
     h = 1e-5
-    before, after, now = led.wants(time - h), led.wants(time + h), led.wants(time)
-    rate = np.concatenate([after[1] - before[1], turned(after[0], before[0])]) / (2 * h)
+    before, after, now = (
+        moving_hand.intention(time - h),
+        moving_hand.intention(time + h),
+        moving_hand.intention(time),
+    )
+    rate = np.concatenate([after[1] - before[1], rotation_between(after[0], before[0])]) / (2 * h)
     np.testing.assert_allclose(rate, now[2], rtol=0, atol=1e-5)
     faster = (after[2] - before[2])[:3] / (2 * h)
     np.testing.assert_allclose(faster, now[3], rtol=1e-5, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Driver, watchers and clock, in virtual time; and what a page is shown."""
+"""Driver, spectators and frames in virtual time."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from full_disk import small_disk
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.common.writing import CannotWrite
-from drake_teleop.live.live import FRAME, Live
-from drake_teleop.live.messages import LONGEST, parse
+from drake_teleop.live.live import FRAME, MAX_MESSAGE_BYTES, Live, parse
 from drake_teleop.live.pace import Pace
-from drake_teleop.live.session import Session, read_drive, repeat
+from drake_teleop.live.session import Session, read_drive
 from drake_teleop.station.result import SimulationResult
 
 
 class Clock:
-    """Time that passes only when it is told to."""
+    """Clock that only advances on request."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -40,7 +39,7 @@ def make(scenario, load, clock, record=None) -> Live:
 
 
 def pass_time(live: Live, clock: Clock, seconds: float) -> list[dict]:
-    """All frames of a while in which nothing is ever late."""
+    """Return all frames of a period without lateness."""
     end, frames = clock.now + seconds, []
     while clock.now < end:
         frame = live.tick(clock)
@@ -51,15 +50,13 @@ def pass_time(live: Live, clock: Clock, seconds: float) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
-    scenario, load, clock, tmp_path
-):
+def test_closed_page_releases_the_hand_and_completes_the_record(scenario, load, clock, tmp_path):
     folder = tmp_path / "drive"
     live = make(scenario, load, clock, folder)
     live.join(1, clock())
     frames = []
     for z in range(-1000, -5001, -1000):
-        live.hear(1, json.dumps({"set": {"z": z}}), clock())
+        live.handle_message(1, json.dumps({"set": {"z": z}}), clock())
         frames += pass_time(live, clock, 0.05)
     assert frames[-1]["contact"] and frames[-1]["f"][1][1] > 0.2
     assert not frames[1]["contact"] and frames[-1]["state"] == "running"
@@ -77,7 +74,7 @@ def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
     pull = log["hand_wrench_E"][gone:, :3] + 20.0 * log["twist_master"][gone:, :3]
     np.testing.assert_allclose(pull, 0.0, atol=1e-12)
     assert np.ptp(log["pose_command"][gone + 10 :, 4:], axis=0).max() == 0.0
-    again = repeat(read_drive(folder), silent(""))
+    again = read_drive(folder).repeat(silent(""))
     assert len(again.t) == len(log.t)
     np.testing.assert_array_equal(again["slave_state"], log["slave_state"])
 
@@ -91,63 +88,59 @@ def test_a_page_that_closes_in_contact_lets_the_hand_go_and_all_is_on_the_disk(
     assert np.abs(np.diff(pull[len(log.t) - 5 :], axis=0)).max() < 0.2
 
 
-def test_one_drives_and_others_watch_until_they_ask(scenario, load, clock):
+def test_first_page_drives_and_another_takes_over_on_request(scenario, load, clock):
     live = make(scenario, load, clock)
     live.join(1, clock())
     live.join(2, clock())
-    live.hear(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
+    live.handle_message(2, '{"set": {"x": 100}, "pause": true, "reset": true}', clock())
     (frame, *_) = pass_time(live, clock, FRAME)
     assert (frame["driver"], frame["inputs"]["x"], frame["drive"]) == (1, 0, 1)
-    live.hear(2, '{"drive": true, "set": {"x": 100}}', clock())
-    live.hear(1, '{"set": {"x": 500}}', clock())
+    live.handle_message(2, '{"drive": true, "set": {"x": 100}}', clock())
+    live.handle_message(1, '{"set": {"x": 500}}', clock())
     frame = pass_time(live, clock, FRAME)[-1]
     assert (frame["driver"], frame["inputs"]["x"]) == (2, 100)
-    live.hear(2, '{"pause": true}', clock())
+    live.handle_message(2, '{"pause": true}', clock())
     frames = pass_time(live, clock, 0.1)
     assert frames[-1]["state"] == "paused" and frames[-1]["t"] == frames[0]["t"]
-    live.hear(2, '{"pause": false, "slow": 10}', clock())
+    live.handle_message(2, '{"pause": false, "slow": 10}', clock())
     assert pass_time(live, clock, 0.2)[-1]["t"] - frames[-1]["t"] == pytest.approx(0.02, abs=6e-3)
-    live.hear(2, '{"reset": true}', clock())
+    live.handle_message(2, '{"reset": true}', clock())
     frame = pass_time(live, clock, FRAME)[-1]
     assert (frame["drive"], frame["inputs"]["x"]) == (2, 0) and frame["t"] < 0.02
 
 
-def test_a_station_that_there_is_not_is_refused_and_the_drive_goes_on(
-    scenario, load, clock, monkeypatch
-):
+def test_impossible_station_is_reported_and_the_drive_continues(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
 
     def no_such(*_):
         raise DrakeTeleopError("there is no such station")
 
-    monkeypatch.setattr("drake_teleop.live.session.chosen", no_such)
-    live.hear(1, '{"set": {"network": 3, "x": 100}}', clock())
+    monkeypatch.setattr("drake_teleop.live.session.chosen_scenario", no_such)
+    live.handle_message(1, '{"set": {"network": 3, "x": 100}}', clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["inputs"]["network"], frame["inputs"]["x"]) == ("running", 0, 100)
     assert frame["words"] == ["there is no such station"]
 
 
-def test_what_is_kept_from_the_hand_is_said(scenario, load, clock, monkeypatch):
+def test_removed_force_is_reported(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
     assert pass_time(live, clock, FRAME)[-1]["words"] == []
-    monkeypatch.setattr(Session, "kept_back", lambda session: 1.234)
+    monkeypatch.setattr(Session, "removed_force", lambda session: 1.234)
     said = "1.2 N are not rendered until the hand presses less"
     assert pass_time(live, clock, FRAME)[-1]["words"] == [said]
 
 
-def test_another_scene_is_another_drive_and_its_record_another_folder(
-    scenario, load, clock, tmp_path
-):
+def test_new_scene_starts_a_drive_with_its_own_folder(scenario, load, clock, tmp_path):
     live = make(scenario, load, clock, tmp_path / "drive")
     (tmp_path / "drive-2").mkdir()
     live.join(1, clock())
     pass_time(live, clock, 0.03)
-    live.hear(1, '{"scene": "wall"}', clock())
-    frame = pass_time(live, clock, 0.05)[-1]  # time stands still until its load is known
-    assert (frame["state"], frame["scene"], live.asked) == ("preparing", "wall", "wall")
-    live.change(scenario, load, lambda rows: {}, clock())
+    live.handle_message(1, '{"scene": "wall"}', clock())
+    frame = pass_time(live, clock, 0.05)[-1]  # the simulation waits for its load
+    assert (frame["state"], frame["scene"], live.requested_scene) == ("preparing", "wall", "wall")
+    live.change_scene(scenario, load, lambda rows: {}, clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["scene"], frame["drive"]) == ("running", "wall", 2)
     assert frame["record"] == str(tmp_path / "drive-3")
@@ -157,7 +150,7 @@ def test_another_scene_is_another_drive_and_its_record_another_folder(
 
 @pytest.mark.slow
 def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, monkeypatch):
-    """Not by the next one into the same folder, nor after a reset, nor in a folder with a file."""
+    """Neither by a new drive or a reset, nor in a folder with other files."""
     monkeypatch.chdir(tmp_path)
     before: dict[Path, bytes] = {}
     (tmp_path / "mine").mkdir()
@@ -166,7 +159,7 @@ def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, 
         live = make(scenario, load, clock, Path(name))
         live.join(1, clock())
         assert pass_time(live, clock, 0.02)[-1]["record"] == first
-        live.hear(1, '{"reset": true}', clock())
+        live.handle_message(1, '{"reset": true}', clock())
         pass_time(live, clock, 0.02)
         live.close()
         assert live.recorded[0] == first and len(set(live.recorded)) == 2
@@ -179,7 +172,7 @@ def test_a_recorded_drive_is_never_overwritten(scenario, load, clock, tmp_path, 
     assert live.recorded == [] and not (tmp_path / "drive-5").exists()  # it never began
 
 
-def test_two_drives_that_begin_at_once_share_no_folder(scenario, load, tmp_path):
+def test_simultaneous_drives_use_different_folders(scenario, load, tmp_path):
     first = Session(scenario, load, record=tmp_path)
     with pytest.raises(CannotWrite, match=r"inputs.csv: cannot be written .File exists"):
         Session(scenario, load, record=tmp_path)
@@ -189,33 +182,33 @@ def test_two_drives_that_begin_at_once_share_no_folder(scenario, load, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", [60_000, 400_000])
-def test_a_full_disk_is_an_error_of_the_drive(scenario, load, clock, tmp_path, room):
-    """Of the inputs or of the log; the drive stops, and its end is no success."""
-    with small_disk(tmp_path, room):
+@pytest.mark.parametrize("size_bytes", [60_000, 400_000])
+def test_full_disk_stops_the_drive_with_an_error(scenario, load, clock, tmp_path, size_bytes):
+    """For the inputs and the log."""
+    with small_disk(tmp_path, size_bytes):
         live = make(scenario, load, clock, tmp_path / "drive")
         live.join(1, clock())
         for k in range(6000):
-            live.hear(1, json.dumps({"set": {"x": k % 2000}}), clock())
+            live.handle_message(1, json.dumps({"set": {"x": k % 2000}}), clock())
             frames = pass_time(live, clock, 0.005)
             if frames and frames[-1]["state"] == "stopped":
                 break
         else:
             pytest.fail("the disk was never full")
         assert "cannot be written" in frames[-1]["stopped"]
-        live.hear(1, '{"reset": true}', clock())
+        live.handle_message(1, '{"reset": true}', clock())
         live.frame()
         with pytest.raises(CannotWrite, match=r"cannot be written .*(No space left|large)"):
             live.close()
         assert live.recorded == []
 
 
-def test_what_is_done_is_shown_at_once(scenario, load, clock):
-    """Not with the next of 60 frames a second; and no more of them follow from that."""
+def test_input_is_shown_before_the_next_scheduled_frame(scenario, load, clock):
+    """The number of frames does not increase."""
     live = make(scenario, load, clock)
     live.join(1, clock())
     pass_time(live, clock, 0.1)
-    live.hear(1, '{"set": {"x": 100}}', clock())
+    live.handle_message(1, '{"set": {"x": 100}}', clock())
     start = clock.now
     frame = None
     while frame is None or frame["inputs"]["x"] != 100:
@@ -224,13 +217,13 @@ def test_what_is_done_is_shown_at_once(scenario, load, clock):
     assert clock.now - start < 0.013
     assert len(pass_time(live, clock, 0.2)) <= 13
     frames = []
-    for x in range(101, 121):  # who goes on is shown each slice
-        live.hear(1, json.dumps({"set": {"x": x}}), clock())
+    for x in range(101, 121):  # continuous motion is shown each slice
+        live.handle_message(1, json.dumps({"set": {"x": x}}), clock())
         frames += pass_time(live, clock, 0.005)
     assert len(frames) >= 15
 
 
-def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clock, monkeypatch):
+def test_failure_is_reported_and_a_reset_restarts(scenario, load, clock, monkeypatch):
     live = make(scenario, load, clock)
     live.join(1, clock())
 
@@ -241,14 +234,14 @@ def test_what_stops_a_drive_is_said_and_a_reset_begins_again(scenario, load, clo
         patch.setattr(Session, "advance", fail)
         frame = pass_time(live, clock, 0.05)[-1]
         assert (frame["state"], frame["stopped"]) == ("stopped", "joint 2 leaves its range")
-    live.hear(1, '{"reset": true}', clock())
+    live.handle_message(1, '{"reset": true}', clock())
     assert pass_time(live, clock, 0.02)[-1]["state"] == "running"
 
 
-def test_a_reset_that_fails_is_said_and_another_one_begins_again(
+def test_failed_reset_is_reported_and_the_next_one_restarts(
     scenario, load, clock, monkeypatch, tmp_path
 ):
-    """Of the record that ends, and of the station that begins."""
+    """The failure is in the old record or in the new station."""
     live = make(scenario, load, clock, tmp_path / "drive")
     live.join(1, clock())
     pass_time(live, clock, 0.02)
@@ -259,24 +252,24 @@ def test_a_reset_that_fails_is_said_and_another_one_begins_again(
     for owner, name, state in ((Session, "close", "running"), (Session, "__init__", "stopped")):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, fail)
-            live.hear(1, '{"reset": true}', clock())
+            live.handle_message(1, '{"reset": true}', clock())
         frame = pass_time(live, clock, 0.03)[-1]
         assert frame["state"] == state
         assert "no space left on device" in [frame["stopped"], *frame["words"]]
-    live.hear(1, '{"reset": true}', clock())
+    live.handle_message(1, '{"reset": true}', clock())
     frame = pass_time(live, clock, 0.03)[-1]
     assert (frame["state"], frame["words"]) == ("running", []) and frame["t"] > 0.0
     with pytest.raises(CannotWrite, match="no space left"):  # the record of the first is lost
         live.close()
 
 
-def test_without_a_page_nothing_runs(scenario, load, clock, tmp_path):
+def test_simulation_waits_without_a_page(scenario, load, clock, tmp_path):
     live = make(scenario, load, clock)
     frames = pass_time(live, clock, 0.5)
     assert live.ms == 0 and frames[-1]["state"] == "waiting"
 
 
-def test_lost_time_is_caught_up_with_or_given_up():
+def test_short_delays_are_caught_up_and_long_ones_given_up():
     pace = Pace(5e-3, 0.0)
     for k in range(10):
         pace.begin(5e-3 * k)
@@ -291,8 +284,8 @@ def test_lost_time_is_caught_up_with_or_given_up():
     assert pace.wait(0.305) == pytest.approx(0.02)
 
 
-def nonsense(rng: np.random.Generator) -> object:
-    """What somebody might say: damaged messages, other types, numbers that are none."""
+def random_message(rng: np.random.Generator) -> object:
+    """Return a random message: damaged, of other types, or with non-finite numbers."""
     good = json.dumps({"set": {"x": 10, "sigma": 50, "clutch": 1}, "slow": 2.0, "pause": False})
     kind = rng.integers(8)
     if kind == 0:
@@ -303,7 +296,7 @@ def nonsense(rng: np.random.Generator) -> object:
         place = rng.integers(len(good))
         return good[:place] + chr(rng.integers(1, 0x2000)) + good[place + 1 :]
     if kind == 3:
-        return "[" * int(rng.integers(1, LONGEST + 9))
+        return "[" * int(rng.integers(1, MAX_MESSAGE_BYTES + 9))
     wild = ["NaN", "Infinity", "-1e308", "1e999", "9" * 400, "null", "true", '"7"', "[1]", "{}"]
     names = ["x", "rz", "sigma", "force_scale", "held", "clutch", "__class__", "ms", ""]
     names += ["network", "method", "sensor", "object"]
@@ -313,18 +306,18 @@ def nonsense(rng: np.random.Generator) -> object:
 
 
 @pytest.mark.slow
-def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, load, clock):
+def test_all_values_stay_finite_after_10000_random_messages(scenario, load, clock):
     live, rng = make(scenario, load, clock), np.random.default_rng(0)
     live.join(1, clock())
-    live._begin = lambda now: None  # a reset builds a station, and is asked for a thousand times
+    live._start_drive = lambda now: None  # a thousand resets would build as many stations
     for k in range(10_000):
-        live.hear(1, nonsense(rng), clock())
+        live.handle_message(1, random_message(rng), clock())
         if k % 1000 == 0:
-            live.hear(1, '{"pause": false, "slow": 1}', clock())
-            live.asked = ""  # so is another scene
-            live._session.apply(live._wanted)
+            live.handle_message(1, '{"pause": false, "slow": 1}', clock())
+            live.requested_scene = ""  # likewise
+            live._session.apply(live._requested)
             live._session.advance()
-    live.asked = ""
+    live.requested_scene = ""
     frame = live.frame()
     assert live.refused > 3000
     assert frame["state"] == "running" and math.isfinite(sum(frame["inputs"].values()))
@@ -345,8 +338,8 @@ def test_ten_thousand_messages_of_nonsense_leave_every_number_finite(scenario, l
         ("[]", None),
         ("{}", None),
         (b'{"reset": true}', None),
-        ('{"reset": true}' + " " * LONGEST, None),
+        ('{"reset": true}' + " " * MAX_MESSAGE_BYTES, None),
     ],
 )
-def test_nothing_is_taken_from_a_message_that_is_not_expected(text, found):
+def test_unexpected_entries_of_a_message_are_ignored(text, found):
     assert parse(text) == found

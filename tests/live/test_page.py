@@ -1,4 +1,4 @@
-"""The page in a browser without a window: mouse, keys, slider, and a gamepad that is a spy."""
+"""The page in a headless browser: mouse, keys, slider and a simulated gamepad."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def drag(page: Page, x: int, y: int, dx: int, dy: int) -> None:
 
 
 def speed_by_key(page: Page, slow: int) -> float:
-    """Of the simulated tool while a key is held [m/s]: the slope over all frames of 0.8 s."""
+    """Return the speed of the simulated tool while a key is held [m/s]."""
     page.run(f"say({{slow: {slow}}}); Object.assign(target, {{x: 0, y: 0, z: 0}}); 1")
     page.until(f"frame.slow === {slow} && frame.inputs.z === 0 && frame.speed > 0")
     page.call("Input.dispatchKeyEvent", type="keyDown", code="KeyE", key="e")
@@ -78,7 +78,7 @@ def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
 @pytest.mark.slow
 def test_the_page_drives(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
-    # Meshcat tells where the camera is after all else; from its own place, right is another way.
+    # Meshcat sets the camera last; its default position has another direction to the right.
     page.until("Math.hypot(...view().place.map((p, k) => p - frame.tool[k])) < 2")
     x, z = page.run("[frame.tool[0], frame.tool[2]]")
     drag(page, 300, 300, 20, -10)
@@ -102,7 +102,7 @@ def test_the_page_drives(page):
     page.run("at('sigma').value = 40; at('sigma').dispatchEvent(new Event('input'))")
     page.until("frame.inputs.sigma === 40")
 
-    # Vibration: of what is measured always, of the contact not before there is one.
+    # Vibration by the measured force always, by the contact force only in contact.
     page.until("frame.f[1][1] < 0.05 && frame.inputs.z === 0")
     page.run("effects.length = 0; at('by-measured').click()")
     page.until("effects.length > 2")

@@ -1,4 +1,4 @@
-"""The 3D scene of the page: objects once, then where they are, and a drive that goes on without."""
+"""3D scene of the page: objects, poses and failures."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def view(scenario) -> PageScene:
 
 @pytest.fixture(scope="module")
 def rows(scenario, load) -> dict[str, np.ndarray]:
-    """The tool is pressed onto the leaf."""
+    """Return rows with the tool pressed onto the leaf."""
     session = Session(scenario, load)
     session.apply(session.inputs.changed({"z": -3000, "rx": 1000}))
     session.advance(200)
-    return session.news()
+    return session.new_rows()
 
 
-def test_everything_that_moves_is_an_object_and_is_where_the_station_has_it(scenario, view, rows):
+def test_moving_objects_have_the_poses_of_the_station(scenario, view, rows):
     objects = json.loads(view.objects)
     commands = [base64.b64decode(text) for text in objects["commands"]]
     frame = view.show(rows)
@@ -50,21 +50,19 @@ def test_everything_that_moves_is_an_object_and_is_where_the_station_has_it(scen
     json.dumps(frame, allow_nan=False)
 
 
-def test_without_forces_there_is_no_arrow(scenario, rows):
+def test_scene_without_forces_has_no_arrow(scenario, rows):
     moves = PageScene("0", scenario, forces=False).show(rows)["moves"]
     assert not moves["sizes"] and not any("forces" in path for path in moves["poses"])
 
 
-def test_meshcat_is_closed_when_the_scene_is_made(scenario):
+def test_meshcat_is_closed_after_the_scene_is_made(scenario):
     before = ports()
     PageScene("own", scenario)
     assert ports() == before
 
 
 @pytest.mark.parametrize("broken", ["Meshcat", "ReplayScene", "_objects"])
-def test_a_scene_that_cannot_be_made_is_said_and_no_error(
-    scenario, rows, monkeypatch, capsys, broken
-):
+def test_failed_scene_is_reported_without_an_error(scenario, rows, monkeypatch, capsys, broken):
     def fail(*_, **__):
         raise RuntimeError("no port is free\nfor this")
 
@@ -77,7 +75,7 @@ def test_a_scene_that_cannot_be_made_is_said_and_no_error(
     assert said == f"warning: {view.failure}; the drive continues without it\n"
 
 
-def test_a_scene_that_fails_later_is_said_once(scenario, rows, capsys):
+def test_scene_that_fails_later_is_reported_once(scenario, rows, capsys):
     view = PageScene("own", scenario)
     for _ in range(3):
         frame = view.show({name: values for name, values in rows.items() if name != "slave_state"})
@@ -86,7 +84,7 @@ def test_a_scene_that_fails_later_is_said_once(scenario, rows, capsys):
 
 
 @pytest.mark.parametrize("name", ["slave_state", "master_state", "contact_wrench_S"])
-def test_what_is_not_finite_is_not_sent(view, rows, name):
+def test_non_finite_poses_are_not_sent(view, rows, name):
     for value in (np.nan, np.inf):
         wild = view.show(rows | {name: np.full_like(rows[name], value)})
         json.dumps(wild, allow_nan=False)

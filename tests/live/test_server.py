@@ -1,4 +1,4 @@
-"""What listens: the page and its socket, for who has the token, from our own page alone."""
+"""Access to the page and its socket."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from websockets.sync.client import connect
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.live import server
-from drake_teleop.live.messages import LONGEST
+from drake_teleop.live.live import MAX_MESSAGE_BYTES
 from drake_teleop.station.scenario import Scenario, replace
 
-LEARNING = replace(Scenario(), load_estimator__enabled=True)  # identifies nothing beforehand
+LEARNING = replace(Scenario(), load_estimator__enabled=True)  # no identification before the drive
 
 
 def status(url: str, **headers: str) -> int:
@@ -39,7 +39,7 @@ def open_socket(live: server.LiveDrive, origin: str | None = None):
 
 
 def until(socket, wanted) -> dict:
-    """The first frame that is as wanted; frames come 60 times a second."""
+    """Return the first frame that satisfies a condition."""
     end = time.monotonic() + 20.0
     while time.monotonic() < end:
         frame = json.loads(socket.recv(20.0)).get("frame")
@@ -48,14 +48,14 @@ def until(socket, wanted) -> dict:
     raise AssertionError("there was no such frame")
 
 
-def test_a_record_that_cannot_be_written_is_said_and_nothing_waits(tmp_path):
+def test_unwritable_record_fails_at_once(tmp_path):
     (tmp_path / "file").write_text("a file, and no folder")
     with pytest.raises(DrakeTeleopError, match="cannot be made a folder"):
         server.drive(LEARNING, record=tmp_path / "file" / "record")
 
 
 @pytest.mark.slow
-def test_only_who_has_the_token_gets_the_page(live):
+def test_page_requires_the_token(live):
     base = live.url.partition("?")[0]
     assert listening() <= THIS_MACHINE
     assert status(live.url) == 200
@@ -64,13 +64,13 @@ def test_only_who_has_the_token_gets_the_page(live):
     assert status(base) == status(live.url + "x") == status(base + "meshcat.js") == 403
     assert json.loads(urlopen(live.url.replace("/?", "/scene/leaf?")).read())["commands"]
     assert status(live.url.replace("/?", "/scene/../leaf?")) == 404
-    # A name that somebody else's server gave to this address.
+    # Another host name of this address (DNS rebinding).
     assert status(live.url, Host="evil.example") == 403
     assert live.url in live._repr_html_()
 
 
 @pytest.mark.slow
-def test_the_socket_takes_orders_from_our_own_page_alone(live):
+def test_socket_requires_the_origin_of_our_page(live):
     for origin in ("http://evil.example", "null", live.url.partition("/?")[0] + "0"):
         with pytest.raises(InvalidStatus, match="403"):
             open_socket(live, origin)
@@ -82,16 +82,16 @@ def test_the_socket_takes_orders_from_our_own_page_alone(live):
         with open_socket(live) as other:
             other.send('{"drive": true}')
             assert until(page, lambda frame: frame["driver"] != hello["you"])
-        page.send("x" * (LONGEST + 1))
+        page.send("x" * (MAX_MESSAGE_BYTES + 1))
         with pytest.raises(ConnectionClosed):
             until(page, lambda frame: False)
 
 
 @pytest.mark.slow
-def test_a_port_that_is_taken_is_one_line(live, scenario, load, monkeypatch):
+def test_port_in_use_is_one_error_line(live, scenario, load, monkeypatch):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
     taken = int(live.url.partition("/?")[0].rpartition(":")[2])
-    with pytest.raises(DrakeTeleopError, match=f"port {taken}: cannot be listened to"):
+    with pytest.raises(DrakeTeleopError, match=f"port {taken}: cannot be opened"):
         server.drive(scenario, port=taken)
     with pytest.raises(DrakeTeleopError, match="there is no scenario"):
         server.drive("no-such-scenario")
@@ -113,7 +113,7 @@ def test_one_port_listens_also_when_the_scene_changes(scenario, load, monkeypatc
 
 
 @pytest.mark.slow
-def test_the_policy_of_the_page_allows_its_own_scripts_alone(live):
+def test_content_policy_allows_only_our_scripts(live):
     with urlopen(live.url) as answer:
         policy, page = answer.headers["Content-Security-Policy"], answer.read()
     assert "default-src 'none'" in policy and "unsafe-eval" not in policy
@@ -122,7 +122,7 @@ def test_the_policy_of_the_page_allows_its_own_scripts_alone(live):
 
 
 def hostile(host: str, token: str) -> Iterator[bytes]:
-    """Requests that no browser makes, or that a foreign page can make it make."""
+    """Send requests that a browser does not send, or that another page can cause."""
     start = f"GET /?token={token} HTTP/1.1\r\n"
     upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
     key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
@@ -136,7 +136,7 @@ def hostile(host: str, token: str) -> Iterator[bytes]:
         to = f"GET /socket?token={token} HTTP/1.1\r\nHost: {host}\r\n"
         yield f"{to}{origin}{upgrade}{key}\r\n".encode()
         yield f"{to}Origin: http://{host}\r\n{upgrade}{key}{key}\r\n".encode()
-    yield b"\x16\x03\x01\x02\x00\x01\x00" + bytes(range(256))  # a browser that was told https
+    yield b"\x16\x03\x01\x02\x00\x01\x00" + bytes(range(256))  # a browser with https
     yield b"POST / HTTP/1.1\r\nContent-Length: 5\r\n\r\nhello"
     yield b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 5000
     yield b"\r\n" * 100
@@ -144,8 +144,7 @@ def hostile(host: str, token: str) -> Iterator[bytes]:
 
 
 @pytest.mark.slow
-def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch, capfd):
-    """And it prints nothing but that the last page has gone."""
+def test_hostile_clients_cannot_end_or_delay_a_drive(scenario, load, monkeypatch, capfd):
     monkeypatch.setattr(server, "identified_load", lambda *_: load)
     drive = server.drive(scenario)
     host, token = drive.url.partition("//")[2].partition("/")[0], drive.url.partition("token=")[2]
@@ -153,12 +152,12 @@ def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch,
     for request in hostile(host, token):
         with socket.create_connection(address) as client:
             client.settimeout(5.0)
-            with contextlib.suppress(OSError):  # it closes what it refuses, sooner or later
+            with contextlib.suppress(OSError):  # the server closes refused connections
                 client.sendall(request)
                 if request.endswith(b"\r\n\r\n"):
                     assert b" 200 " not in client.recv(65536).partition(b"\r\n")[0]
     with contextlib.ExitStack() as stack:
-        for text in ("[]", b"\xc1", "x" * 4096, "", b"", "x" * (LONGEST + 1)):
+        for text in ("[]", b"\xc1", "x" * 4096, "", b"", "x" * (MAX_MESSAGE_BYTES + 1)):
             with open_socket(drive) as page:
                 page.send(text)
         silent = [socket.create_connection(address) for _ in range(5)]
@@ -172,29 +171,29 @@ def test_no_client_ends_a_drive_or_holds_up_its_end(scenario, load, monkeypatch,
     said = capfd.readouterr()
     assert said.out == "" and set(said.err.splitlines()) == {
         "Prepare the station and its 3D scenes ...",
-        "no page is open: nothing runs",
+        "no page is open: the simulation waits",
     }
 
 
 @pytest.mark.slow
-def test_a_drive_ends_while_another_scene_identifies_its_load(scenario, load, monkeypatch):
-    """However long that would take: it looks at the clock whenever it tells how far it is."""
-    asked, drives = threading.Event(), itertools.count()
+def test_drive_ends_while_a_scene_identifies_its_load(scenario, load, monkeypatch):
+    """The identification checks for the end in its progress function."""
+    started, drives = threading.Event(), itertools.count()
 
     def identify(_, progress):
         if next(drives) == 0:
             return load
-        told = progress("Identify the load")
+        report = progress("Identify the load")
         while True:
-            asked.set()
-            told(0.5)
+            started.set()
+            report(0.5)
             time.sleep(0.01)
 
     monkeypatch.setattr(server, "identified_load", identify)
     drive = server.drive(scenario)
     with open_socket(drive) as page:
         page.send('{"scene": "slot"}')
-        assert asked.wait(10.0)
+        assert started.wait(10.0)
         start = time.monotonic()
         drive.stop()
         assert time.monotonic() - start < 5.0

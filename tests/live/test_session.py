@@ -1,4 +1,4 @@
-"""A drive: inputs between slices, and the same bytes when it is repeated."""
+"""A drive with inputs between slices, and its repetition to the same bytes."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.progress import silent
 from drake_teleop.common.resources import models_dir
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.live.hand import BEHIND
-from drake_teleop.live.handing_on import GoesOver
+from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row
-from drake_teleop.live.session import Drive, Session, read_drive, repeat
+from drake_teleop.live.session import Drive, Session, read_drive
+from drake_teleop.live.station_swap import CrossFade
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.result import SimulationResult
@@ -28,8 +28,7 @@ END = 300  # ms
 
 
 def script(scenario: Scenario) -> list[tuple[int, Inputs]]:
-    """Down into the leaf with sliders on ramps; clutch out and in; an object is grasped; the hand
-    lets go, and network and method become others at the end."""
+    """Return inputs: a press, ramps of sliders, clutch, object, release, another network."""
     now, changes = Inputs.of(scenario), []
     for ms in range(0, END, 20):
         now = now.changed(
@@ -50,7 +49,7 @@ def same(one: SimulationResult, other: SimulationResult) -> bool:
 
 @pytest.fixture(scope="module")
 def driven(scenario, load, tmp_path_factory):
-    """A drive as a page makes one, slice after slice; its folder and its log."""
+    """Return the folder and the log of a drive in slices."""
     folder = tmp_path_factory.mktemp("drive")
     session = Session(scenario, load, log=folder / "log.parquet", record=folder)
     changes = dict(script(scenario))
@@ -58,43 +57,43 @@ def driven(scenario, load, tmp_path_factory):
         session.apply(changes.get(session.ms, session.inputs))
         session.advance()
         if session.ms % 50 == 0:
-            session.news()
-            session.keep()
+            session.new_rows()
+            session.flush()
     session.close()
     return folder, SimulationResult.read_parquet(folder / "log.parquet")
 
 
 @pytest.mark.slow
-def test_a_drive_is_recorded_and_repeats_itself_however_it_is_sliced(driven, scenario, load):
+def test_recorded_drive_repeats_for_any_slices(driven, scenario, load):
     folder, log = driven
     drive = read_drive(folder)
     assert drive.scenario == replace(scenario, simulation__duration=1e-3 * END)
     assert dict(drive.changes).items() >= dict(script(scenario)).items()
     for slice_ms in (1, 7, END):
-        assert same(repeat(drive, silent(""), slice_ms=slice_ms), log)
+        assert same(drive.repeat(silent(""), slice_ms=slice_ms), log)
     assert len(log.t) == END + 1 and np.abs(log["true_contact_wrench_W"][:, 2]).max() > 5.0
     # One input one slice late is another drive.
     late = [(ms + 5 * (ms == 100), inputs) for ms, inputs in script(scenario)]
-    assert not same(repeat(Drive(scenario, load, late), silent("")), log)
+    assert not same(Drive(scenario, load, late).repeat(silent("")), log)
 
 
 @pytest.mark.slow
-def test_nothing_jumps_when_inputs_change(driven, scenario):
+def test_signals_are_continuous_when_inputs_change(driven, scenario):
     _, log = driven
     step = np.abs(np.diff(log["pose_command"][:, 4:], axis=0)).max()
     assert step < 1e-3  # at 1 kHz, less than 1 m/s
     assert np.abs(np.diff(log["intent"][:239, 4:], axis=0)).max() < 6e-4
     free = log["force_to_master"][:80, :3]  # before the leaf
     assert np.abs(free).max() > 0.1 and np.abs(np.diff(free, axis=0)).max() < 0.02
-    # Where the clutch is open the command stays; later it goes on from there.
+    # The command is constant while the clutch is open, and continues from there.
     held = log["pose_command"][170:180]
     assert np.ptp(held, axis=0).max() == 0.0
     assert np.ptp(log["pose_command"][210:230], axis=0).max() > 1e-4
 
 
 @pytest.mark.slow
-def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
-    """In contact; over another channel and back to wires. What is felt goes over, slowly."""
+def test_new_network_and_method_continue_the_state(scenario, load):
+    """In contact, to another channel and back; the rendered wrench cross-fades."""
     session = Session(scenario, load)
     now = session.inputs.changed({"z": -2900})
     for end, change in ((250, {}), (1050, {"network": 2, "method": 4}), (1400, {"network": 0})):
@@ -106,71 +105,71 @@ def test_another_network_and_method_go_on_where_the_station_is(scenario, load):
     log = session.log()
     np.testing.assert_allclose(np.diff(log.t), 1e-3, atol=1e-12)
     assert np.linalg.norm(log["true_contact_wrench_W"][200:, :3], axis=1).min() > 3.0
-    felt, command = log["force_to_master"][:, 2], log["pose_received"][:, 4:]
+    rendered, command = log["force_to_master"][:, 2], log["pose_received"][:, 4:]
     for k in (250, 1050):
         np.testing.assert_array_equal(command[k + 2], command[k])
-        np.testing.assert_allclose(felt[k : k + 6], felt[k], atol=1e-3)
-        assert np.abs(np.diff(felt[k:])).max() < 0.02
-    # Error control may not cut a slice into more than it has time for.
-    assert session._now.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
-    # The clutch is closed again at last, and the channel passes on what it gets.
+        np.testing.assert_allclose(rendered[k : k + 6], rendered[k], atol=1e-3)
+        assert np.abs(np.diff(rendered[k:])).max() < 0.02
+    # The number of steps of a slice is limited.
+    assert session._station.simulator.get_integrator().get_num_steps_taken() <= 4 * (1400 - 1050)
+    # The clutch is closed at the end, and the channel delivers packets.
     assert np.ptp(command[260:1000], axis=0).max() < 1e-15
     assert not session.filling and session.apply(now.changed({"z": -1000})) is None
     session.advance(100)
     assert session.log()["pose_command"][-1, 6] > command[-1, 2] + 1e-3
 
 
-def test_what_is_felt_goes_over_though_the_wrench_stays():
-    simulator = Simulator(GoesOver(1e-3))
-    over, context = simulator.get_system(), simulator.get_mutable_context()
+def test_rendered_wrench_cross_fades_at_a_constant_wrench():
+    simulator = Simulator(CrossFade(1e-3))
+    cross_fade, context = simulator.get_system(), simulator.get_mutable_context()
     wrench = np.array([3.0, 0.0, 4.0, 0.1, 0.2, 0.3])
-    over.get_input_port().FixValue(context, wrench)
-    felt = over.get_output_port()
-    np.testing.assert_array_equal(felt.Eval(context), wrench)
-    over.Begin(context, 0.1, 0.2, np.ones(6))
-    np.testing.assert_array_equal(felt.Eval(context), np.ones(6))
+    cross_fade.get_input_port().FixValue(context, wrench)
+    rendered = cross_fade.get_output_port()
+    np.testing.assert_array_equal(rendered.Eval(context), wrench)
+    cross_fade.Begin(context, 0.1, 0.2, np.ones(6))
+    np.testing.assert_array_equal(rendered.Eval(context), np.ones(6))
     simulator.AdvanceTo(0.1995)
-    np.testing.assert_allclose(felt.Eval(context), (1.0 + wrench) / 2, atol=0.05)
-    over.Limit(context, 2.5)
+    np.testing.assert_allclose(rendered.Eval(context), (1.0 + wrench) / 2, atol=0.05)
+    cross_fade.Limit(context, 2.5)
     simulator.AdvanceTo(0.4)
-    np.testing.assert_allclose(felt.Eval(context), wrench / 2, rtol=1e-12)
-    over.get_input_port().FixValue(context, wrench / 2)
+    np.testing.assert_allclose(rendered.Eval(context), wrench / 2, rtol=1e-12)
+    cross_fade.get_input_port().FixValue(context, wrench / 2)
     simulator.AdvanceTo(0.402)
-    over.get_input_port().FixValue(context, wrench)
-    np.testing.assert_array_equal(felt.Eval(context), wrench)
+    cross_fade.get_input_port().FixValue(context, wrench)
+    np.testing.assert_array_equal(rendered.Eval(context), wrench)
 
 
 @pytest.mark.slow
-def test_what_a_method_had_hidden_comes_back_to_a_hand_that_has_eased_off(scenario, load):
-    """Without it a press is felt 0.9 N harder at most, and all of it from the next one on."""
-    session, felt = Session(scenario, load), []
+def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, load):
+    """A press is rendered at most 0.9 N harder, and in full from the next one on."""
+    session, rendered = Session(scenario, load), []
 
-    def go(ms, **changes):
+    def simulate(ms, **changes):
         session.apply(session.inputs.changed(changes))
         session.advance(ms)
-        felt.append(float(np.linalg.norm(session.force()[:3])))
-        return session.kept_back()
+        rendered.append(float(np.linalg.norm(session.force()[:3])))
+        return session.removed_force()
 
-    assert go(500, z=-4000) == 0.0
-    assert go(1000, network=2, method=METHODS.index("force_limit")) == 0.0
-    kept = go(1000, method=0)
-    assert felt[-1] == pytest.approx(felt[-2] + 0.9, abs=1e-9)
-    assert felt[-1] + kept == pytest.approx(felt[0], rel=0.02) and kept > 1.0
-    assert go(400, grip=1) > 0.2  # another station, but no other channel
-    assert felt[-1] == pytest.approx(felt[-2], abs=1e-9)
-    assert go(400, z=-1000) == 0.0 and felt[-1] < 0.1
-    assert go(400, z=-4000) == 0.0 and felt[-1] > felt[1] + 1.0
+    assert simulate(500, z=-4000) == 0.0
+    assert simulate(1000, network=2, method=METHODS.index("force_limit")) == 0.0
+    removed = simulate(1000, method=0)
+    assert rendered[-1] == pytest.approx(rendered[-2] + 0.9, abs=1e-9)
+    assert rendered[-1] + removed == pytest.approx(rendered[0], rel=0.02) and removed > 1.0
+    assert simulate(400, grip=1) > 0.2  # another station, but no other channel
+    assert rendered[-1] == pytest.approx(rendered[-2], abs=1e-9)
+    assert simulate(400, z=-1000) == 0.0 and rendered[-1] < 0.1
+    assert simulate(400, z=-4000) == 0.0 and rendered[-1] > rendered[1] + 1.0
     until_it_leaves = np.linalg.norm(session.log()["force_to_master"][1500:3200, :3], axis=1)
     assert np.abs(np.diff(until_it_leaves)).max() < 0.2
 
 
-def test_a_hand_that_is_led_moves_the_tool_at_once_and_stops_where_it_is_led(scenario, load):
-    """The arm's servo takes 10 ms of it. Led evenly the hand neither hangs back nor goes on."""
+def test_tool_follows_the_target_without_lag_and_stops_at_it(scenario, load):
+    """The arm's servo has a lag of 10 ms."""
     session, speed = Session(scenario, load), 0.12
     session.apply(session.inputs.changed({"z": 1000}))
     session.advance(50)
     for ms in range(200):
-        session.apply(session.inputs.changed({"x": round(1e5 * speed * (1e-3 * ms + BEHIND))}))
+        session.apply(session.inputs.changed({"x": round(1e5 * speed * (1e-3 * ms + LEAD_TIME_S))}))
         session.advance(1)
     session.apply(session.inputs.changed({"x": round(1e5 * speed * 0.2)}))
     session.advance(200)
@@ -188,8 +187,7 @@ def test_a_hand_that_is_led_moves_the_tool_at_once_and_stops_where_it_is_led(sce
 
 
 @pytest.mark.slow
-def test_every_other_choice_goes_on_without_a_jump(scenario, load):
-    """A firmer hand, an object, another sensor; the hand's pull and the arm stay what they are."""
+def test_new_grip_object_and_sensor_continue_the_state(scenario, load):
     session = Session(scenario, load)
     now = session.inputs.changed({"x": 1000, "grip": 0})
     session.apply(now)
@@ -201,19 +199,19 @@ def test_every_other_choice_goes_on_without_a_jump(scenario, load):
         ends.append(session.ms)
         session.advance(30)
     log = session.log()
-    pull, felt = log["hand_wrench_E"][:, :3], log["force_to_master"][:, :3]
+    pull, rendered = log["hand_wrench_E"][:, :3], log["force_to_master"][:, :3]
     assert np.abs(pull[115:120]).max() > 0.01
     for k in ends:
         assert np.abs(np.diff(pull[k - 1 : k + 2], axis=0)).max() < 0.05
-        assert np.abs(np.diff(felt[k - 1 : k + 5], axis=0)).max() < 2e-3
+        assert np.abs(np.diff(rendered[k - 1 : k + 5], axis=0)).max() < 2e-3
         assert np.abs(np.diff(log["slave_state"][k - 1 : k + 5, :6], axis=0)).max() < 1e-3
     mass = log["load_estimate"][:, 6]
     assert mass[ends[1] + 1] - mass[ends[1]] == pytest.approx(0.8)
 
 
 @pytest.mark.slow
-def test_what_is_on_its_way_arrives_though_the_grip_becomes_another(scenario, load):
-    """100 ms each way: until they are over, the slave is told what was sent to it before."""
+def test_packets_in_the_channel_arrive_after_a_change_of_grip(scenario, load):
+    """The channel has a delay of 100 ms each way."""
     far = replace(scenario, channel=Channel(delay=0.1))
     logs = []
     for grip in (1, 2):
@@ -226,13 +224,12 @@ def test_what_is_on_its_way_arrives_though_the_grip_becomes_another(scenario, lo
     one, other = (log["pose_received"][150:] for log in logs)
     assert np.ptp(one[:, 4]) > 1e-4
     np.testing.assert_array_equal(other, one)
-    # For how long master and slave have heard nothing: both hear something at every step.
+    # Time since the last packet of master and slave: one arrives at each step.
     assert logs[1]["ports"][150:, 4:6].max() == 0.0
 
 
 @pytest.mark.slow
-def test_a_hand_that_has_let_go_pulls_nowhere(driven):
-    """Nothing but its damping is left, which opposes every motion."""
+def test_released_hand_only_dissipates(driven):
     _, log = driven
     after = slice(241, None)
     np.testing.assert_allclose(
@@ -265,15 +262,15 @@ def test_run_repeats_a_drive_to_the_same_bytes(driven, tmp_path, capsys, monkeyp
 
 
 @pytest.mark.slow
-def test_of_a_drive_that_is_not_closed_two_seconds_are_lost_and_no_input(scenario, load, tmp_path):
-    """What is in the files is what a process that is killed leaves."""
+def test_unclosed_drive_loses_two_seconds_of_log_and_no_input(scenario, load, tmp_path):
+    """The files are those of a killed process."""
     session = Session(scenario, load, log=tmp_path / "log.parquet", record=tmp_path)
     changes = []
     while session.ms < 2100:
         changes.append((session.ms, session.inputs.changed({"x": session.ms})))
         session.apply(changes[-1][1])
         session.advance(100)
-    session._on_disk.finish()  # what has been taken, the thread beside has had time to write
+    session._on_disk.finish()  # the thread has written all parts taken so far
     assert list(read_drive(tmp_path).changes)[1:] == changes[1:]
     log = SimulationResult.read_parquet(tmp_path / "log.parquet")
     assert log.t[-1] >= 1e-3 * session.ms - 2.0
@@ -283,7 +280,7 @@ MADE_BY = {"drake_teleop": "1.2", "drake": "3.4"}
 HEADER = header(MADE_BY)
 
 
-def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
+def test_inputs_are_clipped_and_invalid_ones_ignored():
     wild = {"x": 1e300, "y": -(10**400), "z": np.nan, "rx": "1", "clutch": 7, "sigma": 12.6}
     inputs = Inputs().changed(wild | {"unknown": 1, "gamma": None, "held": False, "rz": np.inf})
     assert inputs == Inputs(sigma=13, clutch=1, held=0)
@@ -293,14 +290,14 @@ def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no record of a drive"),
-        (HEADER, "ends when it begins"),
-        (HEADER + row(0, Inputs()), "ends when it begins"),
-        (HEADER + row(5, Inputs()), "5 ms is no time"),
-        (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is no time"),
+        ("", "is not a record of a drive"),
+        (HEADER, "contains no simulated time"),
+        (HEADER + row(0, Inputs()), "contains no simulated time"),
+        (HEADER + row(5, Inputs()), "5 ms is not a valid time"),
+        (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),
         (HEADER + "0,1\n", "has 2 values, not 22"),
-        (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "something other than whole numbers"),
+        (HEADER + row(0, Inputs()).replace("0,", "a,", 1), "a value that is not a whole number"),
         (
             HEADER + row(0, Inputs()).replace("none", "share"),
             "has an unknown method, 'share'; it ca",
@@ -315,17 +312,17 @@ def test_inputs_are_brought_into_their_ranges_and_nonsense_is_left_out():
             "recorded with drake_teleop 1.1, and this is 1.2; it cannot",
         ),
         (HEADER.replace(", drake 3.4", ""), "recorded with drake unknown, and this is 3.4"),
-        (HEADER.partition("\n")[2] + "0,0\n", "has numbers for names, and no version"),
+        (HEADER.partition("\n")[2] + "0,0\n", "has choices as numbers and no version"),
         ("# \n" + HEADER.partition("\n")[2], "recorded with drake_teleop unknown"),
     ],
 )
-def test_a_file_of_inputs_that_is_none_is_one_line(tmp_path, text, message):
+def test_invalid_file_of_inputs_is_one_error_line(tmp_path, text, message):
     (tmp_path / INPUTS).write_text(text)
     with pytest.raises(DrakeTeleopError, match=message):
         read_inputs(tmp_path / INPUTS, MADE_BY)
 
 
-def test_a_drive_whose_model_has_changed_is_not_repeated(scenario, load, tmp_path):
+def test_drive_with_a_changed_model_is_not_repeated(scenario, load, tmp_path):
     model = tmp_path / "arm.sdf"
     shutil.copy(models_dir() / "rx90.sdf", model)
     session = Session(replace(scenario, slave__model=str(model)), load, record=tmp_path / "drive")
@@ -337,7 +334,7 @@ def test_a_drive_whose_model_has_changed_is_not_repeated(scenario, load, tmp_pat
         read_drive(tmp_path / "drive")
 
 
-def test_a_line_that_a_killed_process_did_not_finish_is_left_out(tmp_path):
+def test_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / INPUTS
     path.write_text(HEADER + row(0, Inputs()) + row(5, Inputs(x=3)) + row(10, Inputs())[:9])
     assert read_inputs(path, MADE_BY) == [(0, Inputs()), (5, Inputs(x=3))]

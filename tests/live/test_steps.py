@@ -7,14 +7,13 @@ from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from drake_teleop.live.inputs import SLICE_MS
-from drake_teleop.live.session import Session
-from drake_teleop.live.steps import take_short_steps_in_contact
+from drake_teleop.live.session import Session, take_short_steps_in_contact
 
 SHORTEST, TICK = 2.5e-4, 5e-4
 
 
 def a_ball_on_a_spring(max_step: float = TICK) -> Simulator:
-    """It falls by 1 mm and flies up again; in contact it vibrates at 700 Hz."""
+    """Return a ball that falls by 1 mm and bounces; its contact vibrates at 700 Hz."""
     x, v = Variable("x"), Variable("v")
     spring = if_then_else(x < 0.0, -((2 * np.pi * 700.0) ** 2) * x, 0.0)
     ball = SymbolicVectorSystem(state=[x, v], dynamics=[v, spring - 9.81])
@@ -26,7 +25,7 @@ def a_ball_on_a_spring(max_step: float = TICK) -> Simulator:
 
 
 def ticks(simulator: Simulator, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Steps that were taken and that were rejected in each of so many ticks."""
+    """Return the numbers of steps taken and rejected in each tick."""
     integrator, counts = simulator.get_integrator(), []
     for k in range(1, number + 1):
         simulator.AdvanceTo(k * TICK)
@@ -52,14 +51,14 @@ def test_after_a_rejected_step_all_are_short_for_4_ms_and_none_is_rejected():
     assert np.count_nonzero(~short) > 80
 
 
-def test_no_step_is_longer_than_a_scenario_wants():
+def test_no_step_is_longer_than_the_scenarios_limit():
     simulator = a_ball_on_a_spring(max_step=1e-4)
     take_short_steps_in_contact(simulator, SHORTEST)
     taken, _ = ticks(simulator, 60)
     assert taken.min() >= 5
 
 
-def test_a_simulator_that_nobody_holds_is_let_go():
+def test_monitor_does_not_keep_the_simulator_alive():
     simulator = a_ball_on_a_spring()
     take_short_steps_in_contact(simulator, SHORTEST)
     held = weakref.ref(simulator)
@@ -68,20 +67,20 @@ def test_a_simulator_that_nobody_holds_is_let_go():
     assert held() is None
 
 
-def test_a_slice_in_contact_takes_two_steps_a_tick_and_few_in_vain(scenario, load):
+def test_contact_takes_two_steps_a_tick_and_few_rejected_ones(scenario, load):
     session = Session(scenario, load)
-    integrator = session._now.simulator.get_integrator()
+    integrator = session._station.simulator.get_integrator()
     pressed, counts = [], []
     while session.ms < 1500:
         down = 0.5 - 0.5 * np.cos(2e-3 * np.pi * session.ms)
         session.apply(session.inputs.changed({"z": round(-4000 * down)}))
         session.advance()
-        pressed.append(session.pressed())
-        session.news()
+        pressed.append(session.contact_force())
+        session.new_rows()
         counts.append(integrator.get_num_derivative_evaluations())
     evaluations = np.diff(counts)[20:]
     ticks_of_slice = SLICE_MS * 1e-3 / TICK
     assert max(pressed) > 0.1
     assert evaluations.min() == 3 * ticks_of_slice
-    # Six of two steps of a tick; and three in vain, of three each: 96 in all without short steps.
+    # Six ticks of two steps, and three rejections; without short steps 96 in all.
     assert 6 * ticks_of_slice <= evaluations.max() <= 6 * ticks_of_slice + 9

@@ -1,1 +1,1 @@
-"""Blind experiments with people in the page of `drive`, and with simulated participants."""
+"""Blind experiments with people or simulated participants."""

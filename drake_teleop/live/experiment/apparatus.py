@@ -1,10 +1,7 @@
-"""The station of a task under a condition, and what an interval in it was.
+"""Station and stimulus of an experiment's task under a condition.
 
-The level of a stimulus goes into the inputs of a drive, in their whole numbers. A contact of F
-newton at the tool, for somebody who presses with P, is the share gamma F / P of what is touched;
-in the other interval it is none, so that eyes see the same in both. A mass of m at the hand is a
-share sigma of the load, more than the condition has (of a held object, if the condition has eta).
-What counts as the level is what it then was: with the force that was pressed with.
+A contact of F newton of the contact force P is rendered with gamma scaled by F / P, the other
+interval with gamma = 0. A mass at the hand increases sigma, or the eta of a held object.
 """
 
 from __future__ import annotations
@@ -16,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
-from drake_teleop.live.choice_names import OWN
-from drake_teleop.live.choices import chosen, known_estimate
 from drake_teleop.live.experiment.design import (
     ApparentMass,
     Condition,
@@ -25,9 +20,9 @@ from drake_teleop.live.experiment.design import (
     PegInSlot,
     Task,
 )
-from drake_teleop.live.experiment.procedure import Felt
-from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.session import live_scenario
+from drake_teleop.live.experiment.procedure import IntervalResult
+from drake_teleop.live.inputs import OWN, RANGES, Inputs
+from drake_teleop.live.scenarios import adapted_estimate, chosen_scenario, live_scenario
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -36,27 +31,24 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_MOST = RANGES["gamma"][1]  # %
-# A contact force counts when it lasts [s], and as a touch from here on [N].
-_LASTS, _TOUCHED = 0.02, 0.5
-# Of the slot: the tip stands so near the floor [m], for so long [s].
-_NEAR, _STANDS = 2e-3, 0.2
+_MAX_SCALE = RANGES["gamma"][1]  # %
+# Averaging time of a contact force [s], and smallest force of a touch [N].
+_AVERAGING_S, _TOUCH_FORCE_N = 0.02, 0.5
+# The tip is on the floor of the slot within this distance [m] for this time [s].
+_FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
-def load_of(scenario: Scenario) -> IdentifiedLoad | None:
-    """What a station is told of its load, if it does not learn it."""
+def load_for(scenario: Scenario) -> IdentifiedLoad | None:
+    """Return the load, None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
 @dataclass(frozen=True, eq=False)
 class Apparatus:
-    """A task under a condition.
+    """Station of a task under a condition.
 
     Attributes:
-        task, condition: which.
-        scenario: with the condition's network and method, and its object if there is one.
-        load: what the station knows of it.
-        mass: at the hand, of the load or object whose share is felt [kg].
+        mass: of the load or object at the hand [kg].
     """
 
     task: Task
@@ -66,12 +58,7 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Those of an interval, in the units of `Inputs`.
-
-        Args:
-            level: of its stimulus; 0 for none.
-            pressed: the contact force at the tool that is expected [N].
-        """
+        """Return the inputs for a stimulus and an expected contact force [N]."""
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
@@ -82,39 +69,30 @@ class Apparatus:
         if condition.eta is None:
             sigma = share
         values = {"sigma": sigma, "sigma_object": share, "gamma": gamma}
-        return {name: min(round(value), _MOST) for name, value in values.items()}
+        return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
-    def felt(self, shown: float, inputs: dict[str, int], rows: Rows) -> Felt:
-        """What an interval was.
-
-        Args:
-            shown: the level that it should have; 0 for none.
-            inputs: as above.
-            rows: of its log.
-        """
+    def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
+        """Return the result of an interval with an intended level."""
         force = rows.force()
         if isinstance(self.task, PegInSlot):
-            return Felt(force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time)
+            return IntervalResult(
+                force_N=force, done=rows.done_at > 0.0, time_s=rows.done_at or rows.time
+            )
         if isinstance(self.task, ContactDetection):
             level = force * inputs["gamma"] / (100.0 * self.condition.gamma)
-            return Felt(level if shown else 0.0, force, valid=force > _TOUCHED)
+            return IntervalResult(level if shown else 0.0, force, valid=force > _TOUCH_FORCE_N)
         before = self.condition.sigma if self.condition.eta is None else self.condition.eta
         level = self.mass * (inputs["sigma_object"] / 100.0 - before)
-        return Felt(level if shown else 0.0, force)
+        return IntervalResult(level if shown else 0.0, force)
 
 
 def make_apparatus(
     task: Task, condition: Condition, scenario: Scenario, load: IdentifiedLoad | None
 ) -> Apparatus:
-    """The station of a task under a condition, to be driven.
-
-    Args:
-        task, condition: which.
-        scenario: of the task.
-        load: that was identified in it.
+    """Return the station of a task under a condition.
 
     Raises:
-        DrakeTeleopError: if there is no such station.
+        DrakeTeleopError: if there is none.
     """
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}
@@ -127,12 +105,12 @@ def make_apparatus(
     setup = replace(setup, contact_detection=None, **changes)
     empty = NominalSlave(setup.slave).arm.phi_load[0]
     if condition.eta is not None and setup.slave.payload.mass == 0.0:
-        held = chosen(setup, load, Inputs.of(setup).changed({"object": 1}))
-        estimate = known_estimate(setup, load, held)
+        with_object = chosen_scenario(setup, load, Inputs.of(setup).changed({"object": 1}))
+        estimate = adapted_estimate(setup, load, with_object)
         if load is not None and estimate is not None:
             known = dataclasses.replace(load.identification, offsets=estimate[:6], phi=estimate[6:])
             load = dataclasses.replace(load, identification=known)
-        setup = held
+        setup = with_object
     setup.check()
     mass = empty
     if condition.eta is not None:
@@ -141,68 +119,61 @@ def make_apparatus(
     return Apparatus(task, condition, setup, load, float(mass) * at_hand)
 
 
-class Rows:
-    """The log of an interval, as it comes in.
+class IntervalLog:
+    """Measures of an interval.
 
     Attributes:
         time: of the last row [s].
-        done_at: when the tool had come to the floor of the slot [s]; 0 before.
-
-    Args:
-        task: that is done.
-        scenario: that is driven; with the task's slot, if it has one.
+        done_at: time at the floor of the slot [s]; 0 before.
     """
 
     def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
         self.time, self.done_at = 0.0, 0.0
         self._forces: list[Array] = []
-        self._felt: list[Array] = []
+        self._rendered: list[Array] = []
         self._dt = 1.0 / scenario.rates.log_hz
         self._slave, self._insert = NominalSlave(scenario.slave), insert
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """The newest rows, as `Session.news` gives them."""
+        """Add the newest rows."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
         contact = rows.get("true_contact_wrench_W", np.zeros((len(rows["t"]), 6)))
         self._forces.append(np.linalg.norm(contact[:, :3], axis=1))
-        self._felt.append(rows["force_to_master"][:, :3])
+        self._rendered.append(rows["force_to_master"][:, :3])
         if self._insert is not None and not self.done_at:
-            self._look(self._insert, rows)
+            self._detect_floor(self._insert, rows)
 
-    def _look(self, insert: Insert, rows: dict[str, Array]) -> None:
-        """Whether the tip stands on the slot's floor."""
+    def _detect_floor(self, insert: Insert, rows: dict[str, Array]) -> None:
         arm, R_WS, p_WS = self._slave.arm, np.empty((3, 3)), np.empty(3)
         forward_kinematics(arm.table, rows["slave_state"][-1, : arm.num_joints], R_WS, p_WS)
         tip = p_WS + R_WS @ self._slave.tip - self._slave.start_tip
-        if tip[2] - insert.translation[2] + insert.depth > _NEAR:
+        if tip[2] - insert.translation[2] + insert.depth > _FLOOR_DISTANCE_M:
             self._on_floor = None
         elif self._on_floor is None:
             self._on_floor = self.time
-        elif self.time - self._on_floor >= _STANDS:
+        elif self.time - self._on_floor >= _FLOOR_TIME_S:
             self.done_at = self._on_floor
 
     def force(self) -> float:
-        """The largest contact force at the tool that lasted for 20 ms [N]."""
-        return _largest(np.concatenate([np.zeros(1), *self._forces]), self._dt)
+        """Return the largest 20 ms mean of the contact force [N]."""
+        return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """The largest change of the felt force that lasted for 20 ms [N].
+        """Return the largest 20 ms mean change of the rendered force [N] from time `after` [s].
 
-        Args:
-            after: what was felt in the tenth of a second before is what it changes from [s].
+        It is relative to the 0.1 s before.
         """
-        felt = np.concatenate(self._felt)
-        begin = round(after / self._dt)
-        rest = felt[round((after - 0.1) / self._dt) : begin].mean(axis=0)
-        return _largest(np.linalg.norm(felt[begin:] - rest, axis=1), self._dt)
+        rendered = np.concatenate(self._rendered)
+        start = round(after / self._dt)
+        rest = rendered[round((after - 0.1) / self._dt) : start].mean(axis=0)
+        return _largest_mean(np.linalg.norm(rendered[start:] - rest, axis=1), self._dt)
 
 
-def _largest(values: Array, dt: float) -> float:
-    """Of the means over 20 ms."""
-    n = max(1, round(_LASTS / dt))
+def _largest_mean(values: Array, dt: float) -> float:
+    n = max(1, round(_AVERAGING_S / dt))
     sums = np.concatenate([[0.0], np.cumsum(values)])
     means = (sums[n:] - sums[:-n]) / n
     return float(means.max()) if len(means) else float(values.max())

@@ -1,8 +1,6 @@
-"""A drive in which a participant is led through an experiment; without any page.
+"""Experiment of one participant, in place of `Live`.
 
-It takes the place of `Live`: each interval is a `Live` of its own, from the scenario's start, and a
-recorded drive, which `run --inputs` repeats. The page is told what the hand feels, for it has to
-come to the hand, and nothing else of the forces, of the condition, or of the stimulus.
+Each interval is a recorded `Live`. The page receives only the rendered force.
 """
 
 from __future__ import annotations
@@ -17,47 +15,40 @@ import numpy as np
 
 from drake_teleop.common.writing import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
-from drake_teleop.live.experiment.apparatus import Apparatus, Rows
+from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot
-from drake_teleop.live.experiment.messages import HAND, parse_study
 from drake_teleop.live.experiment.procedure import GAP, INTERVAL, Procedure
 from drake_teleop.live.experiment.simulated import seeded
 from drake_teleop.live.experiment.store import Store
 from drake_teleop.live.inputs import RANGES, Inputs
-from drake_teleop.live.live import FRAME, Live, Show
+from drake_teleop.live.live import FRAME, Live, Show, parse
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario
 
-#: Between the intervals of a trial [s].
-_GAP = 0.8
-_KNOWN = (
+#: Pause between the intervals of a trial [s].
+_GAP_S = 0.8
+_SHOWN_KEYS = (
     *("t", "tool", "stylus", "device", "factor", "late", "lost", "stopped"),
     *("speed", "slow", "view", "no_view", "moves"),
 )
-_HIDDEN = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+_HIDDEN_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
+
+#: Inputs of a drive that move the hand.
+HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
-def unseen(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The rows without what would draw forces."""
+def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return rows without the forces of the 3D scene."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
 
 class Guided:
-    """What happens when messages and the clock's ticks come in; as `Live` has it.
+    """Event handler of an experiment, with the interface of `Live`.
 
     Attributes:
-        refused: how many messages were none.
-        asked: always "": there is no scene to ask for.
-
-    Args:
-        procedure: of the participant.
-        stations: of each task and condition.
-        scenarios: of the tasks.
-        store: beside whose trials the drives are recorded.
-        shows: what shows the scene of each task.
-        now: the clock [s].
-        link: to a haptic device that is the hand.
+        refused: number of invalid messages.
+        requested_scene: always "".
     """
 
     def __init__(
@@ -70,31 +61,29 @@ class Guided:
         now: float,
         link: DeviceLink | None = None,
     ) -> None:
-        self.refused, self.asked = 0, ""
+        self.refused, self.requested_scene = 0, ""
         self._procedure, self._stations, self._scenarios = procedure, stations, scenarios
         self._drives, self._shows, self._link = store.folder / "drives", shows, link
-        self._clients: list[int] = []
         self._driver: int | None = None
-        self._unwritten = ""
+        self._write_error = ""
         self._intervals, self._since, self._frame_due = 0, now, now
         self._prepare(now)
 
     def _prepare(self, now: float) -> None:
-        """The station of the next interval, at its start."""
         procedure = self._procedure
-        trial, self._prepared = procedure.trial, procedure.prepared
+        trial, self._prepared = procedure.trial, procedure.prepared_intervals
         self._apparatus = self._stations[trial.task, trial.condition]
         self._show = self._shows[trial.task]
         insert = self._scenarios[trial.task].operator.task
         insert = insert if isinstance(insert, Insert) else None
-        self._rows = Rows(procedure.task, self._apparatus.scenario, insert)
-        self._stimulus = self._apparatus.inputs(procedure.shown, procedure.pressed)
+        self._rows = IntervalLog(procedure.task, self._apparatus.scenario, insert)
+        self._stimulus = self._apparatus.inputs(procedure.present_level, procedure.expected_force)
         name = f"{procedure.number:04}-{procedure.interval}"
         self._live = Live(
             seeded(self._apparatus.scenario, procedure),
             self._apparatus.load,
             self._drives / f"{procedure.participant:02}" / name,
-            self._watch,
+            self._add_rows,
             now,
             self._link,
             log=False,
@@ -104,12 +93,12 @@ class Guided:
         if self._driver is not None:
             self._live.join(self._driver, now)
 
-    def _watch(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _add_rows(self, rows: dict[str, np.ndarray]) -> dict[str, Any]:
         self._rows.add(rows)
-        return self._show(unseen(rows))
+        return self._show(without_forces(rows))
 
     def hello(self) -> dict[str, Any]:
-        """What a page has to know."""
+        """Return the constants for a page."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -117,79 +106,76 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """A page has connected; the first one drives."""
-        self._clients.append(client)
+        """Add a page; the first one drives."""
         if self._driver is None:
-            self._hand_over(client, now)
+            self._set_driver(client, now)
 
-    def _hand_over(self, client: int, now: float) -> None:
-        self._leave_alone(now)
+    def _set_driver(self, client: int, now: float) -> None:
+        self._remove_driver(now)
         self._driver = client
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """A page has gone. If it was the driver, the trial will begin again."""
-        self._clients.remove(client)
+        """Remove a page; after the driver's, the trial restarts."""
         if client == self._driver:
-            self._leave_alone(now)
+            self._remove_driver(now)
 
-    def _leave_alone(self, now: float) -> None:
+    def _remove_driver(self, now: float) -> None:
         if self._driver is None:
             return
         self._live.leave(self._driver, now)
         self._driver = None
-        self._procedure.interrupted()
-        self._keep_up(now)
+        self._procedure.restart_trial()
+        self._prepare_if_changed(now)
 
-    def _keep_up(self, now: float) -> None:
-        """Another interval has its own station."""
-        with self._noting():
-            if self._procedure.prepared != self._prepared:
+    def _prepare_if_changed(self, now: float) -> None:
+        with self._keep_write_error():
+            if self._procedure.prepared_intervals != self._prepared:
                 self._live.end()
                 self._prepare(now)
 
     @contextmanager
-    def _noting(self) -> Iterator[None]:
-        """Keep what cannot be written for `tick`, which ends the experiment with it."""
+    def _keep_write_error(self) -> Iterator[None]:
+        """Keep a `CannotWrite` for `tick`."""
         try:
             yield
         except CannotWrite as error:
-            self._unwritten = str(error)
+            self._write_error = str(error)
 
-    def hear(self, client: int, text: Any, now: float) -> None:
-        """A message of a page; what is not one changes nothing but a counter."""
-        said = parse_study(text)
-        if said is None:
+    def handle_message(self, client: int, text: Any, now: float) -> None:
+        """Handle a message of a page; count an invalid one."""
+        message = parse_study(text)
+        if message is None:
             self.refused += 1
             return
-        if "drive" in said and client != self._driver:
-            self._hand_over(client, now)
+        if "drive" in message and client != self._driver:
+            self._set_driver(client, now)
         if client != self._driver:
             return
         procedure = self._procedure
         if procedure.phase == INTERVAL:
-            moves = {kind: said[kind] for kind in said.keys() & {"set", "rates"}}
-            self._live.hear(client, json.dumps(moves), now)
+            moves = {kind: message[kind] for kind in message.keys() & {"set", "rates"}}
+            self._live.handle_message(client, json.dumps(moves), now)
         before = procedure.phase, procedure.number
-        if "answer" in said:
-            with self._noting():
-                procedure.answer(said["answer"], now - self._since)
-        elif "go" in said:
+        if "answer" in message:
+            with self._keep_write_error():
+                procedure.answer(message["answer"], now - self._since)
+        elif "go" in message:
             procedure.go()
         if (procedure.phase, procedure.number) == before:
             return
-        self._keep_up(now)
+        self._prepare_if_changed(now)
         self._since = now
         if procedure.phase == INTERVAL:
             self._live.pace.start(now)
 
     def wait(self, now: float) -> float:
-        """How long there is nothing to do [s]."""
+        """Return the time until the next slice or frame [s]."""
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
     def stopped(self) -> str:
-        """Why simulated time stands still; "" if nothing has failed."""
+        """Failure that stops the simulation, or ""."""
         return self._live.stopped
 
     @property
@@ -202,44 +188,43 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulates what is due; gives a frame when one is due.
+        """Simulate the due slices; return a due frame.
 
         Raises:
-            CannotWrite: if a trial or a drive cannot be written.
+            CannotWrite: if the disk is full.
         """
-        if self._unwritten:
-            raise CannotWrite(self._unwritten)
+        if self._write_error:
+            raise CannotWrite(self._write_error)
         now = clock()
-        if self._procedure.phase == GAP and now - self._since >= _GAP:
-            self._procedure.second()
+        if self._procedure.phase == GAP and now - self._since >= _GAP_S:
+            self._procedure.start_second_interval()
             self._live.pace.start(now)
         if self._runs:
-            told = self._live.tick(clock) is not None
-            self._look(clock())
-            return self.frame() if told else None
+            frame_is_due = self._live.tick(clock) is not None
+            self._end_interval_if_over(clock())
+            return self.frame() if frame_is_due else None
         if now < self._frame_due:
             return None
         self._frame_due = now + FRAME
         return self.frame()
 
-    def _look(self, now: float) -> None:
-        """Whether the interval is over."""
+    def _end_interval_if_over(self, now: float) -> None:
         task, live = self._procedure.task, self._live
         slot = isinstance(task, PegInSlot)
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         if live.ms < 1e3 * length and not (slot and self._rows.done_at):
             return
         live.frame()
-        felt = self._apparatus.felt(self._procedure.shown, self._stimulus, self._rows)
-        felt = dataclasses.replace(felt, lost_s=live.pace.given_up)
-        self._procedure.finished(felt)
+        result = self._apparatus.result(self._procedure.present_level, self._stimulus, self._rows)
+        result = dataclasses.replace(result, lost_s=live.pace.given_up)
+        self._procedure.finish_interval(result)
         self._since = self._frame_due = now
-        self._keep_up(now)
+        self._prepare_if_changed(now)
 
     def frame(self) -> dict[str, Any]:
-        """What a page is shown now."""
+        """Return the present frame for pages."""
         inner = self._live.frame()
-        felt = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
+        rendered = inner.get("f", [[0.0, 0.0]] * 3)[2] if self._runs else [0.0, 0.0]
         task = self._procedure.task
         length = task.timeout if isinstance(task, PegInSlot) else task.interval
         left = max(0.0, 1.0 - 1e-3 * self._live.ms / length) if self._runs else 0.0
@@ -248,9 +233,9 @@ class Guided:
         inputs |= {name: inner["inputs"][name] for name in HAND}
         scaling = self._apparatus.scenario.kinematic_scaling
         return {
-            **{name: inner[name] for name in _KNOWN if name in inner},
-            **_HIDDEN,
-            "f": [felt] * 3,
+            **{name: inner[name] for name in _SHOWN_KEYS if name in inner},
+            **_HIDDEN_VALUES,
+            "f": [rendered] * 3,
             "state": "stopped" if inner["stopped"] else "running",
             "driver": self._driver,
             "drive": self._intervals,
@@ -260,7 +245,28 @@ class Guided:
         }
 
     def close(self) -> None:
-        """Ends the drive; its trials are on the disk."""
+        """End the drive."""
         self._live.close()
         if self._link is not None:
             self._link.close()
+
+
+def parse_study(text: Any) -> dict[str, Any] | None:
+    """Return the valid requests of a message: set, rates, drive, go, answer."""
+    message = parse(text) or {}
+    found: dict[str, Any] = {}
+    for kind in message.keys() & {"set", "rates"}:
+        found[kind] = {name: value for name, value in message[kind].items() if name in HAND}
+    if "drive" in message:
+        found["drive"] = True
+    try:
+        whole = json.loads(text) if isinstance(text, str) and len(text) < 100 else None
+    except (ValueError, RecursionError):
+        whole = None
+    if isinstance(whole, dict):
+        if whole.get("go") is True:
+            found["go"] = True
+        answer = whole.get("answer")
+        if isinstance(answer, int) and not isinstance(answer, bool) and answer in (1, 2):
+            found["answer"] = answer
+    return found or None

@@ -1,8 +1,6 @@
-"""What a participant goes through, one step after another; without page, clock and station.
+"""Sequence of a participant's trials, drawn from the seed and the participant's number.
 
-The order is drawn from the experiment's seed and the participant's number: the tasks, in each task
-practice first, and then rounds in which each condition comes once. So the levels of a condition
-find its threshold while the others go on beside it, and nobody gets used to one of them.
+Each task has practice and then rounds with every condition once.
 """
 
 from __future__ import annotations
@@ -16,8 +14,8 @@ from drake_teleop.live.experiment.design import ContactDetection, Experiment, Pe
 from drake_teleop.live.experiment.psychometrics import Psi
 from drake_teleop.live.experiment.store import Row, Store
 
-#: Where a participant stands; `go` leads on from each but GAP, INTERVAL and ANSWER.
-CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, TOLD, BREAK, END = (
+#: Phases of an experiment; `go` ends each one except GAP, INTERVAL and ANSWER.
+CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
     *("consent", "task", "ready", "interval", "gap", "answer"),
     *("told", "break", "end"),
 )
@@ -25,12 +23,11 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, TOLD, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial that will be.
+    """A planned trial.
 
     Attributes:
-        task, condition: which of the experiment's.
-        practice: whether it does not count.
-        signal: the interval that has the stimulus, 1 or 2; 0 where there are none.
+        task, condition: index in the experiment.
+        signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
     """
 
     task: int
@@ -40,16 +37,16 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Felt:
-    """What an interval was.
+class IntervalResult:
+    """Result of an interval.
 
     Attributes:
-        level: of the stimulus; 0 if it had none, or if it cannot have been felt.
+        level: of the stimulus; 0 without one.
         force_N: largest contact force at the tool.
-        valid: False if it has to be done again: the tool touched nothing.
-        done: whether the tool got to the floor of the slot.
+        valid: False without contact.
+        done: whether the tool reached the floor of the slot.
         time_s: until then.
-        lost_s: that the machine was too slow by.
+        lost_s: simulation time behind the clock.
     """
 
     level: float = 0.0
@@ -61,7 +58,7 @@ class Felt:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """All trials of a participant, in order."""
+    """Return all trials of a participant."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -79,20 +76,15 @@ def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
 
 
 class Procedure:
-    """One participant's way through an experiment; it begins where its rows end.
+    """State of a participant, after the stored rows.
 
     Attributes:
-        phase: see `CONSENT` and the following.
-        interval: 1 or 2 of the trial; of peg in slot 1.
-        level: of the trial's stimulus, as it should be.
-        prepared: counts the intervals that are to come, also those that come again.
-        said: whether the last answer was right, for practice.
-        again: whether the trial is done again, because the tool touched nothing.
-
-    Args:
-        experiment: its design.
-        participant: the number.
-        store: where trials go to, and come from.
+        phase: `CONSENT` to `END`.
+        interval: 1 or 2.
+        level: intended, of the trial.
+        prepared_intervals: number so far.
+        said: whether the last answer was right.
+        again: whether the trial is repeated for lack of contact.
     """
 
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
@@ -107,121 +99,120 @@ class Procedure:
         }
         self._pressed: list[float] = []
         for trial, row in zip(self.trials, self._rows, strict=False):
-            self._learn(trial, row)
+            self._update_estimates(trial, row)
         self.phase, self.said, self.again = CONSENT, False, False
-        self.prepared = 0
+        self.prepared_intervals = 0
         self._new_trial()
 
     @property
     def number(self) -> int:
-        """Of the trial, from 0; as many as there are at the end."""
+        """Number of the trial, from 0."""
         return len(self._rows)
 
     @property
     def trial(self) -> Trial:
-        """The one that is next or under way."""
+        """Present or next trial."""
         return self.trials[min(self.number, len(self.trials) - 1)]
 
     @property
     def task(self) -> Task:
-        """Of that trial."""
+        """Task of that trial."""
         return self.experiment.tasks[self.trial.task]
 
     @property
-    def shown(self) -> float:
-        """The level of the present interval."""
+    def present_level(self) -> float:
+        """Level of the present interval."""
         return self.level if self.trial.signal == self.interval else 0.0
 
     @property
-    def pressed(self) -> float:
-        """The contact force that the participant presses with, so far as it is known [N]."""
+    def expected_force(self) -> float:
+        """Median contact force so far [N]."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))
         return task.pressed if isinstance(task, ContactDetection) else 0.0
 
     def _new_trial(self) -> None:
-        self.interval, self._felt, self.level = 1, [Felt(), Felt()], 0.0
-        self.prepared += 1
+        self.interval, self._results, self.level = 1, [IntervalResult(), IntervalResult()], 0.0
+        self.prepared_intervals += 1
         task, trial = self.task, self.trial
         if not isinstance(task, PegInSlot):
             psi = self._psi[trial.task, trial.condition]
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """The participant goes on."""
+        """Continue after a page of text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
             self.phase = READY
         elif self.phase == READY:
             self.phase, self.again = INTERVAL, False
-        elif self.phase == TOLD:
-            self._go_on()
+        elif self.phase == FEEDBACK:
+            self._next_trial()
 
-    def finished(self, felt: Felt) -> None:
-        """The present interval is over."""
-        self._felt[self.interval - 1] = felt
-        if not felt.valid:
+    def finish_interval(self, result: IntervalResult) -> None:
+        """End the present interval."""
+        self._results[self.interval - 1] = result
+        if not result.valid:
             self._new_trial()
             self.phase, self.again = READY, True
         elif self.trial.signal == 0:
-            self._over(0, felt.done, felt.time_s)
+            self._finish_trial(0, result.done, result.time_s)
         elif self.interval == 1:
             self.interval, self.phase = 2, GAP
-            self.prepared += 1
+            self.prepared_intervals += 1
         else:
             self.phase = ANSWER
 
-    def second(self) -> None:
-        """The gap between the intervals is over."""
+    def start_second_interval(self) -> None:
+        """Start the second interval."""
         self.phase = INTERVAL
 
-    def interrupted(self) -> None:
-        """Whoever drives has gone: the trial begins again."""
+    def restart_trial(self) -> None:
+        """Restart the trial after the driver has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """The participant says which interval it was; at any other time it says nothing."""
+        """Store the chosen interval in the phase `ANSWER`."""
         if self.phase == ANSWER:
-            self._over(interval, interval == self.trial.signal, time_s)
+            self._finish_trial(interval, interval == self.trial.signal, time_s)
 
-    def _over(self, answer: int, correct: bool, time_s: float) -> None:
-        trial, felt = self.trial, self._felt
+    def _finish_trial(self, answer: int, correct: bool, time_s: float) -> None:
+        trial, results = self.trial, self._results
         row = Row(
             trial=self.number,
             task=type(self.task).__name__,
             condition=self.experiment.conditions[trial.condition].name,
             practice=int(trial.practice),
-            level=max(f.level for f in felt),
+            level=max(f.level for f in results),
             signal=trial.signal,
             answer=answer,
             correct=int(correct),
             time_s=round(time_s, 4),
-            force_N=max(f.force_N for f in felt),
-            lost_s=sum(f.lost_s for f in felt),
+            force_N=max(f.force_N for f in results),
+            lost_s=sum(f.lost_s for f in results),
         )
         self._store.write(self.participant, [*self._rows, row])
         self._rows.append(row)
-        self._learn(trial, row)
+        self._update_estimates(trial, row)
         self.said = bool(correct)
         if trial.practice:
-            self.phase = TOLD
+            self.phase = FEEDBACK
         else:
-            self._go_on()
+            self._next_trial()
 
-    def _learn(self, trial: Trial, row: Row) -> None:
+    def _update_estimates(self, trial: Trial, row: Row) -> None:
         if (trial.task, trial.condition) not in self._psi:
             return
         if isinstance(self.experiment.tasks[trial.task], ContactDetection):
             self._pressed.append(row.force_N)
         if not trial.practice:
-            self._psi[trial.task, trial.condition].answered(row.level, bool(row.correct))
+            self._psi[trial.task, trial.condition].update(row.level, bool(row.correct))
 
-    def _go_on(self) -> None:
-        """To what comes after a trial."""
+    def _next_trial(self) -> None:
         before = self.trials[self.number - 1]
         if self.number == len(self.trials):
             self.phase = END
@@ -236,8 +227,8 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """What the participant may know."""
-        number = self.number - (self.phase == TOLD)  # of a trial that is over
+        """Return the state for the participant."""
+        number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {
             "phase": self.phase,
@@ -248,6 +239,6 @@ class Procedure:
             "practice": trial.practice,
             "interval": self.interval,
             "again": self.again,
-            "said": self.said if self.phase == TOLD else None,
+            "said": self.said if self.phase == FEEDBACK else None,
             "consent": self.experiment.consent if self.phase == CONSENT else "",
         }

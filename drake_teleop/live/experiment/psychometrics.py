@@ -1,21 +1,16 @@
-"""Thresholds from answers: which stimulus to show next, and what the answers say. Without Drake.
+"""Thresholds from two-interval forced-choice answers, and the next level to present.
 
-A participant says in which of two intervals a stimulus was (two-interval forced choice), so that
-how ready somebody is to say "yes" does not matter. Of a stimulus of level x
+    d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2)
 
-    d'(x) = (x / threshold)^slope,    P(correct) = lapse / 2 + (1 - lapse) Phi(d' / sqrt 2),
-
-so the threshold is where d' is 1, and 76 % of the answers are right if nobody lapses. (Power law of
-d': Foley and Legge, Vision Research 21, 1981. Phi: Green and Swets, Signal detection theory and
-psychophysics, 1966.) All three parameters are unknown. `Psi` has their joint probability on a grid,
-and asks for the level whose answer will tell most about the threshold: the psi method of Kontsevich
-and Tyler, Vision Research 39, 1999, with the others marginalised (Prins, J. Vision 13(7), 2013).
+Power law: Foley and Legge, Vision Research 21, 1981. Phi: Green and Swets, Signal detection
+theory and psychophysics, 1966. Psi method: Kontsevich and Tyler, Vision Research 39, 1999; with
+marginalised slope and lapse: Prins, J. Vision 13(7), 2013.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,29 +18,23 @@ from scipy.special import ndtr, xlogy
 
 Array = NDArray[np.float64]
 
-#: What is thought possible beforehand, all of it as likely: log-uniform thresholds and slopes.
+#: Grid of the uniform prior; thresholds and slopes are uniform in the logarithm.
 _THRESHOLDS = 81
 _SLOPES = np.geomspace(0.7, 3.0, 7)
 _LAPSES = np.array([0.0, 0.02, 0.04, 0.08])
-# Thresholds may lie so much beyond the levels that can be shown.
-_BEYOND = 2.0
+# Factor of the range of thresholds beyond the range of levels.
+_RANGE_FACTOR = 2.0
 _LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """P(correct) as above; the arguments broadcast. Level and threshold in one unit, level >= 0."""
+    """Return P(correct) for levels >= 0."""
     d = (level / threshold) ** slope
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A quantity with its 95 % interval.
-
-    Attributes:
-        value: the median.
-        low, high: where 2.5 % and 97.5 % of the probability lie below.
-    """
+class Estimate(NamedTuple):
+    """Median, and 2.5 % and 97.5 % quantiles."""
 
     value: float
     low: float
@@ -53,36 +42,28 @@ class Estimate:
 
 
 class Psi:
-    """What is known of one participant in one condition.
-
-    Args:
-        low, high: the range of levels that can be shown, both > 0.
-    """
+    """Posterior of threshold, slope and lapse on a grid, for levels `low` > 0 to `high`."""
 
     def __init__(self, low: float, high: float) -> None:
         self.levels = np.geomspace(low, high, _LEVELS)
-        self._thresholds = np.geomspace(low / _BEYOND, high * _BEYOND, _THRESHOLDS)
+        self._thresholds = np.geomspace(low / _RANGE_FACTOR, high * _RANGE_FACTOR, _THRESHOLDS)
         self._grid = tuple(
             np.meshgrid(self._thresholds, _SLOPES, _LAPSES, indexing="ij", sparse=True)
         )
         shape = (_THRESHOLDS, len(_SLOPES), len(_LAPSES))
-        self._likely = np.full(shape, 1.0 / math.prod(shape))
-        # (levels, thresholds, the rest): P(correct) at all that may be asked.
-        self._correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
-        self._correct = self._correct.reshape(_LEVELS, _THRESHOLDS, -1)
+        self._posterior = np.full(shape, 1.0 / math.prod(shape))
+        # P(correct) as (levels, thresholds, slopes and lapses).
+        self._p_correct = np.stack([self._probability(x).reshape(shape) for x in self.levels])
+        self._p_correct = self._p_correct.reshape(_LEVELS, _THRESHOLDS, -1)
 
     def _probability(self, level: float) -> Array:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
-        """The level whose answer leaves the least expected entropy of the threshold.
-
-        It is the same as the largest mutual information of answer and threshold, as entropy now is
-        the same for all levels.
-        """
-        likely = self._likely.reshape(_THRESHOLDS, -1)
-        right = np.einsum("ltk,tk->lt", self._correct, likely)  # P(correct and threshold)
-        wrong = likely.sum(axis=1) - right
+        """Return the level with the least expected entropy of the threshold."""
+        posterior = self._posterior.reshape(_THRESHOLDS, -1)
+        right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
+        wrong = posterior.sum(axis=1) - right
         lost = np.zeros(_LEVELS)
         for joint in (right, wrong):
             lost -= xlogy(joint, joint).sum(axis=1)
@@ -90,16 +71,16 @@ class Psi:
             lost += xlogy(total, total)
         return float(self.levels[np.argmin(lost)])
 
-    def answered(self, level: float, correct: bool) -> None:
-        """Takes an answer to any level >= 0 into account, also one that was not asked for."""
+    def update(self, level: float, correct: bool) -> None:
+        """Update the posterior with an answer to any level >= 0."""
         p = self._probability(level)
-        self._likely = self._likely * (p if correct else 1.0 - p)
-        self._likely /= self._likely.sum()
+        self._posterior = self._posterior * (p if correct else 1.0 - p)
+        self._posterior /= self._posterior.sum()
 
     def threshold(self) -> Estimate:
-        """Where d' is 1, in the unit of the levels."""
-        share = self._likely.sum(axis=(1, 2))
-        # The probability of a node is spread over its cell, evenly in the logarithm.
+        """Return the threshold."""
+        share = self._posterior.sum(axis=(1, 2))
+        # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
         edges = math.log(self._thresholds[0]) + step * (np.arange(_THRESHOLDS + 1) - 0.5)
         below = np.concatenate([[0.0], np.cumsum(share)])
@@ -107,9 +88,9 @@ class Psi:
         return Estimate(float(value), float(low), float(high))
 
     def d_prime(self, level: float) -> Estimate:
-        """d' at a level."""
+        """Return d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
-        values, share = d.ravel(), self._likely.sum(axis=2).ravel()
+        values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)
         below = np.cumsum(share[order]) - 0.5 * share[order]
         found = np.interp([0.5, 0.025, 0.975], below, values[order])

@@ -1,10 +1,8 @@
-"""What came out of an experiment: thresholds, d', times and forces with 95 % intervals.
+"""Thresholds, d', times and forces of an experiment with 95 % intervals.
 
-`results.csv` has a row for each quantity of each participant, task and condition, and one over all
-participants from two on. Of one participant a threshold and d' are medians of what is probable
-after its answers (`Psi`), times and forces geometric means over the trials with t intervals of the
-logarithm, a share Wilson's. Over participants it is the geometric mean with the t interval of the
-logarithm, of a share the mean with the t interval. d' is that at the middle of the levels.
+Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
+forces geometric means with t intervals of the logarithm. Participant 0 is the (geometric) mean of
+all, with its t interval.
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """A row of the table; participant 0 stands for all of them."""
+    """Row of the table; participant 0 stands for all."""
 
     task: str
     condition: str
@@ -50,7 +48,7 @@ class Result(NamedTuple):
 
 
 def results(experiment: Experiment, store: Store) -> list[Result]:
-    """All rows of the table; what nothing is known of is left out."""
+    """Return all rows of the table."""
     found = []
     known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
     for task in experiment.tasks:
@@ -59,36 +57,31 @@ def results(experiment: Experiment, store: Store) -> list[Result]:
             each: dict[str, list[Result]] = {}
             for n, rows in known.items():
                 done = [r for r in rows if (r.task, r.condition) == (kind, condition.name)]
-                for quantity, estimate in _of_one(task, done).items():
-                    values = (estimate.value, estimate.low, estimate.high)
-                    result = Result(kind, condition.name, n, len(done), quantity, *values)
+                for quantity, estimate in _participant_estimates(task, done).items():
+                    result = Result(kind, condition.name, n, len(done), quantity, *estimate)
                     each.setdefault(quantity, []).append(result)
             for quantity, one in each.items():
                 found += one
                 if len(one) > 1:
-                    over = _over_all([r.value for r in one], share=quantity == _SHARE)
+                    over = _mean_with_interval([r.value for r in one], share=quantity == _SHARE)
                     trials = sum(r.trials for r in one)
-                    found.append(Result(kind, condition.name, 0, trials, quantity, *_triple(over)))
+                    found.append(Result(kind, condition.name, 0, trials, quantity, *over))
     return found
 
 
-def _triple(estimate: Estimate) -> tuple[float, float, float]:
-    return estimate.value, estimate.low, estimate.high
-
-
-def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
+def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
     if not rows:
         return {}
     if isinstance(task, PegInSlot):
         done = [row for row in rows if row.correct]
         found = {_SHARE: _wilson(len(done), len(rows))}
         if done:
-            found["time to the floor [s]"] = _over_all([row.time_s for row in done])
-            found["largest contact force [N]"] = _over_all([row.force_N for row in done])
+            found["time to the floor [s]"] = _mean_with_interval([row.time_s for row in done])
+            found["largest contact force [N]"] = _mean_with_interval([row.force_N for row in done])
         return found
     psi = Psi(task.low, task.high)
     for row in rows:
-        psi.answered(row.level, bool(row.correct))
+        psi.update(row.level, bool(row.correct))
     middle = math.sqrt(task.low * task.high)
     mass = isinstance(task, ApparentMass)
     unit = "kg" if mass else "N"
@@ -96,8 +89,8 @@ def _of_one(task: Task, rows: Sequence[Row]) -> dict[str, Estimate]:
     return {name: psi.threshold(), f"d' at {middle:.3g} {unit}": psi.d_prime(middle)}
 
 
-def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
-    """The (geometric) mean with its t interval; of one value the interval is not known."""
+def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:
+    """Return the (geometric) mean with its t interval, nan for one value."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
@@ -109,7 +102,7 @@ def _over_all(values: Sequence[float], *, share: bool = False) -> Estimate:
 
 
 def _wilson(successes: int, n: int) -> Estimate:
-    """A share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
+    """Return a share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
     p, z2 = successes / n, _Z**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))
@@ -117,7 +110,7 @@ def _wilson(successes: int, n: int) -> Estimate:
 
 
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
-    """Writes trials.csv, results.csv and results.png into the folder; returns the table."""
+    """Write trials.csv, results.csv and results.png; return the table."""
     import polars as pl
 
     found = results(experiment, store)
@@ -137,7 +130,6 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
 
 
 def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
-    """A panel for each quantity: small points for participants, a large one for all of them."""
     from drake_teleop.common.style import Picture, house_style
 
     shown = [quantity for quantity in _SHOWN if any(r.quantity == quantity for r in found)]
@@ -177,7 +169,7 @@ def _draw(axes: Axes, names: list[str], found: list[Result]) -> None:
             axes.plot([r.low, r.high], [place, place], color=colour, linewidth=thick)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
-    # There may be no power of ten among what is shown.
+    # The range may contain no power of ten.
     least, most = axes.get_xlim()
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 3, 4, 6) if most < 30 * least else (3,)))
     axes.xaxis.set_minor_formatter("{x:g}")

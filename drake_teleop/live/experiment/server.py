@@ -1,4 +1,4 @@
-"""The page of an experiment: that of `drive`, whose cockpit gives way to what is asked."""
+"""Page of an experiment."""
 
 from __future__ import annotations
 
@@ -14,21 +14,14 @@ from drake_teleop.live.experiment.guided import Guided
 from drake_teleop.live.experiment.procedure import Procedure
 from drake_teleop.live.experiment.simulated import all_apparatus
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.external_master import with_device
 from drake_teleop.live.page_scene import PageScene
-from drake_teleop.live.server import LiveDrive, waits, warm_up
+from drake_teleop.live.scenarios import with_device
+from drake_teleop.live.server import LiveDrive, start_condition, warm_up
 from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """An experiment whose page is open to one participant.
-
-    Args:
-        experiment, scenarios: as `LoadExperiment` gives them.
-        store: of the trials.
-        participant: whose turn it is.
-        port, device: as of `drive`.
-    """
+    """Experiment whose page is open to one participant."""
 
     def __init__(
         self,
@@ -47,7 +40,6 @@ class ExperimentDrive(LiveDrive):
         super().__init__(scenarios[0], None, port, device)
 
     def _prepare(self, scenario: Scenario, device: bool) -> None:
-        """Make a 3D scene for each task. Arrows would show which force is rendered."""
         for task in map(str, range(len(self._scenarios))):
             seen = self._stations[int(task), 0].scenario
             self._views[task] = PageScene(task, seen, forces=False)
@@ -61,7 +53,7 @@ class ExperimentDrive(LiveDrive):
         return Guided(*setup, time.perf_counter(), link)
 
     def done(self) -> tuple[int, int]:
-        """Trials that the participant has done, and all."""
+        """Return the numbers of finished and of all trials."""
         return self._procedure.number, len(self._procedure.trials)
 
     def _page(self) -> str:
@@ -83,18 +75,17 @@ def serve_experiment(
 ) -> None:
     """Serve the page until Ctrl-C or SIGTERM.
 
-    Args:
-        experiment, scenarios, store, participant, port, device: as of `ExperimentDrive`.
-        browser: whether to open the page.
-
     Raises:
-        DrakeTeleopError: with what had stopped the drive.
-        KeyboardInterrupt: if the participant has not done all trials.
+        DrakeTeleopError: why the drive had stopped.
+        KeyboardInterrupt: if trials are left.
     """
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)
     if browser:
         webbrowser.open(live.url)
-    print(f"participant {participant} at {live.url}\n{waits(device)}; Ctrl-C ends it", flush=True)
+    print(
+        f"participant {participant} at {live.url}\n{start_condition(device)}; Ctrl-C ends it",
+        flush=True,
+    )
     reason, (done, trials) = live.until_signal(), live.done()
     what = f"participant {participant} has done {done} of {trials} trials"
     if live.ended:

@@ -1,10 +1,8 @@
-"""Participants that are simulated: the station runs, and an observer with noise compares.
+"""Simulated participants: an observer with noise compares rendered forces.
 
-In each interval the hand is led by a script: down to what there is to touch and up again, or to and
-fro. The response to an interval is the largest change of the force that the station displayed, plus
-normal noise whose standard deviation grows with it; the interval of the larger one is the answer.
-The peg goes into the slot by the simulated operator of `docs/operator.md`. A participant of its own
-has its own noise, and nothing else: none learns or tires.
+A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
+larger response, the largest change of the rendered force plus normal noise. The simulated operator
+inserts the peg.
 """
 
 from __future__ import annotations
@@ -14,16 +12,23 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drake_teleop.live.experiment.apparatus import Apparatus, Rows, load_of, make_apparatus
+from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog, load_for, make_apparatus
 from drake_teleop.live.experiment.design import (
     ApparentMass,
     Experiment,
     PegInSlot,
     SimulatedParticipant,
 )
-from drake_teleop.live.experiment.procedure import ANSWER, END, GAP, INTERVAL, Felt, Procedure
+from drake_teleop.live.experiment.procedure import (
+    ANSWER,
+    END,
+    GAP,
+    INTERVAL,
+    IntervalResult,
+    Procedure,
+)
 from drake_teleop.live.experiment.store import Store
-from drake_teleop.live.inputs import SLICE_MS
+from drake_teleop.live.inputs import LENGTH, SLICE_MS
 from drake_teleop.live.session import Session
 from drake_teleop.station.operator.task import Insert
 from drake_teleop.station.scenario import Scenario, replace
@@ -31,26 +36,25 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.station import MakeTeleopStation
 from drake_teleop.station.task_measures import contact_force, task_measures
 
-# The hand moves from here on [s]; what it feels in the tenth of a second before is rest.
-_BEGINS = 0.4
-_UNIT = 1e-5  # m, of the inputs
-_NEWS_MS = 200
+# Start of the hand's motion [s].
+_MOTION_START_S = 0.4
+_ROWS_PERIOD_MS = 200
 
 
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """The station of each task under each condition; loads are identified if they are not known."""
-    found = {}
+    """Return the station of each task and condition."""
+    stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
-        load = load_of(scenario)
+        load = load_for(scenario)
         for c, condition in enumerate(experiment.conditions):
-            found[t, c] = make_apparatus(task, condition, scenario, load)
-    return found
+            stations[t, c] = make_apparatus(task, condition, scenario, load)
+    return stations
 
 
 def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """The scenario with noise of its own for each interval of each trial of each participant."""
+    """Return the scenario with a seed for this interval."""
     number = 2 * procedure.number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -64,43 +68,34 @@ def take_part(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """A simulated participant does what it has not done.
-
-    Args:
-        experiment: with its `simulated`.
-        scenarios, stations: as of `all_apparatus`.
-        store: where trials go to.
-        participant: its number.
-        progress: is told the trials that are done, and all.
-    """
+    """Run the remaining trials; `progress` receives finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END:
         if procedure.phase == INTERVAL:
             apparatus = stations[procedure.trial.task, procedure.trial.condition]
             if isinstance(procedure.task, PegInSlot):
-                felt = _insert(apparatus, scenarios[procedure.trial.task], procedure)
+                result = _run_insertion(apparatus, scenarios[procedure.trial.task], procedure)
             else:
-                felt, response = _interval(apparatus, procedure)
+                result, response = _run_interval(apparatus, procedure)
                 responses[procedure.interval - 1] = response
-            procedure.finished(felt)
+            procedure.finish_interval(result)
         elif procedure.phase == GAP:
-            procedure.second()
+            procedure.start_second_interval()
         elif procedure.phase == ANSWER:
             rng = np.random.default_rng([experiment.seed, participant, procedure.number, 3])
-            procedure.answer(compared(observer, responses, rng), 0.5)
+            procedure.answer(compare_responses(observer, responses, rng), 0.5)
             progress(procedure.number, len(procedure.trials))
         else:
             procedure.go()
 
 
-def compared(
+def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """The interval, 1 or 2, that the observer thinks was stronger.
+    """Return the interval, 1 or 2, with the larger noisy response.
 
-    Of responses r1 and r2 with deviations s1 and s2, P(r1 + s1 n1 > r2 + s2 n2) is that of
-    d' = (r1 - r2) / s where both deviations are s: a difference of `noise` at rest is d' = 1.
+    A difference of `noise` at rest is d' = 1.
     """
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
@@ -111,33 +106,33 @@ def compared(
     return 1 if noisy[0] > noisy[1] else 2
 
 
-def _interval(apparatus: Apparatus, procedure: Procedure) -> tuple[Felt, float]:
-    """What it was, and the response of an observer without noise [N]."""
+def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
+    """Return the result, and the response without noise [N]."""
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)
-    stimulus = apparatus.inputs(procedure.shown, procedure.pressed)
-    rows = Rows(task, apparatus.scenario, None)
-    sways, length = isinstance(task, ApparentMass), task.interval - _BEGINS
+    stimulus = apparatus.inputs(procedure.present_level, procedure.expected_force)
+    rows = IntervalLog(task, apparatus.scenario, None)
+    moves_sideways, length = isinstance(task, ApparentMass), task.interval - _MOTION_START_S
     while session.ms < 1e3 * task.interval:
-        t = max(1e-3 * session.ms - _BEGINS, 0.0)
-        if sways:
+        t = max(1e-3 * session.ms - _MOTION_START_S, 0.0)
+        if moves_sideways:
             ramp = min(t, 1.0)
-            place = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
+            displacement = {"x": observer.sway * ramp * math.sin(2.0 * math.pi * t)}
         else:
-            place = {"z": -observer.reach * 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))}
-        hand = {name: value / _UNIT for name, value in place.items()}
+            share = 0.5 * (1.0 - math.cos(2.0 * math.pi * t / length))
+            displacement = {"z": -observer.reach * share}
+        hand = {name: value / LENGTH for name, value in displacement.items()}
         session.apply(session.inputs.changed(stimulus | hand))
         session.advance(SLICE_MS)
-        if session.ms % _NEWS_MS == 0:
-            rows.add(session.news())
-    rows.add(session.news())
+        if session.ms % _ROWS_PERIOD_MS == 0:
+            rows.add(session.new_rows())
+    rows.add(session.new_rows())
     session.close()
-    return apparatus.felt(procedure.shown, stimulus, rows), rows.change(_BEGINS)
+    return apparatus.result(procedure.present_level, stimulus, rows), rows.change(_MOTION_START_S)
 
 
-def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
-    """The simulated operator brings the peg into the slot."""
+def _run_insertion(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> IntervalResult:
     task, condition = apparatus.task, apparatus.condition
     assert isinstance(task, PegInSlot) and isinstance(own.operator.task, Insert)
     scenario = replace(
@@ -154,7 +149,7 @@ def _insert(apparatus: Apparatus, own: Scenario, procedure: Procedure) -> Felt:
     estimate = None if apparatus.load is None else apparatus.load.estimate
     station = MakeTeleopStation(scenario, load_estimate=estimate)
     result = simulate(station, scenario.simulation, progress=False)
-    found = task_measures(result, scenario)
-    done = found["success"] > 0.0
-    taken = found["task_time_s"] if done else task.timeout
-    return Felt(force_N=float(contact_force(result).max()), done=done, time_s=taken)
+    measures = task_measures(result, scenario)
+    done = measures["success"] > 0.0
+    time_s = measures["task_time_s"] if done else task.timeout
+    return IntervalResult(force_N=float(contact_force(result).max()), done=done, time_s=time_s)

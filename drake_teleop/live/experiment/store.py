@@ -1,8 +1,4 @@
-"""The trials of an experiment on disk: one file for each participant, complete after each trial.
-
-A participant is a number. `participants/03.csv` has a row for each trial that is over. It is
-written anew after each, complete or not at all: a kill loses the trial that was under way.
-"""
+"""Trials of an experiment on disk: `participants/03.csv`, complete after each trial."""
 
 from __future__ import annotations
 
@@ -20,25 +16,23 @@ from drake_teleop.common.writing import make_folder, write_table
 from drake_teleop.lab.studies.store import claimed
 from drake_teleop.live.experiment.design import Experiment
 
-#: Participants have numbers up to this.
-MOST = 9999
+#: Largest number of a participant.
+MAX_PARTICIPANT = 9999
 
 
 @dataclass(frozen=True)
 class Row:
-    """A trial that is over.
+    """A finished trial.
 
     Attributes:
-        trial: its number, from 0.
-        task, condition: by name.
-        practice: 1 if it does not count.
-        level: of the stimulus, as it was: contact force at the tool [N], mass at the hand [kg].
-        signal: the interval that had it, 1 or 2; 0 where there are none.
-        answer: the interval that the participant said.
-        correct: 1 if right; of peg in slot, 1 if the tool got to the floor.
-        time_s: until the answer, from the end of the intervals; of peg in slot, to the floor.
+        practice: 1 if it is not evaluated.
+        level: measured stimulus: contact force at the tool [N], mass at the hand [kg].
+        signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
+        answer: interval of the answer.
+        correct: 1 if right, or if the tool reached the floor.
+        time_s: of the answer, or until the floor.
         force_N: largest contact force at the tool.
-        lost_s: that the machine was too slow by.
+        lost_s: simulation time behind the clock.
     """
 
     trial: int
@@ -62,33 +56,29 @@ _SCHEMA: dict[str, type[pl.DataType]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """The trials in a folder.
-
-    Args:
-        folder: of the results.
-    """
+    """Trials in a folder."""
 
     folder: Path
 
     def path(self, participant: int) -> Path:
-        """Of a participant's trials."""
+        """Return the file of a participant."""
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
-        """Those that have done a trial, in order."""
+        """Return the participants with a trial."""
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
     def rows(self, participant: int) -> list[Row]:
-        """A participant's trials, in order.
+        """Return a participant's trials.
 
         Raises:
-            DrakeTeleopError: naming a file that is damaged.
+            DrakeTeleopError: with a damaged file.
         """
         path = self.path(participant)
         if not path.exists():
             return []
-        remedy = "remove it; the participant then begins again"
+        remedy = "remove it; the participant then starts again"
         with reading(path, remedy):
             table = pl.read_csv(path, schema=_SCHEMA)
         rows = [Row(**row) for row in table.iter_rows(named=True)]
@@ -100,30 +90,27 @@ class Store:
         return rows
 
     def write(self, participant: int, rows: list[Row]) -> None:
-        """All trials of a participant, in place of what was there."""
+        """Replace all trials of a participant."""
         make_folder(self.path(participant).parent)
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
         write_table(self.path(participant), table)
 
     def table(self) -> pl.DataFrame:
-        """All trials, with the column participant."""
-        parts = [
-            pl.DataFrame(
-                [dataclasses.asdict(row) for row in self.rows(n)], schema=_SCHEMA
-            ).insert_column(0, pl.Series("participant", [n]).new_from_index(0, len(self.rows(n))))
+        """Return all trials, with the column participant."""
+        rows = [
+            {"participant": n} | dataclasses.asdict(row)
             for n in self.participants()
+            for row in self.rows(n)
         ]
-        return (
-            pl.concat(parts) if parts else pl.DataFrame(schema={"participant": pl.Int64, **_SCHEMA})
-        )
+        return pl.DataFrame(rows, schema={"participant": pl.Int64, **_SCHEMA})
 
 
 @contextmanager
 def open_results(folder: Path, experiment: Experiment) -> Iterator[Store]:
-    """The results in a folder, for this process alone, new or with the trials that it has.
+    """Yield the results in a folder, locked for this process.
 
     Raises:
-        DrakeTeleopError: if the folder holds those of another experiment, or is in use.
+        DrakeTeleopError: if the folder contains another experiment, or is in use.
     """
     make_folder(folder)
     identity = {"experiment": dataclasses.asdict(experiment), "version": __version__}

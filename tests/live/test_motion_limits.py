@@ -1,4 +1,4 @@
-"""Inputs move an arm no faster in slow motion than in real time."""
+"""Limits and rates of inputs are independent of the speed of the simulation."""
 
 from __future__ import annotations
 
@@ -10,47 +10,46 @@ import pytest
 
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.device_packets import DeviceState, packed_state
-from drake_teleop.live.external_master import with_device
-from drake_teleop.live.following import Follower, Steering
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.live.live import Live
+from drake_teleop.live.motion_limits import MotionLimiter, RateInputs
+from drake_teleop.live.scenarios import with_device
 from drake_teleop.station.scenario import Scenario, replace
 
 NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def place(inputs: Inputs) -> np.ndarray:
-    """[m, rad] at the hand."""
+def pose_of(inputs: Inputs) -> np.ndarray:
+    """Return [m, rad] at the hand."""
     return np.array([getattr(inputs, name) for name in NAMES]) * np.repeat([1e-5, 1e-4], 3)
 
 
-def at(values: np.ndarray) -> Inputs:
-    """Of [m, rad]."""
+def inputs_of(values: np.ndarray) -> Inputs:
+    """Return the inputs of [m, rad]."""
     units = values / np.repeat([1e-5, 1e-4], 3)
     return Inputs().changed(dict(zip(NAMES, units.tolist(), strict=True)))
 
 
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_a_motion_within_the_limits_passes_unchanged(slice_s, device):
-    """Up to 13 m/s^2 and 50 rad/s^2; steps of 10 um in 2 ms are 2.5 m/s^2."""
-    follower = Follower(slice_s, (1.0, 1.0), device=device)
+    limiter = MotionLimiter(slice_s, (1.0, 1.0), device=device)
     for k in range(400):
         t = k * slice_s
         begun = min(t / 0.2, 1.0)
         ramp = begun**2 * (3.0 - 2.0 * begun)
-        wanted = at(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
-        assert follower.step(wanted, free=False) == wanted
+        target = inputs_of(ramp * np.array([0.02, 0, -0.01, 0.1, -0.1, 0]) * math.sin(20.0 * t))
+        assert limiter.step(target, free=False) == target
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 4.0])
 @pytest.mark.parametrize(("slice_s", "device"), [(2e-3, True), (5e-3, False)])
 def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, device, scale):
-    follower = Follower(slice_s, (scale, scale), device=device)
-    rng, wanted, path = np.random.default_rng(0), Inputs(), []
+    limiter = MotionLimiter(slice_s, (scale, scale), device=device)
+    rng, target, path = np.random.default_rng(0), Inputs(), []
     for k in range(4000):
         if k % 40 == 0 and k < 3000:
-            wanted = at(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # and out of the box
-        path.append(place(follower.step(wanted, free=False)))
+            target = inputs_of(rng.uniform(-0.16, 0.16, 6) * [1, 1, 1, 7, 7, 7])  # partly outside
+        path.append(pose_of(limiter.step(target, free=False)))
     tool = scale * np.array(path)
     speed = np.diff(tool, axis=0) / slice_s
     rounding = 2.0 * scale * 1e-5 / slice_s
@@ -59,37 +58,36 @@ def test_speed_and_acceleration_of_the_tool_are_limited_and_it_arrives(slice_s, 
         if device:
             changes = np.abs(np.diff(speed[:, part], axis=0))
             assert changes.max() < change * slice_s + 2.0 * unit * rounding
-    np.testing.assert_array_equal(path[-1], place(wanted))
+    np.testing.assert_array_equal(path[-1], pose_of(target))
 
 
-def test_it_stops_without_overshoot():
-    follower, path = Follower(2e-3, (1.0, 1.0), device=True), []
+def test_limited_motion_stops_without_overshoot():
+    limiter, path = MotionLimiter(2e-3, (1.0, 1.0), device=True), []
     for _ in range(300):
-        path.append(follower.step(at(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
+        path.append(limiter.step(inputs_of(np.array([0.05, 0, 0, 0, 0, 0.5])), free=False))
     assert max(each.x for each in path) <= 5000 * 1.01 and path[-1].x == 5000
     assert max(each.rz for each in path) <= 5000 * 1.01 and path[-1].rz == 5000
     assert path[60].x > 2500  # as soon as 20 m/s^2 allow
 
 
-def test_what_does_not_move_the_arm_may_jump():
-    follower, far = Follower(2e-3, (1.0, 1.0), device=True), at(np.full(6, 0.1))
-    assert follower.step(far, free=True) == far
-    assert follower.step(far, free=False) == far
+def test_free_target_may_jump():
+    limiter, target = MotionLimiter(2e-3, (1.0, 1.0), device=True), inputs_of(np.full(6, 0.1))
+    assert limiter.step(target, free=True) == target
+    assert limiter.step(target, free=False) == target
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("slow", [1, 10])
 @pytest.mark.parametrize("rates", [{"x": 12_000, "rz": 5000}, {"z": -777.7}, {"y": 2400, "x": 0}])
-def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load, slow, rates):
-    """Whatever the clock does meanwhile, as long as the page repeats them."""
+def test_keys_move_the_hand_equally_per_simulated_second(scenario, load, slow, rates):
     now, live = 0.0, Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, now)
-    live.hear(1, json.dumps({"slow": slow, "rates": rates}), now)
+    live.handle_message(1, json.dumps({"slow": slow, "rates": rates}), now)
     while live.ms < 300:
         now += max(live.wait(now), 1e-3)
         live.tick(lambda now=now: now)
-        live.hear(1, json.dumps({"rates": rates}), now)
-    live.hear(1, json.dumps({"rates": {}}), now)
+        live.handle_message(1, json.dumps({"rates": rates}), now)
+    live.handle_message(1, json.dumps({"rates": {}}), now)
     found = live.frame()["inputs"]
     for name in NAMES:
         assert found[name] == pytest.approx(1e-3 * live.ms * rates.get(name, 0), abs=0.51)
@@ -97,8 +95,8 @@ def test_keys_move_the_hand_by_the_same_way_in_a_simulated_second(scenario, load
     assert live.frame()["inputs"] == found
 
 
-def test_what_a_page_does_not_repeat_ends_after_a_second():
-    steering, inputs = Steering(), Inputs()
+def test_rate_ends_one_second_after_its_last_repetition():
+    steering, inputs = RateInputs(), Inputs()
     inputs = steering.begin({"x": 1000.0, "sigma": 9.0, "held": 1.0}, inputs, 0.0)
     for k in range(400):
         inputs = steering.step(inputs, 5e-3, 5e-3 * k)
@@ -112,15 +110,15 @@ def test_a_target_that_is_set_ends_a_rate(scenario, load):
     live = Live(scenario, load, None, lambda rows: {}, 0.0)
     live.join(1, 0.0)
     for text in ({"rates": {"x": 5000}}, {"set": {"x": 300}}):
-        live.hear(1, json.dumps(text), 0.0)
+        live.handle_message(1, json.dumps(text), 0.0)
         for _ in range(4):
-            live._slice(0.0)
+            live._simulate_slice(0.0)
     assert live.frame()["inputs"]["x"] == 300
 
 
 @pytest.fixture
 def noisy(scenario) -> Scenario:
-    """With a sensor that saturates; the leaf is where nothing touches it."""
+    """Return a scenario with a saturating sensor and a leaf out of reach."""
     sensor = {"wrist_sensor__ideal": False, "wrist_sensor__offset": [0.0] * 6}
     return replace(scenario, sheet_spring=None, **sensor)
 
@@ -128,19 +126,19 @@ def noisy(scenario) -> Scenario:
 @pytest.mark.slow
 @pytest.mark.parametrize(("slow", "jumps"), [(1, True), (5, True), (10, False), (20, True)])
 def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow, jumps):
-    """It moves by 60 mm at 1 Hz, in the time of its hand."""
-    now, felt = 0.0, []
+    """The mouse moves by 60 mm at 1 Hz of real time."""
+    now, rendered = 0.0, []
     live = Live(noisy, load, None, lambda rows: {}, now)
     live.join(1, now)
-    live.hear(1, json.dumps({"slow": slow}), now)
+    live.handle_message(1, json.dumps({"slow": slow}), now)
     while live.ms < 500:
         sine = math.sin(2.0 * math.pi * now)
-        far = 6000.0 * (math.copysign(1.0, sine) if jumps else sine)
-        live.hear(1, json.dumps({"set": {"x": far, "z": 0.5 * far}}), now)
+        target = 6000.0 * (math.copysign(1.0, sine) if jumps else sine)
+        live.handle_message(1, json.dumps({"set": {"x": target, "z": 0.5 * target}}), now)
         frame = live.tick(lambda now=now: now)
-        felt += [frame["f"][2][1]] if frame and "f" in frame else []
+        rendered += [frame["f"][2][1]] if frame and "f" in frame else []
         now += max(live.wait(now), 1e-3)
-    assert len(felt) > 20 and max(felt) < 0.5
+    assert len(rendered) > 20 and max(rendered) < 0.5
 
 
 @pytest.mark.slow
@@ -148,19 +146,19 @@ def test_a_mouse_renders_no_force_in_free_motion_at_any_speed(noisy, load, slow,
 def test_a_device_renders_no_force_in_free_motion_when_the_machine_is_slow(
     noisy, load, rate, burst
 ):
-    """It goes up and down by 45 mm and rests between; slices come in bursts."""
+    """The device moves up and down by 45 mm with rests; slices come in bursts."""
     link = DeviceLink("udp://127.0.0.1:0")
     live = Live(with_device(noisy), load, None, lambda rows: {}, 0.0, link)
-    felt, now, due, number = [], 0.0, 0.0, 0
+    rendered, now, due, number = [], 0.0, 0.0, 0
     while live.ms < 600:
         now, number = now + 1e-3, number + 1
         up = 0.045 * max(-1.0, min(3.0 * math.sin(2.0 * math.pi * now), 1.0))
         packet = packed_state(DeviceState(number, now, (up, 0.0, up)))
-        link._take(packet, ("127.0.0.1", 9), now)
+        link._handle_packet(packet, ("127.0.0.1", 9), now)
         if now >= due:
             for _ in range(burst):
-                live._slice(now)
+                live._simulate_slice(now)
             due += burst * 2e-3 / rate
-            felt.append(live.frame()["f"][2][1])
+            rendered.append(live.frame()["f"][2][1])
     live.close()
-    assert max(felt) < 0.5
+    assert max(rendered) < 0.5

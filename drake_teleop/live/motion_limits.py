@@ -1,8 +1,7 @@
-"""Inputs in simulated time: how fast keys and sticks move the hand, and how fast it may move.
+"""Rate inputs of keys and sticks, and motion limits, in simulated time.
 
-At 1/10 of real time a hand that moves by 0.3 m/s moves the simulated stylus by 3 m/s. Without a
-limit that saturates the wrist sensor, and forces are rendered where nothing is touched. A motion
-within the limits passes unchanged and without delay.
+In slow motion a hand could otherwise saturate the wrist sensor, and be rendered forces in free
+motion.
 """
 
 from __future__ import annotations
@@ -10,77 +9,68 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from drake_teleop.live.hand import BEHIND
+from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import ANGLE, LENGTH, RANGES, Inputs
 
-_REPEATED = 1.0  # s
-# The target is ahead of what moves evenly: the hand neither hangs back nor goes on after it [s].
-_LEAD = dict.fromkeys(("x", "y", "z"), BEHIND) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
-# Of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. The stylus of a page has
-# a smooth path to each target already; the position of a device is the path.
-_PLACE, _TURN = (0.8, 20.0), (8.0, 250.0)
+_RATE_TIMEOUT_S = 1.0  # s
+# Lead time of the target, which compensates the lag of the hand at constant speed [s].
+_LEAD_TIMES = dict.fromkeys(("x", "y", "z"), LEAD_TIME_S) | dict.fromkeys(("rx", "ry", "rz"), 0.0)
+# Limits of the tool along each axis [m/s, m/s^2], and about it [rad/s, rad/s^2]. Accelerations are
+# limited only for a device; the path of a page's hand is smooth.
+_TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
-class Steering:
-    """Moves the target at rates, of keys and sticks, per simulated second."""
+class RateInputs:
+    """Integrator of rates per simulated second."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
         self._at: dict[str, float] = {}
-        self._until = 0.0
+        self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Return the inputs at which other rates begin; they end 1 s after their last repetition.
-
-        Args:
-            rates: by input, per simulated second; others are 0.
-            inputs: that hold.
-            now: the clock [s].
-        """
+        """Return the inputs at new rates by name; rates end 1 s after their repetition."""
         if not self._rates:
-            self._at = {name: float(getattr(inputs, name)) for name in _LEAD}
-        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD}
-        self._until = now + _REPEATED
+            self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
+        self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
+        self._end_time = now + _RATE_TIMEOUT_S
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
         """Return the inputs of the next slice."""
         if not self._rates:
             return inputs
-        if now > self._until:
+        if now > self._end_time:
             return self.begin({}, inputs, now)
         values = dict(self._at)
         for name, rate in self._rates.items():
             low, high = RANGES[name]
             self._at[name] = min(max(self._at[name] + slice_s * rate, low), high)
-            values[name] = self._at[name] + _LEAD[name] * rate
+            values[name] = self._at[name] + _LEAD_TIMES[name] * rate
         return inputs.changed(values)
 
 
-class Follower:
-    """Follows the target of the inputs, coordinate by coordinate.
+class MotionLimiter:
+    """Limits of the target's speed, and for a device of its acceleration.
 
     Args:
-        slice_s: how often it steps [s].
-        scales: slave over master, of translation and of rotation.
-        device: whether accelerations are limited, too.
+        slice_s: period [s].
+        scales: slave over master, of translation and rotation.
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
         self._axes: dict[str, _Axis] = {}
-        limits = (("x", "y", "z"), LENGTH, _PLACE), (("rx", "ry", "rz"), ANGLE, _TURN)
+        limits = (
+            (("x", "y", "z"), LENGTH, _TRANSLATION_LIMITS),
+            (("rx", "ry", "rz"), ANGLE, _ROTATION_LIMITS),
+        )
         for (names, unit, (speed, acceleration)), scale in zip(limits, scales, strict=True):
             units = slice_s / (unit * max(scale, 1e-3))
             change = slice_s * units * acceleration if device else math.inf
             self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
 
     def step(self, inputs: Inputs, *, free: bool) -> Inputs:
-        """Return the inputs with the target of this slice.
-
-        Args:
-            inputs: that are requested.
-            free: whether the target may jump, because it does not move the arm.
-        """
+        """Return the limited inputs; with `free` the target may jump."""
         followed = {
             name: axis.step(getattr(inputs, name), free) for name, axis in self._axes.items()
         }
@@ -88,8 +78,6 @@ class Follower:
 
 
 class _Axis:
-    """One coordinate: its largest speed per slice, change of that, and range."""
-
     def __init__(self, speed: float, change: float, ends: tuple[float, float]) -> None:
         self._speed, self._change, self._ends = speed, change, ends
         self._at = self._target = self._moved = 0.0
@@ -109,7 +97,7 @@ class _Axis:
         return self._at
 
     def _braking(self, distance: float) -> float:
-        """The speed v from which it stops there: v + (v - change) + (v - 2 change) + ..."""
+        """Return v with v + (v - change) + (v - 2 change) + ... = distance."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

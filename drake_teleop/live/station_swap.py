@@ -1,7 +1,6 @@
-"""One station goes on where another one is: its states, by the names of its blocks.
+"""Transfer of a station's state to another station, by block names.
 
-What both have in the same form is handed on. The rest starts anew: what is random, and a channel
-with another network or method, which begins at the command of now with its clutch open.
+Random numbers, and a changed channel, start anew.
 """
 
 from __future__ import annotations
@@ -15,7 +14,9 @@ from pydrake.systems.framework import (
     BasicVector,
     Context,
     Diagram,
+    DiagramBuilder,
     DiscreteValues,
+    InputPort,
     LeafSystem,
     System,
 )
@@ -25,30 +26,33 @@ from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 
 Array = NDArray[np.float64]
 
-#: The blocks whose parameters change while a station runs.
-_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
+#: Blocks whose parameters change during a drive.
+_BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
-def hand_on(
-    before: Diagram, then: Context, station: Diagram, context: Context, anew: set[str]
+def copy_state(
+    before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Sets the states of a station, and what parameters may have changed, to those of another one.
+    """Copy states and changeable parameters of `before` to `station`.
 
     Args:
-        before, then: the other station, and its context now.
-        station, context: that is to go on.
-        anew: names of blocks that begin anew.
+        then, context: of the two stations.
+        excluded: block names.
     """
     context.SetTime(then.get_time())
-    others = dict(_blocks(before))
+    sources = dict(_blocks(before))
     for path, block in _blocks(station):
-        other = others.get(path)
-        if other is None or type(other) is not type(block) or anew & set(path.split("/")):
+        source_block = sources.get(path)
+        if (
+            source_block is None
+            or type(source_block) is not type(block)
+            or excluded & set(path.split("/"))
+        ):
             continue
         _copy(
-            other.GetMyContextFromRoot(then),
+            source_block.GetMyContextFromRoot(then),
             block.GetMyMutableContextFromRoot(context),
-            path.rpartition("/")[2] in _WITH_PARAMETERS,
+            path.rpartition("/")[2] in _BLOCKS_WITH_PARAMETERS,
         )
 
 
@@ -79,18 +83,15 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 
 @njit(cache=True)
-def _share(change, time):
-    """What of the wrench is felt by now, 0 to 1; `change` as the parameter of `GoesOver`."""
+def _weight(change, time):
+    """Return the weight of the new wrench, 0 to 1."""
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 @njit(cache=True)
-def _felt_into(wrench, before, share, most, out):
-    """Writes what is felt (6,): of a wrench (6,) a share, the rest of what was felt `before` (6,).
-
-    Its force is no longer than `most` [N], and its torque is less by the same factor.
-    """
+def _cross_fade_into(wrench, before, share, most, out):
+    """Write the cross-fade (6,) with a force of at most `most` [N]."""
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
     force = _force(out)
@@ -104,50 +105,51 @@ def _force(wrench):
     return math.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
 
 
-class GoesOver(LeafSystem):
-    """What the hand feels goes over from what it felt of another station, without a step.
+def add_cross_fade(builder: DiagramBuilder, port: InputPort, period: float) -> InputPort:
+    """Add a `CrossFade` in front of `port`, and return its input port."""
+    block = builder.AddNamedSystem("cross_fade", CrossFade(period))
+    builder.Connect(block.get_output_port(), port)
+    return block.get_input_port()
 
-    What the other station had kept from the hand does not come back in a press that the hand has
-    not made: more than `most` is not felt until the wrench has been less than that once.
+
+class CrossFade(LeafSystem):
+    """Cross-fade of the rendered wrench from a previous station.
 
     .. pydrake_system::
 
-        name: GoesOver
+        name: CrossFade
         input_ports:
-        - wrench: (6,) F_E_B that the hand shall feel [N, N m]
+        - wrench: (6,) F_E_B of the new station [N, N m]
         output_ports:
-        - felt: (6,) that, at last
-
-    Args:
-        period: in which it goes on, and looks whether the wrench is less than that [s].
+        - felt: (6,) rendered wrench
     """
 
     __slots__ = ONE_DICT
 
     def __init__(self, period: float) -> None:
         super().__init__()
-        # When it begins [s], its length [s], the wrench that was felt before (6,).
+        # Start [s], length [s], previous rendered wrench (6,).
         self._change = self.DeclareNumericParameter(BasicVector(8))
-        # The share of the wrench that is felt, and the most [N]. Were it the time that the output
-        # asks for, each of the integrator's steps would ask several times.
+        # Weight of the new wrench, and force limit [N]. They are discrete, since the integrator
+        # would evaluate a function of time several times in each step.
         self._state = int(self.DeclareDiscreteState([1.0, math.inf]))
         self._wrench = self.DeclareVectorInputPort("wrench", 6)
-        asked = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
-        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), asked)
+        inputs = {self._wrench.ticket(), self.xd_ticket(), self.pn_ticket()}
+        self.DeclareVectorOutputPort("felt", 6, weak_callback(self._calc), inputs)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def Begin(self, context: Context, start: float, length: float, felt: Array) -> None:
-        """From `start` [s] on and within `length` [s]; until then it is `felt` (6,)."""
-        change = np.concatenate([[start, length], felt])
+    def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
+        """Cross-fade from `rendered` (6,) within `length` [s] from `start` [s]."""
+        change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def Limit(self, context: Context, most: float) -> None:
-        """The force that is felt is at most `most` [N] until the hand has eased off."""
+        """Limit the force to `most` [N] until the wrench was once below."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
-    def kept_back(self, context: Context) -> float:
-        """What is kept from the hand by that limit now [N]."""
+    def removed_force(self, context: Context) -> float:
+        """Return the force that the limit removes [N]."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 
@@ -155,15 +157,15 @@ class GoesOver(LeafSystem):
         share, most = state.value(self._state)
         if share < 1.0:
             change = context.get_numeric_parameter(self._change).value()
-            state.get_mutable_value(self._state)[0] = _share(change, context.get_time())
+            state.get_mutable_value(self._state)[0] = _weight(change, context.get_time())
         elif most < math.inf and _force(self._wrench.Eval(context)) <= most:
             state.get_mutable_value(self._state)[1] = math.inf
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         share, most = context.get_discrete_state(self._state).value()
         wrench = self._wrench.Eval(context)
-        if share == 1.0 and most == math.inf:  # most of the time; the rest takes as long again
+        if share == 1.0 and most == math.inf:  # the usual case, in half the time
             output.SetFromVector(wrench)
             return
         before = context.get_numeric_parameter(self._change).value()[2:]
-        _felt_into(wrench, before, share, most, output.get_mutable_value())
+        _cross_fade_into(wrench, before, share, most, output.get_mutable_value())

@@ -1,0 +1,148 @@
+"""Scenarios of a drive: scenes of the page, and results of the driver's choices."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.lab.identified_load import IdentifiedLoad
+from drake_teleop.live.inputs import NETWORKS, OWN, SENSORS, Inputs
+from drake_teleop.station.channel.channel import Channel
+from drake_teleop.station.channel.network import longest_delay
+from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
+from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
+from drake_teleop.station.operator.operator import GRIPS
+from drake_teleop.station.passivity.methods import METHODS
+from drake_teleop.station.passivity.safe_state import RESUME
+from drake_teleop.station.scenario import LoadScenario, Scenario, replace
+from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
+from drake_teleop.station.slave.payload import Payload
+from drake_teleop.station.slave.plant import NominalSlave
+
+Array = NDArray[np.float64]
+
+#: Gripped object, if the scenario has no payload.
+DEFAULT_OBJECT = Payload(mass=0.8)
+#: Duration of the cross-fade to the rendered wrench of a new station [s].
+CROSS_FADE_S = 0.25
+# Smallest rotational impedance if the scenario does not use `wave` [N m s/rad]. The friction of a
+# ball on a leaf is 1.5 N m about the sensor; with the default 0.05 the tool topples at 0.2 s.
+_MIN_ROTATIONAL_IMPEDANCE = 0.5
+_DELAY_UNIT_S, _JITTER_UNIT, _LOSS_UNIT = 1e-4, 1e-2, 1e-3
+
+#: Shipped scenario of each scene; "own" is the scenario of the drive.
+_SHIPPED = {
+    "leaf": "touch",
+    "slot": "peg_in_slot",
+    "wall": "touch",
+    "block": "push_block",
+}
+SCENES = ("own", *_SHIPPED)
+
+
+def live_scenario(scenario: Scenario) -> Scenario:
+    """Return a scenario without intent, task and settling, with error-controlled steps."""
+    return replace(
+        scenario,
+        operator__intent=[],
+        operator__task=None,
+        simulation__settle=0.0,
+        simulation__end_with_task=False,
+        simulation__on_fault="continue",
+        simulation__integrator="runge_kutta3",
+    )
+
+
+def with_device(scenario: Scenario) -> Scenario:
+    """Return the scenario with a task-space device in place of a serial arm."""
+    if scenario.master.model not in (PHANTOM, LEADER):
+        return scenario
+    return replace(scenario, master=Master(model="haply_inverse3"))
+
+
+def scene(name: str, own: Scenario) -> Scenario:
+    """Return the scenario of one of `SCENES`."""
+    if name == "own":
+        return own
+    scenario = LoadScenario(_SHIPPED[name])
+    if name == "wall":
+        wall = Wall(position=[0.55, 0.0, 0.17], stiffness=1e4)
+        changes = {"sheet_spring": None, "environment": [wall], "description": "a wall to press on"}
+        scenario = replace(scenario, **changes)
+    return live_scenario(scenario)
+
+
+def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
+    """Return the scenario with all choices; detection needs a known noise floor."""
+    changes: dict[str, object] = {
+        "passivity__method": METHODS[inputs.method],
+        "operator__grip": list(GRIPS)[inputs.grip],
+    }
+    if METHODS[inputs.method] == "wave" != scenario.passivity.method:
+        along, turning = scenario.passivity.wave.impedance
+        wave = dataclasses.replace(
+            scenario.passivity.wave, impedance=[along, max(turning, _MIN_ROTATIONAL_IMPEDANCE)]
+        )
+        changes["passivity__wave"] = wave
+    name = NETWORKS[inputs.network]
+    if name == "custom":
+        changes["channel"] = Channel(
+            delay=_DELAY_UNIT_S * inputs.delay,
+            jitter=_JITTER_UNIT * inputs.jitter,
+            distribution="gamma",
+            loss=_LOSS_UNIT * inputs.loss,
+        )
+    elif name != OWN:
+        changes["channel"] = Channel(network=name)
+    if inputs.sensor:
+        changes["wrist_sensor"] = SENSOR_PRESETS[SENSORS[inputs.sensor]]
+    if not (inputs.detection and _has_noise_floor(load, inputs)):
+        changes["contact_detection"] = None
+    elif scenario.contact_detection is None:
+        changes["contact_detection"] = ContactDetectionConfig()
+    has_payload = scenario.slave.payload.mass > 0.0
+    if inputs.object != has_payload:
+        payload = DEFAULT_OBJECT if inputs.object else dataclasses.replace(DEFAULT_OBJECT, mass=0.0)
+        changes["slave__payload"] = payload
+    changed = replace(scenario, **changes)
+    if inputs.object and load is not None and scenario.force_scaling.gripper_phi is None:
+        gripper = load.identification.phi - has_payload * _object_phi(changed)
+        changed = replace(changed, force_scaling__gripper_phi=gripper.tolist())
+    return changed
+
+
+def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
+    return load is not None and load.noise_floor is not None and inputs.sensor == 0
+
+
+def _object_phi(scenario: Scenario) -> Array:
+    """Return phi (10,) of the object, about So in S."""
+    payload = NominalSlave(scenario.slave).arm.phi_load
+    empty = replace(scenario, slave__payload=Payload(mass=0.0))
+    return payload - NominalSlave(empty.slave).arm.phi_load
+
+
+def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
+    """Return the load estimate (16,) for the masses and the tared sensor of `now`."""
+    if load is None:
+        return None
+    estimate = load.estimate.copy()
+    estimate[:6] += _sensor_offset(now) - _sensor_offset(before)
+    arms = (NominalSlave(scenario.slave).arm for scenario in (now, before))
+    estimate[6:] += np.subtract(*(arm.phi_load for arm in arms))
+    return estimate
+
+
+def _sensor_offset(scenario: Scenario) -> Array:
+    sensor = scenario.wrist_sensor
+    return np.zeros(6) if sensor.ideal else np.array(sensor.offset)
+
+
+def fill_time(scenario: Scenario) -> float:
+    """Return the time until a new channel delivers all packets [s]."""
+    if scenario.is_direct:
+        return 0.0
+    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME
