@@ -9,17 +9,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """The parts of an address.
-
-    Args:
-        text: the address.
-        port: if it says none.
-        known: the names that it may have.
-        host: if it says none.
-
-    Raises:
-        DrakeTeleopError: without a host, or with another name or port.
-    """
+    """Parsed address; raise DrakeTeleopError if host, port or a parameter name is invalid."""
 
     def __init__(
         self, text: str, port: int | None, known: tuple[str, ...], *, host: str = ""
@@ -44,15 +34,11 @@ class Address:
                 )
 
     def text_of(self, name: str) -> str | None:
-        """What it says under that name."""
+        """Return a query parameter, None if it is absent."""
         return self._said.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
-        """Positive numbers with commas between them.
-
-        Raises:
-            DrakeTeleopError: if they are others.
-        """
+        """Return `count` positive numbers, None without the parameter; else raise DrakeTeleopError."""
         text = self._said.get(name)
         if text is None:
             return None
@@ -67,11 +53,7 @@ class Address:
         return values
 
     def choice(self, name: str, among: tuple[str, ...]) -> str:
-        """One of some words, the first if it says none.
-
-        Raises:
-            DrakeTeleopError: if it is another.
-        """
+        """Return one of the words `among`, by default the first; else raise DrakeTeleopError."""
         text = self._said.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
@@ -80,12 +62,8 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """+1 for what the sensor exerts on the load, Eq. (1); -1, the default, for the opposite.
-
-        Raises:
-            DrakeTeleopError: for anything else.
-        """
+        """Return 1 for the wrench of sensor on load, Eq. (1); -1 (default) for the opposite."""
         text = self._said.get("sign", "-1")
-        if text not in ("-1", "1", "+1", " 1"):  # a plus in a query is a blank
+        if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(f"sign={text!r} is neither 1 nor -1", where=self.text)
         return -1.0 if text == "-1" else 1.0

@@ -1,16 +1,6 @@
-"""Readings from parts: the wrench of one stream, the motion at that instant of another.
+"""Readings that combine the wrench of one stream with the motion of another.
 
-The motion follows from poses as in a log: around each a polynomial of degree 5 is fitted to a
-window of 1.8 / cut-off, and its derivatives in the middle are taken (`logs.read.alignment`). So a
-motion is known half a window after it was, and the wrench waits for it, 30 ms at 30 Hz; both are
-of the same instant then. Poses that come at uneven times are put onto a grid first, on straight
-lines; without one for `STALE_S` the window begins anew.
-
-Specific force and angular velocity of an IMU in S go the same way, if nobody tells poses.
-
-**Clocks.** Streams of one source have one clock. Those of two are related by what each took least
-time for, as in `compensator`: what the motion takes longer on its way than the wrench cannot be
-seen in that. It is the delay that `identify` finds, and that `delay_following` follows from there.
+Motions are derivatives of poses (docs/robot.md, "Methods").
 """
 
 from __future__ import annotations
@@ -35,20 +25,18 @@ from drake_teleop.robots.streams import IMU, VALUES, WRENCH, Flag, Part, Reading
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 NOWHERE = np.array([1.0, 0, 0, 0, 0, 0, 0])
-"""Pose of a sensor that is where the posed frame is."""
-_KEPT_S = 0.5  # of motions and wrenches
-_LEAST_DT, _LATEST, _LARGEST = 1e-4, 1e11, 1e5  # [s], [s], of any unit
-_SPACINGS = 20  # that tell the rate of the motion
+"""Identity: the sensor's frame is the posed frame."""
+_KEPT_S = 0.5  # buffer of motions and wrenches
+_LEAST_DT, _LATEST, _LARGEST = 1e-4, 1e11, 1e5  # [s], [s], any unit
+_SPACINGS = 20  # for the median period of the motion
 
 
 class Window:
-    """Motions of S from samples as they come, late by half a window.
-
-    The grid's spacing is the median of the first ones.
+    """Motions of S from poses of a frame F, or from IMU samples, on a uniform grid.
 
     Args:
-        cutoff_hz: see the module; None for the shortest window.
-        X_FS: (7,) pose of the sensor in the frame whose poses come.
+        cutoff_hz: None for the shortest window.
+        X_FS: (7,) pose of the sensor in F.
         gravity_W: (3,) [m/s^2].
     """
 
@@ -60,7 +48,7 @@ class Window:
         self.forget()
 
     def forget(self) -> None:
-        """Begins anew."""
+        """Discard all samples."""
         self._last: tuple[float, Array] | None = None
         self._next, self._rows = 0.0, deque[Array](maxlen=self._size)
         self._came = -math.inf
@@ -74,14 +62,14 @@ class Window:
             self.forget()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Times and motions (9,) that are known by a sample now."""
+        """Return times and motions (9,) that are complete with a sample received at `now`."""
         row = self._row(part)
         if row is None:
             return []
         last = self._last
         step = math.inf if last is None else part.t - last[0]
         if step <= 0.0 and now - self._came <= STALE_S:
-            return []  # out of order, or the same
+            return []  # out of order or repeated
         if not self._dt and _LEAST_DT <= step <= STALE_S:
             self._measure(step)
         if self._last is None or not 0.0 < step <= STALE_S:
@@ -100,7 +88,7 @@ class Window:
         return found
 
     def _row(self, part: Part) -> Array | None:
-        """(12,) R_WS and p_WS, or (6,) as they come; None of what is no motion."""
+        """Return R_WS and p_WS (12,), or IMU values (6,); None if invalid."""
         values = part.values
         if part.flags or not (abs(part.t) < _LATEST and (np.abs(values) < _LARGEST).all()):
             return None
@@ -113,7 +101,7 @@ class Window:
         return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
     def _middle(self) -> Array:
-        """(9,) specific force, angular velocity and acceleration in the middle of the window."""
+        """Return s, omega, alpha (9,) in the middle of the window."""
         rows = np.array(self._rows)
         smooth, first, second = self._weights @ rows
         if rows.shape[1] == 6:
@@ -125,20 +113,17 @@ class Window:
 
 
 def _axis(A: Array) -> Array:
-    """The vector of a matrix's skew part."""
     return 0.5 * np.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])
 
 
 def pose_of(numbers: Sequence[float]) -> Array:
-    """(7,) quaternion and position of x, y, z [m], roll, pitch, yaw [deg], as in a URDF."""
+    """Return quaternion and position (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
     roll, pitch, yaw = np.radians(numbers[3:])
     R = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
     return np.concatenate([quaternions(R[None])[0], numbers[:3]])
 
 
 class _Offset:
-    """Our clock less another, by what took least time."""
-
     def __init__(self) -> None:
         self.now_less_t, self._now = math.inf, 0.0
 
@@ -150,22 +135,17 @@ class _Offset:
 
 
 class Assembly:
-    """A source of readings made of parts.
+    """Source of readings with the motion of another stream.
 
     Args:
-        parts: wrench and motion.
-        cutoff_hz: see the module.
-        delay_s: by how much the motion's stamps come behind the wrench's [s].
-        follow: a load whose wrench tells how that delay changes; None: it stays.
-        X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
-        weight_removed: the robot has removed the weight from the wrench. The readings then have the
-            acceleration in the place of the specific force.
-
-    Raises:
-        DrakeTeleopError: if the weight is removed and the motion is an IMU's.
+        delay_s: delay of the motion's stamps behind the wrench's [s].
+        follow: load for tracking this delay; None for a constant delay.
+        X_FS: (7,) [w x y z, position] of the sensor in the posed frame.
+        weight_removed: the robot has removed the weight from the wrench. Readings contain the
+            acceleration instead of the specific force; an IMU raises DrakeTeleopError.
 
     Attributes:
-        lag_s: by how much readings come late, if poses come often enough for the window [s].
+        lag_s: delay of the readings [s].
     """
 
     live = True
@@ -196,7 +176,7 @@ class Assembly:
 
     @property
     def delay_s(self) -> float:
-        """The present delay [s]."""
+        """Present delay of the motion [s]."""
         return self._delay if self._follower is None else self._follower.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
@@ -207,7 +187,7 @@ class Assembly:
         return [reading for part, now in came for reading in self.take(part, now)]
 
     def take(self, part: Part, now: float) -> list[Reading]:
-        """The readings that are whole by a part that came at `now`. It never raises."""
+        """Return the readings that are complete with a part received at `now`."""
         if part.stream == WRENCH:
             self._clocks[0].follow(part.t, now)
             self._waiting.append(part)
@@ -227,7 +207,7 @@ class Assembly:
     def _keep(self, t: float, motion: Array) -> None:
         motions = self._motions
         if motions and not motions[-1][0] - STALE_S < t < motions[-1][0] + _KEPT_S:
-            motions.clear()  # another clock: what waits for a motion by the old one waits for ever
+            motions.clear()  # another clock: wrenches on the old one would wait forever
             waiting = [each for each in self._waiting if not abs(each.t - t) > _KEPT_S]
             self._waiting = deque(waiting, self._waiting.maxlen)
         if math.isfinite(t) and (not motions or t > motions[-1][0]):
@@ -236,7 +216,7 @@ class Assembly:
                 motions.popleft()
 
     def _whole(self, part: Part) -> Reading | None:
-        """With the motion of its instant, or stale without; None while it has to wait for it."""
+        """Return the reading, stale if without motion; None while its motion is pending."""
         values, flags, motions = np.zeros(VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):

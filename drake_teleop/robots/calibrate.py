@@ -1,8 +1,4 @@
-"""Identification from a stream: record and look until the requested parameters are known.
-
-In a live stream the record is evaluated on another thread; the loop goes on reading. What is left
-out of the record is described in `recording`.
-"""
+"""Identification from a stream until the requested parameters are known."""
 
 from __future__ import annotations
 
@@ -18,14 +14,12 @@ from drake_teleop.robots.calibration import FIRST_S, GROWS, Look, look
 from drake_teleop.robots.recording import Records
 
 DEFAULT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
-"""What is asked for if nothing is."""
+"""Default tolerances."""
 _IDLE_S = 0.05
 _T = TypeVar("_T")
 
 
 class _Stream(Protocol[_T]):
-    """A `Source` of whatever is recorded."""
-
     live: bool
 
     def read(self, timeout_s: float) -> list[_T] | None: ...
@@ -42,22 +36,19 @@ def calibrate(
     seconds: float = 120.0,
     show: Callable[[Look], None] = lambda _: None,
 ) -> list[Look]:
-    """Records and looks until all that is asked is known, or the source or the time is over.
+    """Record a stream until the tolerance is met, the source ends or the time is over.
 
     Args:
-        source: of readings, or of parts.
-        recorder: of those.
-        path: of the record, which is what the last look has seen.
-        tolerance: what is asked.
-        cutoff_hz, delay: as of `identify_log`.
-        seconds: of the record, at most.
-        show: takes each look.
+        path: file of the record; the last result refers to it.
+        cutoff_hz, delay: see `identify_log`.
+        seconds: maximum length of the record.
+        show: callback for each result.
 
     Returns:
-        the looks, the last of which is the result.
+        All results.
 
     Raises:
-        DrakeTeleopError: if hardly anything came, or the record cannot be written.
+        DrakeTeleopError: if too few samples came, or the record cannot be written.
     """
     looks, after = list[Look](), FIRST_S
     earlier = [path.with_name(name) for name in recorder.files] if source.live else []

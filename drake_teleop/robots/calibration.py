@@ -1,18 +1,4 @@
-"""Whether a load is known well enough yet, and which motion would tell more.
-
-What has been recorded is identified as `identify` does, again and again, each time the record has
-grown by `GROWS`. A number is known when the half-width of its interval of `SURE` is within its
-tolerance, two looks in a row; the 95 % interval that is shown is then half of it or about. To look
-often and to stop at the first good news makes intervals too narrow; therefore the level is far
-above 95 %, two looks have to agree, and the variance be known itself (`FEWEST_DEGREES`). Nothing is
-known while something speaks against the record: suspected errors, another load or another zero from
-some time on, poses at rest. Contacts are left out of the record and cast no doubt on it.
-
-**What is missing.** The information of the recorded motion, G = sum of [E V]^T W [E V] over the
-samples that are independent behind the low-pass, and that of each of six motions from the present
-orientation, G_k: to tilt slowly and to swing briskly about x, y and z of S. The one is advised that
-leaves least of what is asked: the least sum of log max(1, deviation / tolerance).
-"""
+"""Decision whether a load is known well enough, and the best next motion (docs/robot.md)."""
 
 from __future__ import annotations
 
@@ -35,42 +21,41 @@ from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
 
 SURE = 0.9998
-"""Level of the interval that has to be within the tolerance."""
+"""Level of the interval that must be within the tolerance."""
 GROWS = 1.12
-"""By how much longer the record is at the next look."""
+"""Growth factor of the record from one result to the next."""
 FIRST_S = 1.0
-"""Length of the record at the first look [s]."""
+"""Length of the record at the first result [s]."""
 FEWEST_DEGREES = 20.0
-"""Of freedom of the variance of a number that is known."""
+"""Minimum degrees of freedom of the variance of a known number."""
 _ANEW = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY = 9.81
-# A load and a sensor [N, N m] to give advice with before anything is known.
+# Load and noise [N, N m] for the advice before the first identification.
 _GUESS = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
 _NOISE = np.repeat([0.25, 0.012], 3)
-_NOTHING = 1e-12  # information that keeps matrices regular, of natural columns
-# Motions: words, angle [rad], rate [Hz]; seconds and samples of each.
+_NOTHING = 1e-12  # relative information that keeps matrices regular
+# Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
     ("swing the wrist about {axis}, briskly, by 20 deg to and fro", np.radians(20.0), 1.5),
 )
 _LASTS, _SAMPLES = 4.0, 80
-# Numbers per second and hertz of the low-pass that are independent.
+# Independent samples per second and hertz of the low-pass.
 _INDEPENDENT = 2.2
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is known at one time.
+    """Intermediate result of a calibration.
 
     Attributes:
         t: length of the record [s].
-        found: what was identified; None if nothing could be.
-        why: nothing could be; else "".
-        half: (k,) half-widths of the 95 % intervals of the asked numbers over their tolerances.
-        sure: (k,) whether the wider interval of each is within its tolerance.
-        known: (k,) whether that is so in the look before, too.
-        doubts: what speaks against the record; nothing is known then.
-        advice: the motion that tells most of what is not known, or to start again; "" if all is.
+        found: the identification; None if it failed for the reason `why`.
+        half: (k,) half-widths of the 95 % intervals over the tolerances.
+        sure: (k,) whether the interval of level `SURE` is within the tolerance.
+        known: (k,) whether the previous one also was.
+        doubts: problems of the record; no parameter is known then.
+        advice: the next motion; "" if all parameters are known.
     """
 
     t: float
@@ -91,14 +76,7 @@ def look(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Look:
-    """Identifies the record so far, as `identify` would.
-
-    Args:
-        path: the record, a canonical log.
-        tolerance: what is asked.
-        before: the look before this one.
-        cutoff_hz, delay: as of `identify_log`.
-    """
+    """Identify the present record; `before` is the previous result."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -123,17 +101,14 @@ def look(
         return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
     try:
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
-    except DrakeTeleopError:  # hardly anything yet
+    except DrakeTeleopError:  # too few samples
         return Look(0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x"))
     advice = missing_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
     return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Half-widths of the intervals of 95 % and of `SURE` over the tolerances, and their degrees.
-
-    The degrees of freedom of a number are the least of the parameters that it depends on.
-    """
+    """Return half-widths at 95 % and `SURE` over the tolerances, and degrees of freedom."""
     load = found.identification
     errors = errors_of(tolerance, load.phi)
     deviations = deviations_of(errors, load.covariance)
@@ -144,7 +119,7 @@ def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Arra
 
 
 def doubts_of(found: IdentifiedLog) -> tuple[str, ...]:
-    """Why the numbers of a record are not to be trusted, whatever their intervals."""
+    """Return problems that invalidate all intervals."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("there are only poses at rest")
@@ -160,12 +135,10 @@ def missing_motion(
     errors: Array,
     noise: Array,
 ) -> str:
-    """The advice, in words (module docstring).
+    """Return the most informative motion, in words.
 
     Args:
-        motion: s, omega, alpha, (N, 3) each, of the record.
-        dt: of the record [s].
-        cutoff_hz: of the low-pass it has passed.
+        motion: s, omega, alpha, (N, 3) each.
         errors: (k, 16) from `errors_of`.
         noise: (6,) of a sample's wrench [N, N m].
     """
@@ -186,7 +159,7 @@ def missing_motion(
 
 
 def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
-    """Words, and (16, 16) information, of each motion from where the specific force is `up`."""
+    """Yield words and information (16, 16) of motions that start at the specific force `up`."""
     s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
     t = np.arange(_SAMPLES) * (_LASTS / _SAMPLES)
     for words, size, hertz in _MOTIONS:
@@ -195,7 +168,7 @@ def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Arr
         change = 0.5 * size * w * w * np.cos(w * t)
         for k, axis in enumerate("xyz"):
             e = np.eye(3)[k]
-            # What is fixed in W turns about -e in S (Rodrigues).
+            # Vectors fixed in W rotate about -e in S (Rodrigues).
             s = (
                 np.outer(np.cos(angle), s0)
                 - np.outer(np.sin(angle), np.cross(e, s0))

@@ -1,13 +1,7 @@
-"""A tare or a grasp in a stream, found beside the loop by the test that `identify` uses.
+"""Detection of a tare or a grasp in a stream, by the test of `identify`.
 
-The flags of `Watch` show that the known load does not explain the wrench. When they have lasted for
-`SETTLED_S`, the last `SPAN_S` seconds are explained as a record is: another zero from t on, another
-load from t on, or something else. At rest a push looks like either of them. A change is therefore
-reported only once the tool has turned by a few degrees after it, and if the other kind explains the
-record decisively worse. A push that turns with the tool remains indistinguishable from a tare.
-
-The explanation takes a second or so. A live stream has it made by another process of low priority,
-so that the loop waits for nothing: threads of one interpreter would share its lock.
+For a live stream it runs in another process of low priority, because threads would share the
+interpreter lock with the loop.
 """
 
 from __future__ import annotations
@@ -35,12 +29,12 @@ from drake_teleop.robots.streams import ONLY_SAID, VALUES, Flag, Reading
 SPAN_S = 20.0
 """Length of the record that is explained [s]."""
 SETTLED_S = 2.0
-"""How long the flags have to last [s]."""
+"""Minimum duration of the flags [s]."""
 _FLAGGED, _WRONG = int(Flag.IN_CONTACT | Flag.OTHER_LOAD), ~int(ONLY_SAID)
-# Seconds: between attempts at most, unflagged until a change is over, between two changes.
+# [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _PATIENCE, _OVER, _SAME = 10.0, 1.0, 1.0
 _LEAST_S, _DECISIVE = 4.0, 40.0
-_MOVED = 0.5  # m/s^2, deviation of the specific force after a change
+_MOVED = 0.5  # m/s^2, minimum standard deviation of the specific force after a change
 _NICE, _TIMEOUT_S = 10, 60.0
 
 Report = tuple[float, str]
@@ -48,13 +42,7 @@ Report = tuple[float, str]
 
 
 class Changes:
-    """Reports each change of zero or load once (module docstring).
-
-    Args:
-        dt: between readings [s].
-        live: whether the stream goes on while the record is explained.
-        say: takes the report.
-    """
+    """Report of each change of zero or load, once, by the callback `say`."""
 
     def __init__(self, dt: float, *, live: bool, say: Callable[[str], None]) -> None:
         self._dt, self._live, self._say = dt, live, say
@@ -103,7 +91,7 @@ class Changes:
 
     def _report(self, found: Future[list[Report]]) -> None:
         error = found.exception()
-        if error is not None:  # the loop goes on
+        if error is not None:  # the loop continues
             self._say(f"a tare or another load could not be looked for ({error})")
             return
         for time, words in found.result():
@@ -114,25 +102,20 @@ class Changes:
 
 
 def _reports_beside(rows: Array, dt: float) -> list[Report]:
-    """`reports`, by another process."""
+    """Return `reports`, computed by another process."""
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
         stdout=subprocess.PIPE,
         timeout=_TIMEOUT_S,
         check=True,
-        start_new_session=True,  # Ctrl-C is for the loop
+        start_new_session=True,  # Ctrl-C stops the loop only
     )
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 
 def reports(rows: Array, dt: float) -> list[Report]:
-    """Find the changes of zero and load in a part of a stream.
-
-    Args:
-        rows: (N, 16) time [s] and values of readings.
-        dt: between readings [s].
-    """
+    """Return the changes of zero and load in rows (N, 16) of time [s] and values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _LEAST_S:
@@ -148,7 +131,7 @@ def reports(rows: Array, dt: float) -> list[Report]:
 
 
 def _decisive(state: State, time: float) -> bool:
-    """Whether S has moved since, and the other kind of change explains the record much worse."""
+    """Return whether S has moved since, and the other kind explains the record much worse."""
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MOVED:

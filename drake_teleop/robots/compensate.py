@@ -1,4 +1,4 @@
-"""`drake-teleop compensate`: from a source through the compensator to a sink, in one loop."""
+"""Loop of `drake-teleop compensate`, from a source to a sink."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
 from drake_teleop.robots.watch import Watch
 
-_IDLE_S = 0.01  # between wrenches of zero while nothing comes
+_IDLE_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class Control:
-    """A UDP port of this machine that takes the word `tare`, and answers."""
+    """UDP port of this machine that accepts the word `tare`."""
 
     def __init__(self, port: int) -> None:
         self._socket = listening(THIS_MACHINE, port)
@@ -37,16 +37,16 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answers what has been asked."""
+        """Answer a waiting request."""
         try:
             words, asker = self._socket.recvfrom(64)
             known = words.strip() == b"tare"
             self._socket.sendto((tare() if known else "unknown: say tare").encode(), asker)
-        except OSError:  # nothing was asked, or nobody waits for the answer
+        except OSError:  # no request, or the sender is gone
             pass
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the port."""
         self._socket.close()
 
 
@@ -60,16 +60,14 @@ def run(
     changes: Changes | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensates until the source ends, or Ctrl-C.
+    """Compensate until the source ends, or Ctrl-C.
 
     Args:
-        control: answers requests to tare.
-        tare: also once, as soon as there is `TARE_S` of good readings, whatever comes of it.
-        changes: reports a tare or another load in the stream.
-        say: takes what is to be known: a tare, and each kind of fault when it first comes.
+        tare: tare once, after `TARE_S` of good readings.
+        say: callback for a tare, and the first fault of each kind.
 
     Returns:
-        how many wrenches there were, under "wrenches", and how many with each flag.
+        The number of wrenches, under "wrenches", and the number with each flag.
     """
     counts: Counter[str] = Counter(wrenches=0)
     tare_at = np.inf if not tare else round(TARE_S / source.dt)
@@ -124,22 +122,16 @@ def compensate_command(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> None:
-    """The command `compensate`; what there is to know goes to stderr.
+    """Run the command `compensate`; messages go to stderr.
 
     Args:
-        source, sink, rate_hz, real_time, delay, motion, sensor_pose: see `source_of` and `sink_of`.
-        load: identification.json.
-        sigma, gamma, cutoff_hz, predicted: see `Compensator`.
-        largest: the sensor's range [N], [N m].
-        tare: at the start.
-        watch: for contact and another load, see `drake_teleop.robots.watch`; a tare or a grasp is
-            reported with its time, see `drake_teleop.robots.changes`.
-        free: log of free motion, whose noise floor contact is told by, see `Detector`.
+        sigma, gamma, cutoff_hz, predicted: see `Compensator`; other options: `source_of`.
+        largest: range of the sensor [N], [N m].
+        free: log of free motion, see `Detector`.
         control: port of `Control`.
-        arm: kinematics, if the source delivers joint positions instead of poses.
 
     Raises:
-        DrakeTeleopError: if one of them cannot be used.
+        DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
     readings = source_of(

@@ -1,17 +1,10 @@
-"""The wrench without the tool, sample by sample, and nothing where it cannot be trusted.
+"""Contact wrench of each reading; a flagged zero for each invalid reading.
 
-A good reading goes through the kernels of `eliminate --causal`, in their order: elimination, low-
-pass, the wait for a motion that comes later; the result is the same to the last bit. Whatever is
-wrong with a reading makes the wrench zero, with a flag that says what; never the last value. The
-next good one is compensated again. After a fault that lasted `STALE_S`, a restart or a clock that
-was set, the low-pass starts anew, settled, as at the very first.
+Good readings pass the kernels of `eliminate --causal`, with bit-equal results. After a fault of
+`STALE_S` the low-pass restarts in its steady state.
 
-**Clocks.** The source's time t and ours are related by the least now - t so far, which fades by
-`DRIFT`, so that it follows clocks that drift apart. What a reading is later than that is its age;
-what is late for `JUMP_S` is a clock that was set.
-
-**Tare.** The offsets are set to what the last `TARE_S` seconds say, if S rests, the wrench does not
-waver and the offsets are not further off than sensors drift (`tare_limit`): a push is no offset.
+The source's time t is related to our clock by the least (now - t), which rises by `DRIFT`. The
+excess of (now - t) is the age of a reading; if it lasts for `JUMP_S`, the clock was set.
 """
 
 from __future__ import annotations
@@ -38,49 +31,44 @@ from drake_teleop.robots.streams import ONLY_SAID, VALUES, Compensated, Flag, Re
 from drake_teleop.robots.watch import Watch
 
 STALE_S = 0.05
-"""Age above which there is no wrench [s]."""
+"""Age above which the wrench is zero [s]."""
 JUMP_S = 1.0
-"""Steps of a clock, against the other, that are no lateness [s]."""
+"""Larger steps between two clocks indicate a clock that was set [s]."""
 DRIFT = 1e-3
-"""How fast clocks may drift apart [s/s]."""
+"""Maximum relative drift of two clocks [s/s]."""
 RATE_OFF = 0.05
-"""Share by which the rate may be another, over `_RATE_OF` readings, and `_RATE_S`."""
+"""Tolerated relative error of the rate, over `_RATE_OF` readings and `_RATE_S`."""
 TARE_S = 0.5
-"""How long it has to rest before a tare [s]."""
-_RATE_OF, _RATE_S = 200, 0.4  # readings, [s]: a burst is no rate
+"""Time at rest before a tare [s]."""
+_RATE_OF, _RATE_S = 200, 0.4  # readings, [s]: longer than a burst
 _LATEST = 1e12  # [s]
 _LARGEST = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
-# Whole numbers: what is done with a `Flag` in Python takes a microsecond each time.
+# Integers, because each operation on a `Flag` takes a microsecond.
 _DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
 _ONLY_SAID, _GAP, _WRONG_RATE = int(ONLY_SAID), int(Flag.GAP), int(Flag.WRONG_RATE)
 _IN_CONTACT = int(Flag.IN_CONTACT)
 _DOUBTS = {NOT_FINITE: Flag.NOT_FINITE, TOO_LARGE: Flag.OUT_OF_RANGE, AT_RANGE: Flag.SATURATED}
-# At rest, rms: specific force [m/s^2], angular velocity [rad/s]; noise of the wrench, as a multiple
-# of what the identification left, and at least [N, N m].
+# Maximum rms at rest: specific force [m/s^2], angular velocity [rad/s]; wrench, as a multiple of
+# the residual of the identification, and at least [N, N m].
 _MOVED, _TURNING = 0.1, 0.02
 _WAVERS, _WAVERS_LEAST = 4.0, np.repeat([0.1, 0.005], 3)
 
 
 class Compensator:
-    """From readings to wrenches (module docstring).
+    """Conversion of readings to wrenches.
 
     Args:
-        load: what is eliminated.
-        dt: between readings [s].
-        sigma, gamma: scales of the load's wrench and of the contact in what is called scaled.
-        cutoff_hz: of the low-pass; None for none.
-        wait: readings that a motion comes behind the wrench, already brought together by the
-            source; what comes out is late by as many.
+        sigma, gamma: scales of load wrench and contact wrench in the scaled wrench.
+        wait: readings by which the motion comes late, already aligned by the source.
         predicted: extrapolate over wait and low-pass.
-        largest: (6,) the sensor's range [N, N m].
-        watch: says of each good reading whether something is touched, or it is another load.
-        detector: says of each whether something is touched, instead of `watch`.
-        tare_limit: how far offsets may drift [N], [N m].
+        largest: (6,) range of the sensor [N, N m].
+        detector: flags contact instead of `watch`.
+        tare_limit: maximum drift of the offsets [N], [N m].
 
     Attributes:
         offsets: (6,) of the sensor [N, N m].
-        lag_s: by how much a slow contact comes late, or would without the prediction [s].
-        rested: good readings in a row.
+        lag_s: delay of a slow contact without prediction [s].
+        rested: number of successive good readings.
     """
 
     def __init__(
@@ -113,20 +101,20 @@ class Compensator:
         self._memory = np.full((2, 12), np.nan)
         self._late: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
-        self._offset = math.inf  # the least now - t
-        self._in_time = -math.inf  # when the last one came that was not late
+        self._offset = math.inf  # least (now - t)
+        self._in_time = -math.inf  # arrival of the last reading in time
         self._since, self._first, self._readings, self._rate_off = 0.0, 0, 0, 0
         self._rate_of = max(_RATE_OF, round(_RATE_S / dt))
         self._rest = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
         self.rested = 0
-        # What is compiled is loaded now: the first readings would be stale before they are judged.
+        # Load compiled code now; otherwise the first readings would be stale.
         doubts(np.zeros(VALUES), self._largest, self._range)
         clipped(self._eliminated(np.zeros(VALUES)), self._range)
         self._settle_anew()
         self.rested = 0
 
     def step(self, reading: Reading, now: float) -> Compensated:
-        """Takes a reading that came at `now` [s], of a clock that never goes back."""
+        """Return the output for a reading received at `now` of a monotonic clock."""
         flags = self._judge(reading, now)
         wrong = flags & ~_ONLY_SAID
         if wrong & ~_GAP:
@@ -148,17 +136,17 @@ class Compensator:
         return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
     def idle(self, now: float) -> Compensated | None:
-        """What to say when nothing comes: nothing at first, then that it is stale."""
+        """Return a stale zero wrench if nothing came for `STALE_S`, else None."""
         if now - self._now <= STALE_S:
             return None
         return self._zero(_STALE)
 
     def left(self, now: float) -> float:
-        """How long the last reading is not stale yet [s]."""
+        """Return the time until the last reading is stale [s]."""
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
-        """Sets the offsets; what it did, or why it did not: "refused: ..."."""
+        """Set the offsets to their mean in `TARE_S`; return the result, or the reason of refusal."""
         if self.rested < len(self._rest):
             return f"refused: there are not {TARE_S:g} s of good readings yet"
         spread = self._rest.std(axis=0)
@@ -183,7 +171,7 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _judge(self, reading: Reading, now: float) -> int:
-        """The reading's flags; keeps the clocks."""
+        """Return the flags of a reading and update the clocks."""
         flags = reading.flags
         if flags & _DAMAGED:
             return _DAMAGED
@@ -199,7 +187,7 @@ class Compensator:
         ahead = now - reading.t
         known = not math.isinf(self._offset)
         step = reading.t - self._t
-        # What is out of order comes between what is not; if nothing else comes, it is the order.
+        # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
         lost = now - self._now > STALE_S
         if known and reading.number <= self._number and (abs(step) > JUMP_S or lost):
             return self._anew(reading, ahead, flags | int(Flag.RESTART))
@@ -219,7 +207,7 @@ class Compensator:
         return flags | self._rate(reading)
 
     def _anew(self, reading: Reading, ahead: float, flags: int) -> int:
-        """Believes the clock from here on."""
+        """Accept the clock of this reading and restart."""
         self._offset, self._number, self._t = ahead, reading.number, reading.t
         self._readings, self._rate_off, self.rested = 0, 0, 0
         self._now = self._in_time = reading.t + ahead
@@ -233,7 +221,6 @@ class Compensator:
         self._late.clear()
 
     def _rate(self, reading: Reading) -> int:
-        """Whether the rate is the stated one, over a while."""
         if self._readings == 0:
             self._since, self._first = reading.t, reading.number
         self._readings += 1
@@ -244,7 +231,7 @@ class Compensator:
         return self._rate_off
 
     def _eliminated(self, values: Array) -> Array:
-        """(12,) contact and scaled, behind the low-pass; keeps what a tare wants to know."""
+        """Return low-passed contact and scaled wrench (12,)."""
         out = np.empty(12)
         at = self.rested % len(self._rest)
         load = self._phi, self._nothing, self._scales

@@ -1,15 +1,9 @@
-"""By how much the motion's stamps come behind the wrench's, followed while it runs.
+"""Tracking of the motion's delay behind the wrench, from the wrench of the load.
 
-Clocks do not tell it: a driver may stamp what it filtered, or what it got late. The load does. With
-the motion too early by e, the non-contact wrench V phi misses e times its slope g, so that of the
-wrench r = o + g e is left, with offsets o. Least squares of the six channels together, with weights
-that fade in `FADES_S`, gives
+If the motion is early by e, the residual wrench is r = o + g e, with offsets o and g the slope of
+V phi. Least squares over the channels c, with weights that fade in `FADES_S`, gives
 
     e = sum_c w_c cov(g_c, r_c) / sum_c w_c var(g_c),    w_c = 1 / noise_c^2.
-
-A contact is no noise: what offsets, noise, gains and a wrong delay cannot make is left out.
-The delay moves to what is found, by `SLEWS` at most, and only while the standard deviation is below
-`SURE_S`: a tool at rest shows nothing, and the last delay stays. It stays within `MOST_S`.
 """
 
 from __future__ import annotations
@@ -25,38 +19,28 @@ from drake_teleop.logs.processing import usable_phi
 from drake_teleop.robots.watch import MODEL_ERROR, raw_noise
 
 FADES_S = 10.0
-"""Time constant of what is remembered [s]."""
+"""Time constant of the weights [s]."""
 SURE_S = 5e-4
-"""Standard deviation below which it is believed [s]."""
+"""Maximum standard deviation of a usable estimate [s]."""
 SLEWS = 0.005
-"""How fast the delay may change [s/s]."""
+"""Maximum rate of change of the delay [s/s]."""
 MOST_S = 0.1
-"""Delays of either sign [s]."""
+"""Maximum magnitude of the delay [s]."""
 FAR_S = 0.03
-"""Error of the delay for which a sample may be off, until it is known [s]."""
+"""Error of the delay that the residual of a sample may contain at first [s]."""
 NEAR_S = 0.004
-"""Likewise then, beside what is not followed yet [s]."""
+"""The same when the delay is known, in addition to the remaining correction [s]."""
 EVERY_S = 0.004
-"""Samples are looked at so often."""
-_OFFSETS = np.repeat([5.0, 0.25], 3)  # by which they may have drifted: as of a tare [N, N m]
-_SIGMAS, _FIRST = 5.0, 50  # samples that tell the offsets
+"""Period of the evaluated samples [s]."""
+_OFFSETS = np.repeat([5.0, 0.25], 3)  # maximum drift, as for a tare [N, N m]
+_SIGMAS, _FIRST = 5.0, 50  # samples before offsets are estimated
 
 Motion = tuple[float, Array]
-"""When [s], and s, omega, alpha (9,)."""
+"""Time [s], and s, omega, alpha (9,)."""
 
 
 class DelayFollower:
-    """Follows a delay.
-
-    Args:
-        load: whose wrench tells it.
-        dt: between wrenches [s].
-        cutoff_hz: see `raw_noise`.
-        delay_s: to begin with [s].
-
-    Attributes:
-        delay_s: the present one [s].
-    """
+    """Tracked delay `delay_s` [s] of the motion."""
 
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
@@ -67,7 +51,7 @@ class DelayFollower:
         self._wrenches = np.zeros((3, 6))
         self._forget(-math.inf)
         self.take((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
-        self._forget(-math.inf)  # what is compiled is loaded now
+        self._forget(-math.inf)  # loads compiled code before the first sample
 
     def _forget(self, t: float) -> None:
         self._t = self._fitted = t
@@ -75,18 +59,12 @@ class DelayFollower:
         self._far = FAR_S
 
     def take(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
-        """A sample.
-
-        Args:
-            at: time of the wrench, and the motion by the present delay.
-            wrench: (6,) as measured.
-            before, after: motions around it, at times by the wrench's clock and that delay.
-        """
+        """Take a wrench (6,), its motion at the present delay, and both neighbours."""
         t, step = at[0], after[0] - before[0]
         passed = t - self._t
         if 0.0 <= passed < EVERY_S or step <= 0.0:
             return
-        if not 0.0 <= t - self._fitted < FADES_S:  # another clock, or nothing fits any longer
+        if not 0.0 <= t - self._fitted < FADES_S:  # another clock, or no explained sample for long
             self._forget(t)
             passed = 0.0
         self._t = t
@@ -95,7 +73,7 @@ class DelayFollower:
         slope = (self._wrenches[2] - self._wrenches[1]) / step
         left = wrench - self._wrenches[0]
         if self._fits(left, slope):
-            # What the present delay takes out is of the delay that is looked for.
+            # The sums refer to zero delay; the motion is already shifted by the present one.
             left = left + slope * self.delay_s
             fades = math.exp(-(t - self._fitted) / FADES_S)
             self._fitted, self._seen = t, self._seen + 1
@@ -105,7 +83,7 @@ class DelayFollower:
             self._move(min(passed, FADES_S))
 
     def _fits(self, left: Array, slope: Array) -> bool:
-        """Whether offsets, noise, gains and a delay can make this of it."""
+        """Return whether the residual is explained without contact."""
         few = self._seen < _FIRST
         may_be = _SIGMAS * self._noise + self._far * np.abs(slope)
         may_be += MODEL_ERROR * np.abs(self._wrenches[0]) + few * _OFFSETS
@@ -115,7 +93,7 @@ class DelayFollower:
         return bool((np.abs(left - offsets) < may_be).all())
 
     def _move(self, passed: float) -> None:
-        """Towards the delay that is found, if one is."""
+        """Slew the delay towards a sufficiently accurate estimate."""
         if self._seen < _FIRST:
             return
         g, r, gg, gr, rr = self._sums / self._count
@@ -124,7 +102,7 @@ class DelayFollower:
             return
         found = float(self._weights @ (gr - g * r)) / shown
         rest = rr - r * r - found * (gr - g * r)
-        louder = max(1.0, float(self._weights @ rest) / 6.0)  # than the noise that was stated
+        louder = max(1.0, float(self._weights @ rest) / 6.0)  # variance over the stated noise
         self._far = FAR_S
         if math.sqrt(louder / (shown * self._count)) < SURE_S:
             most = SLEWS * passed

@@ -1,9 +1,7 @@
 """Contact by the detector of `detect`, in the loop: `--watch --free LOG`.
 
-Its noise floor, which rises with the motion, and its threshold are fitted to a log of free motion
-with the same load, as `detect --free` does, but to what the loop will see: wrench and motion behind
-the causal low-pass, and gravity as what is slower than `_GRAVITY_HZ` in the specific force. The
-mean of the contact wrench follows in `FOLLOWS_S` while nothing is touched, as offsets drift.
+Noise floor and threshold are fitted to the log after the causal low-pass. Gravity is the specific
+force below `_GRAVITY_HZ`.
 """
 
 from __future__ import annotations
@@ -35,18 +33,14 @@ _SAME_RATE = 0.05
 
 
 class Detector:
-    """What `Compensator` asks whether something is touched.
+    """Contact detection for `Compensator`.
 
     Args:
-        load: that hangs there.
-        free: log of its free motion, at the rate of the stream.
-        dt: between readings [s].
-        cutoff_hz: of the low-pass.
-        delay: of the log, as of `eliminate_log`.
+        free: log of free motion of the load, at the rate of the stream.
+        delay: delay of the log, see `eliminate_log`.
 
     Raises:
-        DrakeTeleopError: if the log cannot be read, has another rate or too little motion, or there
-            is no low-pass.
+        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
     """
 
     def __init__(
@@ -71,9 +65,9 @@ class Detector:
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
-        contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare would
+        contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
         rows = self._behind(np.hstack([contact, values[:, 6:]]))
-        # The low-passes settle first.
+        # Skip the transient of the low-passes.
         settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
         fade = float(np.exp(-1.0 / hold))
@@ -85,16 +79,16 @@ class Detector:
             floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / FOLLOWS_S
         ).settings
         self.restart()
-        self.flags(np.zeros(15), np.zeros(6))  # what is compiled is loaded now
+        self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
         self.restart()
 
     def restart(self) -> None:
-        """Forgets all but the noise floor: after a fault, or a tare."""
+        """Reset all but the noise floor."""
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
     def _behind(self, rows: Array) -> Array:
-        """(N, 18) contact, motion and acceleration behind the low-passes, of (N, 15)."""
+        """Return low-passed contact, motion and acceleration (N, 18)."""
         filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
         out = np.empty((len(rows), 18))
         for row, to in zip(rows, out, strict=True):
@@ -104,7 +98,7 @@ class Detector:
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
-        """Takes a good reading (15,) and what came out of it (6,), behind the low-pass."""
+        """Return the flags of a good reading (15,) with low-passed contact wrench (6,)."""
         touched = _touched(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
@@ -118,7 +112,7 @@ def _packed(dt: float, cutoff_hz: float) -> Array:
 
 @njit(cache=True)
 def _moved_into(values, fast, slow, filters, out):
-    """Motion (9,) behind the low-pass, and acceleration without gravity (3,), into out (12,)."""
+    """Write low-passed motion (9,) and acceleration without gravity (3,)."""
     out[:9] = values[6:]
     low_passed_into(out[:9], fast, filters[:, :9])
     out[9:] = values[6:9]

@@ -1,28 +1,4 @@
-"""An identified load in the format of a robot, of a compensation, or of a model.
-
-**Frames.** Robots and models want the load about a frame of theirs, the flange say; X_FS places the
-sensor in it. Compensations work in the sensor's frame.
-
-**Signs.** `Identification.offsets` are those of the wrench that the sensor exerts on the load. What
-a compensation subtracts is in the sensor's own sign, which for most is the opposite: what the load
-exerts on the sensor, `sign: -1` in a log description.
-
-**Sources.** Of the formats, as read in November 2026; none was tried on the real thing here:
-
-=============== ================================================================================
-ur              URScript manual, `set_target_payload(m, cog, inertia)`; the order of the six as in
-                ur_msgs/SetPayload: xx, yy, zz, xy, xz, yz, about the centre, axes of the flange
-franka          endeffector-config.json of Desk (frankarobotics/external_gripper_example): inertia
-                about the centre, 3 x 3 by columns; transformation of the flange, 4 x 4 by columns
-xarm            xArm-Python-SDK, `set_tcp_load(kg, [mm])`
-kth             kth-ros-pkg/force_torque_tools, gravity_compensation/config
-ft_tools        tpoignonec/ft_tools_ros2, FtParameters: reading = R^T m g + offset
-ros2-admittance ros2_controllers, admittance_controller: gravity_compensation
-bota            bota-payload-utils 1.0.3, payload_compensator_config; whether its inertia is about
-                the centre or about the sensor it does not say: the centre's is written
-urdf, sdf, mjcf a link, a model, a body with this inertia, on the frame F
-=============== ================================================================================
-"""
+"""An identified load in the format of a robot, of a compensation, or of a model."""
 
 from __future__ import annotations
 
@@ -41,18 +17,17 @@ from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
-STANDARD_GRAVITY = 9.80665  #: m/s^2, for a weight in N
+STANDARD_GRAVITY = 9.80665  #: m/s^2
 
 
 @dataclass(frozen=True)
 class Load:
-    """What a format is written from, in SI.
+    """Values for a format, in SI.
 
     Args:
-        mass: [kg].
-        com: (3,) centre of mass in the frame of the values [m].
-        inertia: (3, 3) about that centre, axes of that frame [kg m^2].
-        offsets: (6,) of the sensor, in its frame and sign [N, N m].
+        com: (3,) centre of mass in the frame F of the values [m].
+        inertia: (3, 3) about the centre of mass, in F [kg m^2].
+        offsets: (6,) in the sensor's frame and sign [N, N m].
     """
 
     mass: float
@@ -69,15 +44,13 @@ class Load:
 
 @dataclass(frozen=True)
 class Format:
-    """One target.
+    """Export format.
 
     Args:
-        write: the text of a load.
-        of_sensor: its values are in the sensor's frame, whatever it is mounted on.
-        inertia, offsets: whether it takes them.
-        body: it is read as a body, so that there has to be one with these values.
-        comment: what a comment's line begins with; empty if there are none.
-        note: what to know of it besides.
+        of_sensor: the values are in the sensor's frame.
+        inertia, offsets: whether the format contains them.
+        body: the target requires a physically consistent body.
+        comment: prefix of a comment line; "" for none.
     """
 
     write: Callable[[Load], str]
@@ -97,22 +70,15 @@ def export(
     p_FoSo_F: Array | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
-    """The text for a target, and what to know before it is entered.
+    """Return the text for a target of `FORMATS`, and warnings of dropped and unidentified values.
 
     Args:
-        found: the load.
-        to: one of `FORMATS`.
-        R_FS, p_FoSo_F: (3, 3) and (3,) orientation and place [m] of the sensor in the frame F that
-            the target's values are in; None: F is S.
-        sign: -1 if the sensor reports what the load exerts on it, as most do, else 1.
-
-    Returns:
-        text: with the warnings as comments, if the format has any.
-        warnings: what the target drops, and which of its values are not identified.
+        R_FS, p_FoSo_F: pose [m] of the sensor in the frame F of the values; None: F is S.
+        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
 
     Raises:
-        DrakeTeleopError: for an unknown target, a pose that the target has no use for, or a load
-            that no body has for a target that is read as one.
+        DrakeTeleopError: for an unknown target, a pose for a target in the sensor's frame, or an
+            inconsistent load for a target that requires a body.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(
@@ -154,17 +120,10 @@ def export(
 def export_command(
     identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: int
 ) -> tuple[str, list[str]]:
-    """The command `export`: the text and the warnings, see `export`.
+    """Return text and warnings of the command `export`.
 
     Args:
-        identification: an identification.json.
-        to: one of `FORMATS`.
-        sensor_pose: x, y, z [m] of the sensor in the frame of the values, and its roll, pitch, yaw
-            [deg] about that frame's fixed axes, as in a URDF; None: the sensor's own frame.
-        sign: as for `export`.
-
-    Raises:
-        DrakeTeleopError: as `Identification.load` and `export`.
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in F, as in a URDF.
     """
     found = Identification.load(identification)
     if sensor_pose is None:
@@ -175,7 +134,7 @@ def export_command(
 
 
 def turn(axis: int, angle: float) -> Array:
-    """(3, 3) rotation about the axis 0, 1 or 2 [rad]."""
+    """Return the rotation matrix about the axis 0, 1 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
     R[i, i] = R[j, j] = np.cos(angle)
@@ -203,7 +162,6 @@ def _warnings(found: Identification, to: str, format: Format) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """All digits that matter; no exponent's capital, no -0."""
     return repr(float(value) + 0.0)
 
 
@@ -351,4 +309,4 @@ FORMATS = {
     "sdf": Format(_sdf, body=True),
     "mjcf": Format(_mjcf, body=True),
 }
-"""What `export` writes, by the name of the target."""
+"""Export formats by name."""

@@ -1,8 +1,4 @@
-"""Wrenches for Foxglove: live in its window, or in an MCAP file, by the library foxglove-sdk.
-
-Both have one topic, `/wrench`, of JSON: number and t of the reading, contact and scaled by name,
-and the flags.
-"""
+"""Wrenches for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
 
 from __future__ import annotations
 
@@ -58,11 +54,7 @@ class _Channel:
 
 
 class FoxgloveSink:
-    """Live at foxglove://[HOST][:PORT]: whoever connects there sees them, now by our clock.
-
-    Raises:
-        DrakeTeleopError: if foxglove-sdk is missing, or the address is taken.
-    """
+    """Live server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
         host, port = endpoint(address, PORT)
@@ -88,11 +80,7 @@ class FoxgloveSink:
 
 
 class McapSink:
-    """Into a file, as they come, at the times of the readings.
-
-    Raises:
-        DrakeTeleopError: if foxglove-sdk is missing, or the file cannot be written.
-    """
+    """MCAP file, written continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
         self._channel = _Channel(str(path))

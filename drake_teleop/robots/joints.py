@@ -1,4 +1,4 @@
-"""Poses of the sensor from the joint positions that a source delivers (option `--model`)."""
+"""Poses of the sensor from joint positions (option `--model`)."""
 
 from __future__ import annotations
 
@@ -11,26 +11,18 @@ from drake_teleop.robots.streams import JOINTS, POSE, Part, PartSource
 
 
 class SensorPoseOfJoints(Protocol):
-    """The kinematics of an arm, such as `drake_teleop.station.slave.joint_poses.Arm`."""
+    """Kinematics of an arm, such as `station.slave.joint_poses.Arm`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, from the base outwards."""
+        """Names from the base outwards."""
 
     def pose(self, q: Array) -> Array:
-        """Return the pose (7,) of S in the world at q (n,), as [w x y z, position]."""
+        """Return the pose X_WS (7,) at q (n,), as [w x y z, position]."""
 
 
 class PosedByJoints:
-    """A source whose joint positions are told as poses of S.
-
-    Args:
-        source: tells `JOINTS`, in the order of the arm's names.
-        arm: whose joints they are.
-
-    Attributes:
-        dt, streams: see `PartSource`.
-    """
+    """Source that converts joint positions to poses of S."""
 
     def __init__(self, source: PartSource, arm: SensorPoseOfJoints) -> None:
         self._source, self._arm, self.dt = source, arm, source.dt
@@ -47,11 +39,11 @@ class PosedByJoints:
     def _told(self, part: Part) -> Part:
         if part.stream != JOINTS:
             return part
-        values = np.full(7, np.nan)  # no pose, which nobody takes for one
+        values = np.full(7, np.nan)  # an invalid pose, rejected later
         if part.values.shape == (len(self._arm.joint_names),):
             values = self._arm.pose(part.values)
         return part._replace(stream=POSE, values=values)
 
     def close(self) -> None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._source.close()

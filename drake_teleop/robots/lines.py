@@ -1,7 +1,7 @@
-"""Readings and wrenches as lines of JSON, one object each.
+"""Readings and wrenches as lines of JSON.
 
-In: t [s], wrench (6), s, omega, alpha (3 each); number and saturated may be left out. Out: number,
-t, contact and scaled (6 each), and flags as a list of names.
+Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
+number, t, contact and scaled (6 each), and names of flags.
 """
 
 from __future__ import annotations
@@ -15,17 +15,12 @@ import numpy as np
 
 from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading
 
-_LONGEST = 4096  # bytes of a line
+_LONGEST = 4096  # bytes per line
 _BLOCK = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """The reading in a line, `DAMAGED` if it is none. It never raises.
-
-    Args:
-        line: without its end.
-        number: of the reading, if the line has none.
-    """
+    """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default."""
     if len(line) > _LONGEST:
         return DAMAGED
     try:
@@ -41,7 +36,7 @@ def read_line(line: bytes, number: int) -> Reading:
 
 
 def written_line(out: Compensated) -> str:
-    """The line of a wrench, without its end."""
+    """Return the line of a wrench."""
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
@@ -53,12 +48,12 @@ def written_line(out: Compensated) -> str:
 
 
 def names_of(flags: int) -> list[str]:
-    """What the bits say, as in "out of range"."""
+    """Return the names of the set flags, such as "out of range"."""
     return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
 
 
 class LineSource:
-    """Readings from a file that is being written, such as standard input."""
+    """Readings from a growing file, such as standard input."""
 
     live = True
 
@@ -88,7 +83,7 @@ class LineSource:
 
 
 class LineSink:
-    """Wrenches into a text file, such as standard output, at once."""
+    """Unbuffered lines in a text file, such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

@@ -1,13 +1,7 @@
-"""ATI's Net F/T, and OnRobot's sensors that speak it: RDT, raw data transfer over UDP.
+"""Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP.
 
-A request of 8 bytes starts the stream, records of 36 come until another stops it; both are
-big-endian. A record has its number in the stream (rdt_sequence), the number of the measurement
-(ft_sequence), a status, and six whole numbers, counts of force and torque. It has no time: `Pace`
-makes one of the number. Counts, units and rate are read once from the box's page netftapi2.xml,
-unless the address says them.
-
-The stream is asked for again whenever nothing has come for a while, so that it goes on after the
-box was off. It is of the box that was named: the socket is connected.
+A request of 8 bytes starts the stream of records of 36 bytes, both big-endian. It is repeated after
+a silence, so that the stream resumes after a restart of the box.
 """
 
 from __future__ import annotations
@@ -31,11 +25,11 @@ REQUEST = struct.Struct(">HHI")
 RECORD = struct.Struct(">III6i")
 START, STOP = 2, 0
 _HEADER = 0x1234
-_SATURATED, _ERROR = 1 << 17, 1 << 31  # of the status
+_SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
 _ASK_AGAIN_S, _FROZEN_S = 0.1, 0.05
-_MOST = 256  # records at once
+_MOST = 256  # records per call
 _PAGE_S, _PAGE_BYTES = 2.0, 1 << 20
-# What a unit of the box's page is in N or N m.
+# Units of the box's page in N or N m.
 _UNITS = {
     "lbf": 4.4482216152605, "N": 1.0, "klbf": 4448.2216152605, "kN": 1e3,
     "kgf": 9.80665, "gf": 9.80665e-3,
@@ -45,7 +39,7 @@ _UNITS = {
 
 
 class Record(NamedTuple):
-    """A record as it comes."""
+    """RDT record."""
 
     rdt_sequence: int
     ft_sequence: int
@@ -54,7 +48,7 @@ class Record(NamedTuple):
 
 
 def unpacked_record(packet: bytes) -> Record | None:
-    """The record in a packet; None if it is none. It never raises."""
+    """Return the record in a packet, None if it is invalid."""
     if len(packet) != RECORD.size:
         return None
     rdt, ft, status, *counts = RECORD.unpack(packet)
@@ -62,15 +56,10 @@ def unpacked_record(packet: bytes) -> Record | None:
 
 
 class NetFtSource:
-    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1].
-
-    Args:
-        address: counts are those of 1 N and 1 N m; sign -1, the default, is for a sensor that tells
-            what the load exerts on it.
-        dt: between records, if the address does not say it [s].
+    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
 
     Raises:
-        DrakeTeleopError: if the address cannot be used, or the box's page cannot be had.
+        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the box cannot be read.
     """
 
     streams: tuple[str, ...] = (WRENCH,)
@@ -98,7 +87,7 @@ class NetFtSource:
         self._measured, self._measured_at = -1, -math.inf
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._ask()
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
@@ -107,16 +96,16 @@ class NetFtSource:
                 packet = self._socket.recv(RECORD.size + 1)
                 found.append(self.part(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
-        except OSError:  # nothing more, or nobody there
+        except OSError:  # no further record, or no box
             pass
         return found
 
     def part(self, packet: bytes, now: float) -> Part:
-        """The wrench in a packet that came at `now`, flagged as damaged if there is none."""
+        """Return the wrench in a packet received at `now`, flagged if it is invalid."""
         record = unpacked_record(packet)
         if record is None:
             return Part(WRENCH, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))
-        # rdt_sequence has 32 bits: what is less by half of them has begun again from zero.
+        # rdt_sequence has 32 bits and wraps around.
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._heard = now
         flags = 0
@@ -138,17 +127,16 @@ class NetFtSource:
             self._send(START)
 
     def _send(self, command: int) -> None:
-        with suppress(OSError):  # nobody there yet
+        with suppress(OSError):  # no box yet
             self._socket.send(REQUEST.pack(_HEADER, command, 0))
 
     def close(self) -> None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._send(STOP)
         self._socket.close()
 
 
 def _page(told: Address) -> list[float]:
-    """Counts of 1 N and of 1 N m, and the rate [Hz], as the box says them."""
     from http.client import HTTPConnection, HTTPException
 
     remedy = "or say them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
@@ -166,10 +154,10 @@ def _page(told: Address) -> list[float]:
 
 
 def page_of(content: bytes) -> list[float]:
-    """Counts of 1 N and of 1 N m, and the rate [Hz], as netftapi2.xml says them.
+    """Return counts of 1 N and 1 N m, and rate [Hz], from netftapi2.xml.
 
     Raises:
-        SyntaxError, KeyError, ValueError: if it does not.
+        SyntaxError, KeyError, ValueError: if they are missing or invalid.
     """
     from xml.etree import ElementTree
 

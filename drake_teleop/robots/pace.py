@@ -1,19 +1,16 @@
-"""Times for a stream that numbers its samples and does not say when they were taken."""
+"""Sample times of a stream without time stamps."""
 
 from __future__ import annotations
 
-_LEAST_S, _MOST_S = 1.0, 10.0  # of our clock, over which the period is measured
-_JUMP_S = 1.0  # numbers further off than that are of another start
+_LEAST_S, _MOST_S = 1.0, 10.0  # span of our clock for measuring the period
+_JUMP_S = 1.0  # a larger step of the number is a restart
 
 
 class Pace:
-    """A clock made of numbers: a sample that comes late keeps the time when it was taken.
+    """Clock from sample numbers.
 
-    The period is the stated one at first, and after a second what our clock says. So a stream at
-    another rate than the stated one does not seem later and later; its rate is seen to be wrong.
-
-    Args:
-        dt: the stated period [s].
+    The period is first the stated one, after a second the measured one, so that a wrong stated rate
+    causes no growing delay.
     """
 
     def __init__(self, dt: float) -> None:
@@ -22,11 +19,11 @@ class Pace:
         self._first: tuple[int, float] | None = None
 
     def time_of(self, number: int, now: float) -> float:
-        """When a sample was taken, on a clock of its own [s].
+        """Return the time of a sample, on its own clock [s].
 
         Args:
-            number: of the sample; less than before if it is out of order, or after a restart.
-            now: our clock, which never goes back [s].
+            number: smaller than before if out of order or after a restart.
+            now: our monotonic clock [s].
         """
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _JUMP_S:

@@ -1,4 +1,4 @@
-"""Wrench and motion as parts: of one source, or the wrench of one and the motion of another."""
+"""Wrench and motion parts of one or two sources."""
 
 from __future__ import annotations
 
@@ -9,19 +9,11 @@ from drake_teleop.robots.streams import IMU, POSE, WRENCH, Part, PartSource
 
 
 class Parts:
-    """One or two sources as one.
-
-    Args:
-        wrench: tells the wrench, and without `motion` the motion, too.
-        motion: tells the motion.
+    """One or two sources as one; raise DrakeTeleopError if there is no motion.
 
     Attributes:
-        dt: between wrenches [s].
-        told: the stream that tells the motion: poses, if there are some, else an IMU.
-        two_clocks: the times of wrench and motion are of two clocks.
-
-    Raises:
-        DrakeTeleopError: if nobody tells a motion.
+        told: stream of the motion: poses if available, else an IMU.
+        two_clocks: wrench and motion have different clocks.
     """
 
     live = True
@@ -37,7 +29,7 @@ class Parts:
             )
 
     def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
-        """As of `Source`, each with the time when it came."""
+        """Return parts with their times of arrival."""
         found: list[tuple[Part, float]] = []
         if self._motion is not None:
             parts, now = self._motion.read(0.0) or (), time.monotonic()

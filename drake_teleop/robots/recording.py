@@ -1,14 +1,7 @@
-"""What comes from a stream, kept until it is written as a log.
+"""Samples of a stream, collected and written as a log.
 
-Readings make a canonical log. Parts make a table for each stream and a description of them,
-log.yaml: the poses stay as they came, so that `identify` finds the motion, its noise, the delay and
-the drift of the clock as it does of every log, and better than a motion that was differentiated as
-it came. What is damaged, not finite, no pose, or saturated is left out, and so is what comes late.
-A clock that was set begins another part of the record, if `_SET` samples in a row confirm it: fewer
-are wrong stamps, and left out. The longest part is written.
-
-**Clocks.** Streams of one source have one. Those of two are brought together by what each took
-least time for; what is left of that is the delay that is estimated.
+Readings make a canonical log; parts a table for each stream and a description, log.yaml. A set
+clock starts a new part of the record; the longest part is written.
 """
 
 from __future__ import annotations
@@ -36,21 +29,19 @@ _COLUMNS = {
     POSE: (*canonical.ORIENTATION, *canonical.POSITION),
     IMU: (*canonical.SPECIFIC_FORCE, *canonical.ANGULAR_VELOCITY),
 }
-_GRAVITY = 9.81  # as `compensate` has it
-_UNIT = 0.01  # by which the norm of a quaternion may be off
-_SET = 50  # samples in a row on another clock
+_GRAVITY = 9.81  # as in `compensate`
+_UNIT = 0.01  # tolerated error of a quaternion's norm
+_SET = 50  # successive samples that confirm another clock
 _T = TypeVar("_T", contravariant=True)
 
 
 class Records(Protocol[_T]):
-    """Keeps what comes.
+    """Collector of samples.
 
     Attributes:
-        file: name of the log that it writes.
-        files: names of all that it writes.
-        left_out: of what came.
-        began_anew: how often the clock was set.
-        seconds: length of the record.
+        file, files: name of the log, and of all written files.
+        left_out: number of rejected samples.
+        began_anew: number of clock changes.
     """
 
     file: str
@@ -60,23 +51,17 @@ class Records(Protocol[_T]):
 
     @property
     def seconds(self) -> float:
-        """How long what was kept is."""
+        """Length of the record [s]."""
         ...
 
     def take(self, one: _T) -> None:
-        """Keeps it if it is good."""
+        """Add a sample if it is good."""
 
     def write(self, path: Path) -> None:
-        """Writes the log.
-
-        Raises:
-            DrakeTeleopError: if hardly anything came, or it cannot be written.
-        """
+        """Write the log; raise DrakeTeleopError if there are too few samples."""
 
 
 class _Record:
-    """Samples of streams in parts between steps of a clock."""
-
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
         self.left_out, self.began_anew = 0, 0
@@ -107,16 +92,11 @@ class _Record:
 
     @property
     def seconds(self) -> float:
-        """Length of the record [s]."""
         return _seconds(self._best())
 
 
 class Recorder(_Record):
-    """`Records` of readings.
-
-    Args:
-        largest: (6,) the sensor's range [N, N m]; what is at its ends is left out.
-    """
+    """`Records` of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
     file = "log.parquet"
     files: tuple[str, ...] = (file,)
@@ -136,13 +116,7 @@ class Recorder(_Record):
 
 
 class PartRecorder(_Record):
-    """`Records` of what `Parts` reads.
-
-    Args:
-        parts: which streams there are, and whether they have a clock each.
-        largest: see `Recorder`.
-        X_FS: (7,) see `Assembly`.
-    """
+    """`Records` of parts; `X_FS` as in `Assembly`."""
 
     file = "log.yaml"
     files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
@@ -163,7 +137,7 @@ class PartRecorder(_Record):
         self._keep(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
-        """See `Records`. The tables stand beside the log."""
+        """See `Records`."""
         import polars as pl
 
         wrench, motion = (self._best()[stream] for stream in (WRENCH, self._told))
@@ -200,12 +174,7 @@ _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 class _Kept:
-    """Samples of one stream, in order.
-
-    Attributes:
-        t: their times [s].
-        least: our clock less the stream's, of the sample that took least time.
-    """
+    """Samples of one stream; `least` is the minimum of (our - its clock) [s]."""
 
     def __init__(self) -> None:
         self.t: list[float] = []
@@ -216,7 +185,7 @@ class _Kept:
         return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
 
     def add(self, t: float, values: Array, now: float) -> bool:
-        """Whether it came in order; it is kept then."""
+        """Add the sample and return True, unless it is out of order."""
         if self.t and t <= self.t[-1]:
             return False
         self.t.append(t)
@@ -225,7 +194,7 @@ class _Kept:
         return True
 
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
-        """(N,) times and (N, width) values."""
+        """Return times (N,) and values (N, width)."""
         if len(self.t) < 2:
             raise DrakeTeleopError(
                 f"{len(self.t)} good readings came, {left_out} were left out",

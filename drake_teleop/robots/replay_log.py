@@ -1,9 +1,4 @@
-"""A log as a source: what a loop would have been given of it.
-
-Wrench and motion are brought together as `eliminate` does, with the delay that it estimates; the
-loop waits for the motion, and is late by that. Motion that a log tells by poses alone was
-differentiated with a look ahead, see `drake_teleop.logs.causal`.
-"""
+"""A log as a source, aligned as by `eliminate`."""
 
 from __future__ import annotations
 
@@ -24,21 +19,17 @@ from drake_teleop.robots.streams import Flag, Reading
 
 
 class LogSource:
-    """Readings of a log.
+    """Readings of a log. The motion comes late by its delay, `wait` readings.
 
     Args:
-        path: canonical table or log description.
-        load: whose wrench tells the delay; None leaves wrench and motion as they were recorded.
-            If the robot had removed its weight, the specific force is the acceleration alone.
-        cutoff_hz, delay: as of `eliminate_log`.
-        real_time: in the log's own time; else as fast as they are taken.
-        chunk: readings at once.
-
-    Attributes:
-        wait: readings that the motion comes late.
+        load: load for the estimate of the delay; None keeps wrench and motion as recorded. If the
+            robot removed its weight, the acceleration replaces the specific force.
+        cutoff_hz, delay: see `eliminate_log`.
+        real_time: replay in real time; else as fast as possible.
+        chunk: maximum number of readings per call.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, or is of static poses.
+        DrakeTeleopError: if the log cannot be used, or contains static poses.
     """
 
     def __init__(

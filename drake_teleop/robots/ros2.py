@@ -1,9 +1,7 @@
-"""ROS 2 without ROS: what its middleware rmw_zenoh puts into a zenoh network, by eclipse-zenoh.
+"""Protocol of the ROS 2 middleware rmw_zenoh, by the library eclipse-zenoh, without ROS.
 
-A topic is the key `DOMAIN/TOPIC/TYPE/HASH`, a message CDR, which rosbags writes and reads, with an
-attachment: number, time of sending, and who sent it. What is in the graph (`ros2 topic list`) says
-so by a liveliness token. All sessions are clients of a router, `ros2 run rmw_zenoh_cpp
-rmw_zenohd`: nothing listens here, and a router that is not there yet is waited for.
+A topic has the key `DOMAIN/TOPIC/TYPE/HASH`. Messages are CDR, with number, send time and sender
+attached. A liveliness token lists a node in the ROS graph.
 """
 
 from __future__ import annotations
@@ -20,15 +18,11 @@ PORT = 7447
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _NUMBER = struct.Struct("<qq")
 _SENT = struct.Struct("<qqB16s")
-_NAMED = b"\x0fsequence_number"  # how Jazzy's rmw_zenoh 0.2.0 to 0.2.3 began
+_NAMED = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
 
 
 def needed(where: str) -> None:
-    """Refuses to go on without the libraries.
-
-    Raises:
-        DrakeTeleopError: naming the one that is missing.
-    """
+    """Raise DrakeTeleopError if a library is missing."""
     for module, library in (("zenoh", "eclipse-zenoh"), ("rosbags", "rosbags")):
         if importlib.util.find_spec(module) is None:
             raise DrakeTeleopError(
@@ -39,14 +33,14 @@ def needed(where: str) -> None:
 
 
 def types() -> Any:
-    """The messages of ROS 2: `deserialize_cdr`, `serialize_cdr`, `hash_rihs01`, `types`."""
+    """Return the store of ROS 2 message types of rosbags."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def opened(told: Address) -> Any:
-    """A session with the router at that address, now or when it is there."""
+    """Return a session with a router, which may start later."""
     import zenoh
 
     config = zenoh.Config()
@@ -64,16 +58,12 @@ def opened(told: Address) -> Any:
 
 
 def key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Of a topic; with any hash, Humble's having none."""
+    """Return the key of a topic, by default with any hash (Humble has none)."""
     return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
 
 
 def domain_of(told: Address) -> int:
-    """`domain=N`, 0 without.
-
-    Raises:
-        DrakeTeleopError: if it is none.
-    """
+    """Return the parameter `domain`, by default 0; raise DrakeTeleopError if invalid."""
     text = told.text_of("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=told.text)
@@ -81,11 +71,7 @@ def domain_of(told: Address) -> int:
 
 
 def topic_of(told: Address, text: str) -> str:
-    """A topic's name as keys have it, without the slash in front.
-
-    Raises:
-        DrakeTeleopError: if it is none.
-    """
+    """Return a topic name without leading slash; raise DrakeTeleopError if invalid."""
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
@@ -95,7 +81,7 @@ def topic_of(told: Address, text: str) -> str:
 
 
 def tokens(domain: int, session: str, node: str, topic: str, kind: str, hashed: str) -> list[str]:
-    """Of a node with one publisher, which keeps its last ten messages."""
+    """Return the liveliness tokens of a node with one publisher."""
     here = f"@ros2_lv/{domain}/{session}/0"
     name = "%" + topic.replace("/", "%")
     return [
@@ -105,12 +91,12 @@ def tokens(domain: int, session: str, node: str, topic: str, kind: str, hashed: 
 
 
 def attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Of a message, as rmw_zenoh has it since 0.2.4."""
+    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
     return _SENT.pack(number, ns, len(sender), sender)
 
 
 def number_of(attached: bytes) -> int | None:
-    """The number in an attachment of either form; None if there is none."""
+    """Return the number in an attachment, None without."""
     if len(attached) == _SENT.size:
         return int(_NUMBER.unpack_from(attached)[0])
     if attached.startswith(_NAMED) and len(attached) >= len(_NAMED) + 8:

@@ -1,4 +1,4 @@
-"""Wrenches as topics of ROS 2, see `ros2`."""
+"""Wrenches as topics of ROS 2."""
 
 from __future__ import annotations
 
@@ -28,13 +28,7 @@ _NODE = "drake_teleop"
 class Ros2Sink:
     """WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
 
-    Args:
-        address: the contact wrench, or with `wrench=scaled` the scaled one, of the frame NAME. It
-            is stamped with the time when it is sent, since what is zero for want of readings has
-            no other. The flags do not go with it.
-
-    Raises:
-        DrakeTeleopError: if the address cannot be used, or a library is missing.
+    It contains the send time, because stale zeros have no other. Flags are not sent.
     """
 
     def __init__(self, address: str) -> None:
@@ -64,7 +58,7 @@ class Ros2Sink:
         self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
 
     def message(self, wrench: Array, ns: int) -> bytes:
-        """WrenchStamped in CDR."""
+        """Return WrenchStamped in CDR."""
         kinds = self._types.types
         vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
         header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)

@@ -1,4 +1,4 @@
-"""Wrench and motion from topics of ROS 2, see `ros2`."""
+"""Wrench and motion from topics of ROS 2."""
 
 from __future__ import annotations
 
@@ -35,17 +35,16 @@ KINDS = {
     JOINTS: "sensor_msgs/msg/JointState",
 }
 _STREAMS = {"tf": POSE}
-_MOST = 4096  # messages that wait; more are lost, the newest first
-_DEEPEST = 64  # frames from one to another
+_MOST = 4096  # queued messages; newer ones are dropped
+_DEEPEST = 64  # frames in a chain
 
 
 class Messages:
-    """What messages say, in parts.
+    """Conversion of ROS 2 messages to parts.
 
     Args:
-        sign: of wrenches.
-        frames: parent and child whose pose is told by transforms; empty for none.
-        joints: names of the joints whose positions are told, in that order.
+        frames: parent and child of the pose from transforms; empty for none.
+        joints: names of the joints, in the order of the values.
     """
 
     def __init__(
@@ -58,18 +57,12 @@ class Messages:
         self._damaged = SerdeError
         self._links: dict[str, tuple[str, Array]] = {}
         self._counts = dict.fromkeys(KINDS, 0)
-        for name in KINDS:  # what reads them is made now: the first messages would wait for that
+        for name in KINDS:  # creates the deserializers before the first message
             self.parts(name, b"", b"")
         self._counts = dict.fromkeys(KINDS, 0)
 
     def parts(self, name: str, message: bytes, attached: bytes) -> list[Part]:
-        """What a message says, flagged as damaged if it is none. It never raises.
-
-        Args:
-            name: a key of `KINDS`.
-            message: in CDR.
-            attached: to it, see `ros2.number_of`.
-        """
+        """Return the parts of a CDR message with a name in `KINDS`, flagged if it is invalid."""
         self._counts[name] += 1
         number = number_of(attached)
         if number is None:
@@ -90,7 +83,7 @@ class Messages:
         ]
 
     def _values(self, name: str, data: Any) -> Array | None:
-        """None of joints that are of something else, such as a gripper."""
+        """Return the values; None for joints of another device, such as a gripper."""
         if name == WRENCH:
             wrench = data.wrench
             return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
@@ -103,7 +96,7 @@ class Messages:
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
     def _posed(self, data: Any) -> list[tuple[Any, Array]]:
-        """The pose of the child in the parent, if this message says anything new of it."""
+        """Return the pose of the child in the parent, if this message updates it."""
         newest = {each.child_frame_id: each for each in data.transforms}
         for child, each in newest.items():
             motion = each.transform
@@ -127,20 +120,7 @@ class Messages:
 class Ros2Source:
     """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
 
-    Args:
-        address: TOPIC is of WrenchStamped; sign -1, the default, is for a sensor that tells what
-            the load exerts on it. With tf=PARENT,CHILD the pose is that of one frame in another,
-            put together of what `/tf` tells: all frames between them have to be in it. `domain` is
-            that of ROS, 0 without.
-        dt: between wrenches [s].
-        joints: names of the joints of whose JointState `joints` tells, see `Messages`.
-
-    Attributes:
-        streams: see `PartSource`.
-        messages: what read them.
-
-    Raises:
-        DrakeTeleopError: if the address cannot be used, or a library is missing.
+    TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
@@ -170,7 +150,7 @@ class Ros2Source:
             self._session.declare_subscriber(key(domain, topic, KINDS[stream]), self._take(stream))
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
+        """See `PartSource`."""
         found: list[Part] = []
         try:
             found += self.messages.parts(*self._came.get(timeout=timeout_s))
@@ -181,7 +161,7 @@ class Ros2Source:
         return found
 
     def close(self) -> None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._session.close()
 
     def _take(self, stream: str) -> Callable[[Any], None]:
@@ -203,7 +183,6 @@ def _pose(p: Any, q: Any) -> Array:
 
 
 def _moved(a: Array, b: Array) -> Array:
-    """X_a X_b."""
     turn = tuple(a[:4].tolist())
     p = rotate(turn, tuple(b[4:].tolist()))
     return np.array([*multiply(turn, tuple(b[:4].tolist())), *(a[4:] + p)])

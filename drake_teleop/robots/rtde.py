@@ -1,10 +1,4 @@
-"""Universal Robots: wrench, pose and acceleration of the tool by RTDE, with the library ur_rtde.
-
-Of each sample of the controller, 500 or 125 a second: `ft_raw_wrench`, what the sensor in the wrist
-of an e-Series measures; `actual_TCP_pose` in the frame of the robot's base, z upwards; and
-`actual_tool_accelerometer`. With a TCP of zero in the robot's installation the pose is that of the
-flange, where the sensor is. The library runs in a process of its own, see `rtde_reader`.
-"""
+"""Universal Robots: wrench, pose and tool acceleration by RTDE, with the library ur_rtde."""
 
 from __future__ import annotations
 
@@ -25,20 +19,17 @@ from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
-_FIRST_S = 10.0  # to wait for the robot at the start
-_AGAIN_S = 0.2  # from one start of the child to the next
-_FIRST = 5  # samples that tell the rate
+_FIRST_S = 10.0  # wait for the robot at the start
+_AGAIN_S = 0.2  # between two starts of the child
+_FIRST = 5  # samples for the rate
 _BLOCK = 65536
 
 
 class RtdeSource:
-    """Parts of rtde://HOST[?sign=-1]: wrench, pose and acceleration, of the same instants.
-
-    Args:
-        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
+    """Parts of rtde://HOST[?sign=-1], of the same instants, 500 or 125 a second.
 
     Raises:
-        DrakeTeleopError: if the address cannot be used, ur_rtde is missing, or no robot answers.
+        DrakeTeleopError: if the address is invalid, ur_rtde is missing, or no robot answers.
     """
 
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
@@ -55,7 +46,7 @@ class RtdeSource:
             )
         self._host, self._sign, self._rest, self._began = told.host, told.sign(), b"", 0.0
         self._start()
-        exponential((0.0, 0.0, 0.0))  # what is compiled is loaded now
+        exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
         until = time.monotonic() + _FIRST_S
         while len(self._first) < _FIRST and (left := until - time.monotonic()) > 0.0:
@@ -67,12 +58,12 @@ class RtdeSource:
         self.dt = 0.002 if spacing < 0.005 else 0.008
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
+        """See `PartSource`."""
         samples, self._first = [*self._first, *self._samples(timeout_s)], []
         return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
 
     def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
-        """Those that have come; starts the child anew if it has ended."""
+        """Return the received samples; restart an ended child process."""
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
         block = os.read(self._pipe, _BLOCK)
@@ -106,12 +97,12 @@ class RtdeSource:
         os.close(self._pipe)
 
     def close(self) -> None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._end()
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """What a sample of `rtde_reader` tells, see `RtdeSource`. It never raises."""
+    """Return the parts of a sample."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     told = {

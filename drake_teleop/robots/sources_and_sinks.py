@@ -45,22 +45,19 @@ def source_of(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> Source:
-    """The source at an address: udp, posed, rtde, netft, zenoh, - for stdin, or replay:LOG.
+    """Return the source at an address (docs/robot.md).
 
     Args:
-        address: see the sources; docs/robot.md lists them.
-        load: tells the delay, of a log that of which it is the wrench, else its own.
-        rate_hz: of the wrenches; a log, a UR and a NetBox tell their own.
-        cutoff_hz, delay: as of `eliminate_log`; see `Assembly`, too, where "auto" begins with the
-            delay of the load file, and follows it.
-        real_time: replays a log in its own time.
-        motion: address of another source that tells the motion, if the first does not.
-        sensor_pose: of the sensor in the frame whose poses come: x, y, z [m], and roll, pitch, yaw
-            [deg] about its axes, as in a URDF.
-        arm: whose joint positions come.
+        load: identified load, for the delay and for `weight_removed`.
+        rate_hz: rate of the wrenches; logs, UR robots and NetBoxes deliver their own.
+        cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live parts.
+        real_time: replay a log in real time.
+        motion: address of a second source, for the motion.
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
+        arm: kinematics for joint positions.
 
     Raises:
-        DrakeTeleopError: for another address, a live source without a rate, or as the source does.
+        DrakeTeleopError: for an invalid address, a missing rate, or an error of the source.
     """
     kind = _kind(address)
     if kind in _OF_PARTS:
@@ -103,17 +100,9 @@ def recorded(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Any, Records[Any]]:
-    """What `calibrate` reads, readings or parts as they come, and who keeps them.
-
-    Args:
-        address, real_time, motion, sensor_pose, arm: see `source_of`.
-        largest: see `Recorder`.
-
-    Raises:
-        DrakeTeleopError: as `source_of`.
-    """
+    """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
-    # All is kept with its times: the rate is asked of a box alone, whose times are counts.
+    # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _ANY_HZ
     if kind in _OF_PARTS:
         parts = _parts(address, rate_hz, motion, arm)
@@ -123,16 +112,12 @@ def recorded(
 
 
 def is_file(address: str) -> bool:
-    """Whether a sink is a file, or a folder of them."""
+    """Return whether a sink is a file or a folder of files."""
     return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
 
 
 def sink_of(address: str) -> Sink:
-    """The sink at an address: udp, zenoh, foxglove, - for stdout, .csv, .parquet or .mcap.
-
-    Raises:
-        DrakeTeleopError: for another address, or as the sink does.
-    """
+    """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
     kind, path = _kind(address), Path(address)
     if kind == "-":
         return LineSink(sys.stdout)
@@ -152,7 +137,7 @@ def sink_of(address: str) -> Sink:
 
 
 def _kind(address: str) -> str:
-    """What stands before ://; "-", "replay", or "" for a file."""
+    """Return the scheme of the address; "" for a file."""
     if address.startswith(_REPLAY):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""

@@ -1,8 +1,8 @@
-"""Readings and wrenches in UDP packets of a fixed layout, as `drake_teleop_udp.h` has it in C.
+"""Readings and wrenches in UDP packets, with the layout of `drake_teleop_udp.h`.
 
-Little-endian, without padding. In: "DTW1", flags (of `Flag`, SATURATED alone is read), number,
-time [s], 15 numbers; or "DTP1", the same, wrench (6), pose (w x y z, position). Out: "DTC1",
-flags, number, time [s], contact (6), scaled (6).
+Little-endian, without padding. Input: "DTW1", flags (`Flag.SATURATED` only), number, time [s],
+15 numbers; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
+same head, contact (6), scaled (6).
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ POSED = struct.Struct("<4sIQd13d")
 WRENCH = struct.Struct("<4sIQd12d")
 _IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
-_MOST = 256  # packets at once
-_BUFFER = 1 << 20  # bytes: a tenth of a second at 8 kHz, while the system is busy elsewhere
+_MOST = 256  # packets per call
+_BUFFER = 1 << 20  # bytes: a tenth of a second at 8 kHz
 _SATURATED = int(Flag.SATURATED)
 
 
 def packed(reading: Reading) -> bytes:
-    """The packet of a reading."""
+    """Return the packet of a reading."""
     return READING.pack(_IN, reading.flags, reading.number, reading.t, *reading.values)
 
 
 def unpacked(packet: bytes) -> Reading:
-    """The reading in a packet, `DAMAGED` if it is none. It never raises."""
+    """Return the reading in a packet, `DAMAGED` if it is invalid."""
     if len(packet) != READING.size or packet[:4] != _IN:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -46,13 +46,13 @@ def unpacked(packet: bytes) -> Reading:
 
 
 def packed_parts(wrench: Part, pose: Part) -> bytes:
-    """The packet of a wrench and a pose of the same instant."""
+    """Return the packet of a wrench and a pose."""
     head = _POSED, wrench.flags, wrench.number, wrench.t
     return POSED.pack(*head, *wrench.values, *pose.values)
 
 
 def unpacked_parts(packet: bytes) -> list[Part]:
-    """Wrench and pose in a packet, a damaged wrench if it is none. It never raises."""
+    """Return wrench and pose in a packet, a damaged wrench if it is invalid."""
     if len(packet) != POSED.size or packet[:4] != _POSED:
         return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -62,17 +62,13 @@ def unpacked_parts(packet: bytes) -> list[Part]:
 
 
 def packed_wrench(out: Compensated) -> bytes:
-    """The packet of a wrench."""
+    """Return the packet of a wrench."""
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
     return _HEAD.pack(_OUT, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpacked_wrench(packet: bytes) -> Compensated:
-    """The wrench in a packet.
-
-    Raises:
-        DrakeTeleopError: if there is none.
-    """
+    """Return the wrench in a packet; raise DrakeTeleopError if it is invalid."""
     if len(packet) != WRENCH.size or packet[:4] != _OUT:
         raise DrakeTeleopError("is no wrench", where="packet")
     _, flags, number, t, *values = WRENCH.unpack(packet)
@@ -80,11 +76,7 @@ def unpacked_wrench(packet: bytes) -> Compensated:
 
 
 def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
-    """Host and port of udp://HOST:PORT; without a host, this machine, without a port, that one.
-
-    Raises:
-        DrakeTeleopError: if there is no port.
-    """
+    """Return host (default: this machine) and port; raise DrakeTeleopError without a port."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
@@ -98,11 +90,7 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """A socket that packets can be sent to.
-
-    Raises:
-        DrakeTeleopError: if the address is not this machine's, or taken.
-    """
+    """Return a socket that receives packets; raise DrakeTeleopError if the address is in use."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -113,8 +101,6 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 class _Receiver:
-    """Packets that are sent to a port. Only this machine can, unless HOST says otherwise."""
-
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = listening(*endpoint(address))
@@ -125,7 +111,6 @@ class _Receiver:
         self.port = self._socket.getsockname()[1]
 
     def packets(self, timeout_s: float) -> list[bytes]:
-        """Those that have come."""
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
@@ -134,7 +119,6 @@ class _Receiver:
         return found
 
     def close(self) -> None:
-        """See `Source`."""
         self._socket.close()
 
 
@@ -149,12 +133,7 @@ class UdpSource(_Receiver):
 
 
 class PosedSource(_Receiver):
-    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1].
-
-    Args:
-        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
-        dt: between packets [s].
-    """
+    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1]."""
 
     streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
 
@@ -170,14 +149,14 @@ class PosedSource(_Receiver):
 
 
 class UdpSink:
-    """Wrenches, sent to HOST:PORT. Nobody has to listen."""
+    """Wrenches, sent to HOST:PORT whether there is a receiver or not."""
 
     def __init__(self, address: str) -> None:
         self._to = endpoint(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`. What cannot be sent now is too old later."""
+        """Send a wrench; packets that cannot be sent now are dropped."""
         try:
             self._socket.sendto(packed_wrench(out), self._to)
         except OSError as error:
