@@ -1,8 +1,4 @@
-"""Dataclass fields that know their unit and their plausible range, and the check that uses them.
-
-A scenario's blocks declare their parameters with `quantity`, so that one line says default, unit,
-range and meaning, and a value that cannot be right is refused where it stands.
-"""
+"""Dataclass fields with unit, plausible range and meaning."""
 
 from __future__ import annotations
 
@@ -18,17 +14,16 @@ from typing import Any, NamedTuple
 from drake_teleop.common.errors import DrakeTeleopError, inside, meant
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
-"""What a field that is no block may hold, in words."""
+"""Types of values, in words."""
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
-    """A dataclass field holding a number or a list of numbers.
+    """Return a dataclass field for a number or, with a list as default, a vector.
 
     Args:
-        default: the default value, in `unit`; a list makes a vector of that length.
-        unit: SI unit, "1" if it has none.
-        low, high: the closed range in which a value is plausible.
-        doc: what it is, with frame and source.
+        unit: SI unit, "1" if dimensionless.
+        low, high: the closed plausible range.
+        doc: meaning, with frame and source.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
     if isinstance(default, list):
@@ -38,36 +33,34 @@ def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
 
 
 def choice(default: str, choices: Sequence[str], doc: str) -> Any:
-    """A dataclass field holding one of a few words."""
+    """Return a dataclass field for one of several words."""
     return dataclasses.field(default=default, metadata={"choices": tuple(choices), "doc": doc})
 
 
 def plain(default: Any, doc: str) -> Any:
-    """A dataclass field holding a flag, a word, a whole number, or a list of these or of blocks."""
+    """Return a dataclass field for a flag, word, integer, or a list."""
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata={"doc": doc})
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
 def in_short(value: Any) -> str:
-    """A value for a message: six digits of a float, of the rest what is short."""
+    """Return a short text for a message."""
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return reprlib.repr(value)
-    # Of a seed all digits, of a longer integer the first and the last.
+    # All digits of a seed; a longer integer is shortened in the middle.
     return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Checks parsed YAML against a dataclass before it is loaded.
+    """Check parsed YAML against a dataclass before it is loaded.
 
     Args:
-        schema: the dataclass.
-        data: what the YAML parser made of the file (mappings, sequences, scalars; the tag of a
-            variant under the key "_tag").
-        where: the place for the message, as `file` or `file:field`.
-        tagged: whether it is one of several kinds, so that a tag may say which.
+        data: mappings, sequences, scalars; the tag of a variant has the key "_tag".
+        where: `file` or `file:field`.
+        tagged: whether a tag may select one of several kinds.
 
     Raises:
         DrakeTeleopError: for an unknown field, or a value of the wrong kind.
@@ -90,7 +83,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
-    """Raises DrakeTeleopError, with the field that may be meant, unless the dataclass has it."""
+    """Raise DrakeTeleopError, with a similar name, unless the dataclass has this field."""
     names = _names(schema)
     if name not in names:
         remedy = meant(name, names, f"fields: {', '.join(names)}")
@@ -98,11 +91,10 @@ def check_name(schema: type, name: Any, where: str) -> None:
 
 
 def check_ranges(config: Any, where: str) -> None:
-    """Checks every field of a dataclass (and of the dataclasses inside it): kind and range.
+    """Check all values of a dataclass, recursively.
 
     Raises:
-        DrakeTeleopError: naming the field, its unit and the range, for a value that is of another
-            kind, outside, not finite, of the wrong length or not among the choices.
+        DrakeTeleopError: for another kind or length, or a value outside its range or choices.
     """
     kinds = _kinds(config.__class__)
     for field in dataclasses.fields(config):
@@ -131,7 +123,7 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
-        if not low <= number <= high:  # nor if it is no number
+        if not low <= number <= high:  # also false for NaN
             raise DrakeTeleopError(
                 f"{in_short(number)}{unit} is outside {in_short(low)} to {in_short(high)}{unit}",
                 where=place,
@@ -149,7 +141,7 @@ def _names(schema: type) -> list[str]:
 
 
 class Kind(NamedTuple):
-    """What the type of a field says: `list[A | B] | None` is (1, (A, B), True)."""
+    """Structure of a type: `list[A | B] | None` is (1, (A, B), True)."""
 
     lists: int
     items: tuple[Any, ...]
@@ -158,7 +150,7 @@ class Kind(NamedTuple):
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """The type of a field, taken apart."""
+    """Return the structure of a type."""
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
@@ -170,15 +162,7 @@ def kind_of(hint: Any) -> Kind:
 
 
 def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
-    """Descends into lists; refuses words where numbers are wanted, and the like.
-
-    Args:
-        kind: of the field.
-        value: what stands there.
-        place: for the message.
-        from_file: whether it is what a YAML parser made of a file. Then blocks are mappings, which
-            are descended into, and a number may be a word still, such as 1e-3.
-    """
+    """Check a value; blocks from a file are mappings, and numbers may be words such as 1e-3."""
     first = kind.items[0]
     if value is None and kind.optional:
         return
@@ -200,7 +184,7 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
 
 
 def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
-    """The one that the tag of a mapping tells; the first if it has none."""
+    """Return the dataclass that a tag selects, by default the first."""
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:

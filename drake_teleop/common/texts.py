@@ -1,9 +1,8 @@
-"""YAML and JSON files as plain data: what may be read in two ways, or be dropped, is an error.
+"""YAML and JSON files as plain data, without ambiguity.
 
-YAML is read by the core schema of version 1.2, as editors do: a number is decimal, `1:30` and `yes`
-are words, `1e-3` is a number. Refused are keys that stand there twice or are no words, integers
-that begin with 0 (octal in YAML 1.1), integers beyond 64 bits, and more than a file for people
-holds. Nothing in a file is ever executed, whatever its tags say.
+YAML has the core schema of version 1.2: `1:30` and `yes` are words, `1e-3` is a number. Repeated or
+non-string keys, integers with leading 0 (octal in YAML 1.1) or beyond 64 bits, and huge files are
+rejected. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ import yaml
 
 from drake_teleop.common.errors import DrakeTeleopError, inside, one_line
 
-_MOST_VALUES = 50_000  # with what aliases repeat
-_DEEPEST = 50  # brackets inside each other
-_LONGEST_INTEGER = 18  # digits: so many are always in 64 bits
+_MOST_VALUES = 50_000  # including repetitions by aliases
+_DEEPEST = 50  # nested brackets
+_LONGEST_INTEGER = 18  # digits, always within 64 bits
 
 _TAG = "tag:yaml.org,2002:"
 _CORE = (
@@ -38,26 +37,26 @@ _CORE = (
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's parser with the scalars of YAML 1.2; it makes nodes here, and no objects."""
+    """PyYAML's parser with the scalars of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level >= _DEEPEST:  # of which it would look at thousands before it made nodes
+        if self.flow_level >= _DEEPEST:  # PyYAML scans thousands before it creates nodes
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        # Counted here too, so that a huge file is not read to its end.
+        # Counted here too, to stop reading a huge file early.
         self.nodes = getattr(self, "nodes", 0) + 1
-        if self.nodes > 2 * _MOST_VALUES:  # names are nodes as well
+        if self.nodes > 2 * _MOST_VALUES:  # names are nodes too
             what = f"there are more than {_MOST_VALUES} values"
             raise yaml.composer.ComposerError(None, None, what, self.get_mark())
         return super().compose_node(parent, index)
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's emitter that quotes what is no word in YAML 1.1 or in 1.2."""
+    """PyYAML's emitter; it quotes texts that are not words in YAML 1.1 and 1.2."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -79,20 +78,19 @@ for _kind, _, _first in _CORE:
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """What a YAML file holds: dicts, lists, words, numbers, flags and None.
+    """Return the data of a YAML file.
 
     Args:
-        path: the file.
-        tagged: whether a mapping may have a tag, such as `!Touch`; it is then found under "_tag".
+        tagged: allow tags of mappings, such as `!Touch`, returned under "_tag".
 
     Raises:
-        DrakeTeleopError: naming file and field (and line), see the top of this module.
+        DrakeTeleopError: with file, field and line.
     """
     return yaml_data(read_text(path), str(path), tagged=tagged)
 
 
 def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
-    """As `read_yaml`, of a text; `where` is its place for messages."""
+    """Return the data of a YAML text; `where` is its place for messages."""
     try:
         node = yaml.compose(text, _Loader)
         return None if node is None else _Reading(tagged).data(node, where)
@@ -110,15 +108,11 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
 def yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data.
+    """Return YAML that `read_yaml` reads as the same data; raise DrakeTeleopError if impossible.
 
     Args:
-        data: as `read_yaml` gives it, with the tag of a mapping under "_tag".
-        head: comments above it, a line each.
-        comments: comments behind fields, by the place of the field, "block.field".
-
-    Raises:
-        DrakeTeleopError: if it would be read as something else.
+        head: comment lines at the top.
+        comments: comments behind fields, by place, "block.field".
     """
     lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
@@ -133,7 +127,7 @@ def yaml_text(
 
 
 def yaml_scalar(value: Any, flow: bool | None = True) -> str:
-    """Return a value as YAML in one line; with `flow` None, blocks are lines of their own."""
+    """Return YAML in one line; with `flow` None, blocks have their own lines."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,
@@ -146,11 +140,7 @@ def yaml_scalar(value: Any, flow: bool | None = True) -> str:
 
 
 def read_json(path: str | Path) -> Any:
-    """What a JSON file holds; an integer that is too long for one is a float.
-
-    Raises:
-        DrakeTeleopError: naming the file, if it cannot be read, is no JSON, or holds a field twice.
-    """
+    """Return the data of a JSON file; raise DrakeTeleopError if invalid or ambiguous."""
     where, text = str(path), read_text(path)
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -174,11 +164,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a file.
-
-    Raises:
-        DrakeTeleopError: naming the file, if it cannot be read or is not in UTF-8.
-    """
+    """Return the text of a file; raise DrakeTeleopError if unreadable or not UTF-8."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -189,7 +175,7 @@ def read_text(path: str | Path) -> str:
 
 
 class _Reading:
-    """From nodes to data; counts the values, since aliases of aliases would have no end."""
+    """Conversion of nodes to data, with a limited number of values."""
 
     def __init__(self, tagged: bool) -> None:
         self._tagged = tagged
@@ -218,7 +204,7 @@ class _Reading:
             if key.value == "_tag":
                 raise _wrong("there is no such field", key, field, "a kind is a tag: !Kind {...}")
             found[key.value] = self.data(value, field)
-        if node.tag not in (f"{_TAG}map", "!"):  # YAML's own sign for no kind in particular
+        if node.tag not in (f"{_TAG}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
                 raise _wrong(f"the tag {_shown(node.tag)} means nothing here", node, place)
             found["_tag"] = node.tag

@@ -38,7 +38,7 @@ class Address:
         return self._said.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
-        """Return `count` positive numbers, None without the parameter; else raise DrakeTeleopError."""
+        """Return `count` positive numbers, None if absent; raise DrakeTeleopError otherwise."""
         text = self._said.get(name)
         if text is None:
             return None

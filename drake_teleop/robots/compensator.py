@@ -146,7 +146,7 @@ class Compensator:
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
-        """Set the offsets to their mean in `TARE_S`; return the result, or the reason of refusal."""
+        """Set the offsets to their mean in `TARE_S`; return the result or why it is refused."""
         if self.rested < len(self._rest):
             return f"refused: there are not {TARE_S:g} s of good readings yet"
         spread = self._rest.std(axis=0)
