@@ -34,10 +34,10 @@ from drake_teleop.load.tolerance import (
     sizes_of,
     values_of,
 )
-from drake_teleop.robots.calibrate import DEFAULT, calibrate
-from drake_teleop.robots.calibration import Look
+from drake_teleop.robots.calibrate import DEFAULT_TOLERANCE, calibrate
+from drake_teleop.robots.calibration import Evaluation
 from drake_teleop.robots.joints import SensorPoseOfJoints
-from drake_teleop.robots.sources_and_sinks import recorded
+from drake_teleop.robots.sources_and_sinks import open_recording
 
 _BAR, _DECADES = 24, 3.0  # cells, and decades of the half-width over the tolerance
 
@@ -46,7 +46,7 @@ def calibrate_command(
     source: str,
     out: Path,
     *,
-    until: str = DEFAULT,
+    until: str = DEFAULT_TOLERANCE,
     largest: tuple[float, float] | None = None,
     seconds: float = 120.0,
     real_time: bool = False,
@@ -60,7 +60,7 @@ def calibrate_command(
     """The command `calibrate`; see the top of this module.
 
     Args:
-        source, real_time, motion, sensor_pose: see `source_of`.
+        source, real_time, motion, sensor_pose: see `open_source`.
         out: the folder.
         until: see `read_tolerance`.
         largest: the sensor's range [N], [N m].
@@ -77,7 +77,7 @@ def calibrate_command(
     tolerance = read_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
-    stream, recorder = recorded(
+    stream, recorder = open_recording(
         source, limits, real_time=real_time, motion=motion, sensor_pose=sensor_pose, arm=arm
     )
     console = Console(stderr=True, quiet=quiet)
@@ -85,7 +85,7 @@ def calibrate_command(
     try:
         with Live(console=console, auto_refresh=False) as live:
 
-            def show(at: Look) -> None:
+            def show(at: Evaluation) -> None:
                 live.update(shown(at, tolerance), refresh=True)
 
             path = out / recorder.file
@@ -116,7 +116,7 @@ def calibrate_command(
     return summary
 
 
-def shown(at: Look, tolerance: Tolerance) -> Group:
+def shown(at: Evaluation, tolerance: Tolerance) -> Group:
     """The table of a look, and what to do next."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
@@ -149,7 +149,7 @@ def _bar(half: float, known: bool) -> Text:
     return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")
 
 
-def _verdict(at: Look, k: int) -> str:
+def _verdict(at: Evaluation, k: int) -> str:
     if at.known[k]:
         return "known"
     if not np.isfinite(at.half[k]):
@@ -159,7 +159,7 @@ def _verdict(at: Look, k: int) -> str:
     return "almost" if at.half[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
     """Half-widths of the 95 % intervals over the tolerances, and the advice under them."""
     with house_style():
         figure = Picture(figsize=(9, 5.5))

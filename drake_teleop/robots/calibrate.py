@@ -10,10 +10,15 @@ from typing import Protocol, TypeVar
 
 from drake_teleop.common.writing import set_aside
 from drake_teleop.load.tolerance import Tolerance
-from drake_teleop.robots.calibration import FIRST_S, GROWS, Look, look
+from drake_teleop.robots.calibration import (
+    FIRST_RECORD_S,
+    RECORD_GROWTH,
+    Evaluation,
+    evaluate_record,
+)
 from drake_teleop.robots.recording import Records
 
-DEFAULT = "mass 0.5 %, com 0.5 mm, inertia 5 %"
+DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
 """Default tolerances."""
 _IDLE_S = 0.05
 _T = TypeVar("_T")
@@ -34,8 +39,8 @@ def calibrate(
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     seconds: float = 120.0,
-    show: Callable[[Look], None] = lambda _: None,
-) -> list[Look]:
+    show: Callable[[Evaluation], None] = lambda _: None,
+) -> list[Evaluation]:
     """Record a stream until the tolerance is met, the source ends or the time is over.
 
     Args:
@@ -50,12 +55,12 @@ def calibrate(
     Raises:
         DrakeTeleopError: if too few samples came, or the record cannot be written.
     """
-    looks, after = list[Look](), FIRST_S
+    results, next_length_s = list[Evaluation](), FIRST_RECORD_S
     earlier = [path.with_name(name) for name in recorder.files] if source.live else []
-    pending: Future[Look] | None = None
+    pending: Future[Evaluation] | None = None
 
-    def seen(result: Look) -> bool:
-        looks.append(result)
+    def finish(result: Evaluation) -> bool:
+        results.append(result)
         show(result)
         return bool(result.known.all())
 
@@ -65,31 +70,33 @@ def calibrate(
             earlier.clear()
         recorder.write(path)
 
-    over = False
+    done = False
     try:
-        with ThreadPoolExecutor(1) as beside, suppress(KeyboardInterrupt):
-            while not over and (readings := source.read(_IDLE_S)) is not None:
+        with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
+            while not done and (readings := source.read(_IDLE_S)) is not None:
                 for each in readings:
                     recorder.take(each)
-                    if pending is None and recorder.seconds >= after:
-                        after = max(FIRST_S, GROWS * recorder.seconds)
+                    if pending is None and recorder.seconds >= next_length_s:
+                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.seconds)
                         record()
                         options = {"cutoff_hz": cutoff_hz, "delay": delay}
-                        before = looks[-1] if looks else None
-                        pending = beside.submit(look, path, tolerance, before, **options)  # type: ignore[arg-type]
+                        previous = results[-1] if results else None
+                        pending = executor.submit(
+                            evaluate_record, path, tolerance, previous, **options
+                        )  # type: ignore[arg-type]
                     if pending is not None and (not source.live or pending.done()):
-                        over, pending = seen(pending.result()), None
-                        if over:
+                        done, pending = finish(pending.result()), None
+                        if done:
                             break
-                over = over or recorder.seconds >= seconds
+                done = done or recorder.seconds >= seconds
     except Exception:
         if recorder.seconds:
             record()
         raise
     if pending is not None:
-        seen(pending.result())
-    if not looks or not looks[-1].known.all():
+        finish(pending.result())
+    if not results or not results[-1].known.all():
         record()
-        before = looks[-1] if looks else None
-        seen(look(path, tolerance, before, cutoff_hz=cutoff_hz, delay=delay))
-    return looks
+        previous = results[-1] if results else None
+        finish(evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay))
+    return results

@@ -20,39 +20,39 @@ from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
 
-SURE = 0.9998
+CONFIDENCE = 0.9998
 """Level of the interval that must be within the tolerance."""
-GROWS = 1.12
+RECORD_GROWTH = 1.12
 """Growth factor of the record from one result to the next."""
-FIRST_S = 1.0
+FIRST_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
-FEWEST_DEGREES = 20.0
+MIN_DEGREES_OF_FREEDOM = 20.0
 """Minimum degrees of freedom of the variance of a known number."""
-_ANEW = "start again: the record has another zero or another load from t = {t:.2f} s on"
+_START_AGAIN = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
-_GUESS = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
-_NOISE = np.repeat([0.25, 0.012], 3)
-_NOTHING = 1e-12  # relative information that keeps matrices regular
+_INITIAL_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
+_INITIAL_NOISE = np.repeat([0.25, 0.012], 3)
+_REGULARIZATION = 1e-12  # relative information that keeps matrices regular
 # Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
-    ("swing the wrist about {axis}, briskly, by 20 deg to and fro", np.radians(20.0), 1.5),
+    ("swing the wrist about {axis}, briskly, by 20 deg back and forth", np.radians(20.0), 1.5),
 )
-_LASTS, _SAMPLES = 4.0, 80
+_MOTION_S, _MOTION_SAMPLES = 4.0, 80
 # Independent samples per second and hertz of the low-pass.
-_INDEPENDENT = 2.2
+_INDEPENDENT_PER_S_HZ = 2.2
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Evaluation:
     """Intermediate result of a calibration.
 
     Attributes:
         t: length of the record [s].
         found: the identification; None if it failed for the reason `why`.
         half: (k,) half-widths of the 95 % intervals over the tolerances.
-        sure: (k,) whether the interval of level `SURE` is within the tolerance.
+        sure: (k,) whether the interval of level `CONFIDENCE` is within the tolerance.
         known: (k,) whether the previous one also was.
         doubts: problems of the record; no parameter is known then.
         advice: the next motion; "" if all parameters are known.
@@ -68,15 +68,15 @@ class Look:
     advice: str
 
 
-def look(
+def evaluate_record(
     path: Path,
     tolerance: Tolerance,
-    before: Look | None,
+    previous: Evaluation | None,
     *,
     cutoff_hz: float | None,
     delay: str | float,
-) -> Look:
-    """Identify the present record; `before` is the previous result."""
+) -> Evaluation:
+    """Identify the present record; `previous` is the previous result."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -84,51 +84,53 @@ def look(
         why = str(error)
     half, sure = np.full(count, np.inf), np.zeros(count, bool)
     doubts: tuple[str, ...] = ()
-    phi, noise, log = _GUESS, _NOISE, None
+    phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE, None
     if found is not None:
         load, log = found.identification, found.log
         half, wider, degrees = half_widths(found, tolerance)
-        doubts = doubts_of(found)
-        sure = (wider <= 1.0) & (degrees >= FEWEST_DEGREES) & (not doubts)
+        doubts = record_problems(found)
+        sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
-            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _NOISE)
-    known = sure & (before is not None and before.sure)
+            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE)
+    known = sure & (previous is not None and previous.sure)
     if log is not None and sure.all():
-        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, "")
+        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, "")
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGES] if found else []
     if log is not None and changes:
-        advice = _ANEW.format(t=min(changes))
-        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
+        advice = _START_AGAIN.format(t=min(changes))
+        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
     try:
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
     except DrakeTeleopError:  # too few samples
-        return Look(0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x"))
-    advice = missing_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
-    return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
+        return Evaluation(
+            0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x")
+        )
+    advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+    return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return half-widths at 95 % and `SURE` over the tolerances, and degrees of freedom."""
+    """Return half-widths at 95 % and `CONFIDENCE` over the tolerances, and degrees of freedom."""
     load = found.identification
     errors = errors_of(tolerance, load.phi)
     deviations = deviations_of(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
-    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, SURE))
+    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, CONFIDENCE))
     return half, sure, degrees
 
 
-def doubts_of(found: IdentifiedLog) -> tuple[str, ...]:
+def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
     """Return problems that invalidate all intervals."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
-        doubts.append("there are only poses at rest")
+        doubts.append("all poses are at rest")
     if found.identification.mass <= 0.0:
-        doubts.append("the mass is negative: the wrench has the other sign")
+        doubts.append("the mass is negative: the wrench has the opposite sign")
     return tuple(doubts)
 
 
-def missing_motion(
+def best_motion(
     motion: tuple[Array, Array, Array],
     dt: float,
     cutoff_hz: float | None,
@@ -142,15 +144,15 @@ def missing_motion(
         errors: (k, 16) from `errors_of`.
         noise: (6,) of a sample's wrench [N, N m].
     """
-    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT * cutoff_hz)
+    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)
     equations = NormalEquations(noise)
     equations.add(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
     size = np.sqrt(np.diag(gram).max()) + 1.0
-    gram = gram + _NOTHING * size**2 * np.eye(16)
+    gram = gram + _REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
-    for words, of_motion in _primitives(last, noise, rate):
+    for words, of_motion in _candidate_motions(last, noise, rate):
         left = deviations_of(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
@@ -158,10 +160,10 @@ def missing_motion(
     return best
 
 
-def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
+def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
     """Yield words and information (16, 16) of motions that start at the specific force `up`."""
     s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
-    t = np.arange(_SAMPLES) * (_LASTS / _SAMPLES)
+    t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
     for words, size, hertz in _MOTIONS:
         w = 2.0 * np.pi * hertz
         angle, speed = 0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t)
@@ -175,7 +177,7 @@ def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Arr
                 + np.outer(1.0 - np.cos(angle), e * (e @ s0))
             )
             V = regressor(s, np.outer(speed, e), np.outer(change, e))
-            rows = np.concatenate([np.tile(np.eye(6), (_SAMPLES, 1, 1)), V], axis=2)
+            rows = np.concatenate([np.tile(np.eye(6), (_MOTION_SAMPLES, 1, 1)), V], axis=2)
             rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
-            share = rate * _LASTS / _SAMPLES
+            share = rate * _MOTION_S / _MOTION_SAMPLES
             yield words.format(axis=axis), share * (rows.T @ rows)

@@ -19,8 +19,8 @@ from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
 from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.joints import SensorPoseOfJoints
-from drake_teleop.robots.lines import names_of
-from drake_teleop.robots.sources_and_sinks import is_file, sink_of, source_of
+from drake_teleop.robots.lines import flag_names
+from drake_teleop.robots.sources_and_sinks import is_file, open_sink, open_source
 from drake_teleop.robots.streams import Compensated, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
 from drake_teleop.robots.watch import Watch
@@ -39,9 +39,11 @@ class Control:
     def answer(self, tare: Callable[[], str]) -> None:
         """Answer a waiting request."""
         try:
-            words, asker = self._socket.recvfrom(64)
-            known = words.strip() == b"tare"
-            self._socket.sendto((tare() if known else "unknown: say tare").encode(), asker)
+            request, sender = self._socket.recvfrom(64)
+            valid = request.strip() == b"tare"
+            self._socket.sendto(
+                (tare() if valid else "unknown request: send tare").encode(), sender
+            )
         except OSError:  # no request, or the sender is gone
             pass
 
@@ -58,7 +60,7 @@ def run(
     control: Control | None = None,
     tare: bool = False,
     changes: Changes | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
     """Compensate until the source ends, or Ctrl-C.
 
@@ -70,32 +72,36 @@ def run(
         The number of wrenches, under "wrenches", and the number with each flag.
     """
     counts: Counter[str] = Counter(wrenches=0)
-    tare_at = np.inf if not tare else round(TARE_S / source.dt)
+    tare_count = np.inf if not tare else round(TARE_S / source.dt)
 
-    def put(out: Compensated) -> None:
+    def write(out: Compensated) -> None:
         sink.write(out)
         counts["wrenches"] += 1
-        for name in names_of(out.flags) if out.flags else ():
+        for name in flag_names(out.flags) if out.flags else ():
             if counts[name] == 0:
-                say(f"t = {out.t:.3f} s: {name}")
+                report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def waited() -> float:
-        left = compensator.left(time.monotonic())
+    def timeout_s() -> float:
+        left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
     with suppress(KeyboardInterrupt):
-        while (readings := source.read(waited())) is not None:
-            if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
-                put(stale)
+        while (readings := source.read(timeout_s())) is not None:
+            if (
+                source.live
+                and (stale := compensator.stale_output(time.monotonic()))
+                and not readings
+            ):
+                write(stale)
             for reading in readings:
                 out = compensator.step(reading, time.monotonic() if source.live else reading.t)
-                put(out)
+                write(out)
                 if changes is not None:
                     changes.take(reading, out.flags)
-                if compensator.rested >= tare_at:
-                    tare_at = np.inf
-                    say(f"tare {compensator.tare()}")
+                if compensator.good_count >= tare_count:
+                    tare_count = np.inf
+                    report(f"tare {compensator.tare()}")
             if control is not None:
                 control.answer(compensator.tare)
     return counts
@@ -125,7 +131,7 @@ def compensate_command(
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        sigma, gamma, cutoff_hz, predicted: see `Compensator`; other options: `source_of`.
+        sigma, gamma, cutoff_hz, predicted: see `Compensator`; other options: `open_source`.
         largest: range of the sensor [N], [N m].
         free: log of free motion, see `Detector`.
         control: port of `Control`.
@@ -134,7 +140,7 @@ def compensate_command(
         DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
-    readings = source_of(
+    readings = open_source(
         source,
         found,
         rate_hz=rate_hz,
@@ -159,29 +165,35 @@ def compensate_command(
         detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
     )
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
     file = [Path(sink)] if readings.live and is_file(sink) else []
     if earlier := set_aside(*file):
-        say(f"{sink} exists; it is kept in {earlier}")
-    wrenches = sink_of(sink)
-    asked = None if control is None else Control(control)
-    changes = Changes(readings.dt, live=readings.live, say=say) if watch else None
+        report(f"{sink} exists; it is moved to {earlier}")
+    wrenches = open_sink(sink)
+    control_port = None if control is None else Control(control)
+    changes = Changes(readings.dt, live=readings.live, report=report) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    say(f"late by {1e3 * late:.1f} ms")
-    say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
+    report(f"late by {1e3 * late:.1f} ms")
+    report(f"readings are stale after {1e3 * STALE_S:.0f} ms; invalid wrenches are zero")
     if largest is None:
-        say("no --range: nothing says how large a wrench can be, and what is saturated is not seen")
+        report("no --range: saturation of the sensor is not detected")
     try:
         counts = run(
-            readings, compensator, wrenches, control=asked, tare=tare, changes=changes, say=say
+            readings,
+            compensator,
+            wrenches,
+            control=control_port,
+            tare=tare,
+            changes=changes,
+            report=report,
         )
-        say(", ".join(f"{name} {count}" for name, count in counts.items()))
+        report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, Assembly):
-            say(f"the motion came {1e3 * readings.delay_s:.1f} ms behind the wrench at the end")
+            report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
         with ExitStack() as last:
-            for each in (wrenches, readings, asked, changes):
+            for each in (wrenches, readings, control_port, changes):
                 if each is not None:
                     last.callback(each.close)

@@ -21,15 +21,15 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.causal import low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.robots.live_step import low_passed_into
+from drake_teleop.robots.live_step import low_pass_into
 from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import Flag
 
-FOLLOWS_S = 3.0
+MEAN_TIME_S = 3.0
 """Time constant of the mean [s]."""
 _GRAVITY_HZ = 0.5
 _STATISTIC = "level"
-_SAME_RATE = 0.05
+_RATE_TOLERANCE = 0.05
 
 
 class Detector:
@@ -54,19 +54,19 @@ class Detector:
         if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
             raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
         source = LogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
-        if abs(source.dt / dt - 1.0) > _SAME_RATE:
+        if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
             raise DrakeTeleopError(
                 f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
                 where=str(free),
-                remedy="take the log that `calibrate` wrote of this stream",
+                remedy="use the log that `calibrate` wrote from this stream",
             )
-        self._fast, self._slow = (_packed(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        self._fast, self._slow = (_low_pass(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
         readings = [each for each in source.read(0.0) or () if not each.flags]
         values = np.array([each.values for each in readings]).reshape(-1, 15)
         phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
         contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
         contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
-        rows = self._behind(np.hstack([contact, values[:, 6:]]))
+        rows = self._low_passed(np.hstack([contact, values[:, 6:]]))
         # Skip the transient of the low-passes.
         settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
         hold = round(1.0 / (cutoff_hz * dt))
@@ -76,7 +76,7 @@ class Detector:
         floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
         threshold = max(RARE, floor.threshold(_STATISTIC))
         self._settings = ContactDetector(
-            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / FOLLOWS_S
+            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
         ).settings
         self.restart()
         self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
@@ -87,43 +87,43 @@ class Detector:
         self._memory = ContactDetector.initial_memory()
         self._filters = np.full((2, 12), np.nan)
 
-    def _behind(self, rows: Array) -> Array:
+    def _low_passed(self, rows: Array) -> Array:
         """Return low-passed contact, motion and acceleration (N, 18)."""
         filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
         out = np.empty((len(rows), 18))
         for row, to in zip(rows, out, strict=True):
             to[:6] = row[:6]
-            low_passed_into(to[:6], self._fast, contacts)
-            _moved_into(row, self._fast, self._slow, filters, to[6:])
+            low_pass_into(to[:6], self._fast, contacts)
+            _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
         """Return the flags of a good reading (15,) with low-passed contact wrench (6,)."""
-        touched = _touched(
+        touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
         return int(Flag.IN_CONTACT) if touched else 0
 
 
-def _packed(dt: float, cutoff_hz: float) -> Array:
+def _low_pass(dt: float, cutoff_hz: float) -> Array:
     b, a, settled = low_pass_coefficients(dt, cutoff_hz)
     return np.concatenate([b, a[1:], settled])
 
 
 @njit(cache=True)
-def _moved_into(values, fast, slow, filters, out):
+def _filter_motion_into(values, fast, slow, filters, out):
     """Write low-passed motion (9,) and acceleration without gravity (3,)."""
     out[:9] = values[6:]
-    low_passed_into(out[:9], fast, filters[:, :9])
+    low_pass_into(out[:9], fast, filters[:, :9])
     out[9:] = values[6:9]
-    low_passed_into(out[9:], slow, filters[:, 9:])
+    low_pass_into(out[9:], slow, filters[:, 9:])
     for i in range(3):
         out[9 + i] = out[i] - out[9 + i]
 
 
 @njit(cache=True)
-def _touched(memory, values, contact, fast, slow, filters, settings):
-    moved = np.empty(12)
-    _moved_into(values, fast, slow, filters, moved)
-    s, omega, alpha, acceleration = moved[:3], moved[3:6], moved[6:9], moved[9:]
+def _detect(memory, values, contact, fast, slow, filters, settings):
+    filtered = np.empty(12)
+    _filter_motion_into(values, fast, slow, filters, filtered)
+    s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
     return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)

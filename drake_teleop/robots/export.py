@@ -82,7 +82,7 @@ def export(
     """
     if to not in FORMATS:
         raise DrakeTeleopError(
-            f"{to!r} is no target", where="export", remedy=f"one of {', '.join(FORMATS)}"
+            f"{to!r} is not a target", where="export", remedy=f"one of {', '.join(FORMATS)}"
         )
     format = FORMATS[to]
     if found.weight_removed and format.of_sensor:
@@ -92,8 +92,8 @@ def export(
             where="export",
             remedy="use a wrench without the robot's payload compensation, or `compensate`",
         )
-    moved = R_FS is not None or p_FoSo_F is not None
-    if moved and format.of_sensor:
+    posed = R_FS is not None or p_FoSo_F is not None
+    if posed and format.of_sensor:
         raise DrakeTeleopError(
             f"{to} takes its values in the sensor's frame",
             where="export",
@@ -106,9 +106,9 @@ def export(
     )
     if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
         raise DrakeTeleopError(
-            f"no body has these values (mass {found.mass:.4g} kg), and {to} describes one",
+            f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
             where="export",
-            remedy="`identify --method consistent` finds the nearest body; a negative mass means"
+            remedy="use `identify --method consistent`; a negative mass means"
             " that the sign of the wrench is wrong",
         )
     load = Load(*mass_com_inertia(phi), sign * found.offsets)
@@ -129,11 +129,11 @@ def export_command(
     if sensor_pose is None:
         return export(found, to, sign=sign)
     roll, pitch, yaw = np.radians(sensor_pose[3:])
-    R_FS = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
+    R_FS = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
     return export(found, to, R_FS=R_FS, p_FoSo_F=np.array(sensor_pose[:3]), sign=sign)
 
 
-def turn(axis: int, angle: float) -> Array:
+def rotation_about(axis: int, angle: float) -> Array:
     """Return the rotation matrix about the axis 0, 1 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
@@ -144,19 +144,19 @@ def turn(axis: int, angle: float) -> Array:
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:
-    taken = {name: name.startswith(("m", "I")) for name in PARAMETERS}
-    taken |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
-    taken |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
+    written = {name: name.startswith(("m", "I")) for name in PARAMETERS}
+    written |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
+    written |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
     warnings = [
-        f"{name} is not identified ({verdict}): do not enter what depends on it"
+        f"{name} is not identified ({verdict}): do not use values that depend on it"
         for name, verdict in zip(PARAMETERS, found.verdicts, strict=True)
-        if taken[name] and verdict != "identified"
+        if written[name] and verdict != "identified"
     ]
     if not format.inertia:
-        warnings.append(f"{to} has no place for the inertia: what it causes in motion stays")
+        warnings.append(f"{to} has no field for the inertia: inertial wrenches remain")
     if not found.physically_consistent:
         warnings.append(
-            "no body has these values: `identify --method consistent` finds the nearest"
+            "the load is not physically consistent; `identify --method consistent` corrects it"
         )
     return [*warnings, format.note] if format.note else warnings
 
@@ -280,12 +280,12 @@ def _json(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-_FRAME = "ft_sensor stands for the name of your sensor's frame"
+_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
 
 FORMATS = {
     "ur": Format(_ur, comment="#"),
     "franka": Format(
-        _franka, note="transformation is the flange itself: put in that of your end effector"
+        _franka, note="transformation is the identity: replace it by that of your end effector"
     ),
     "xarm": Format(_xarm, inertia=False, comment="#"),
     "kth": Format(
@@ -294,16 +294,18 @@ FORMATS = {
         inertia=False,
         offsets=True,
         comment="#",
-        note=f"{_FRAME}; the weight is the mass times what an IMU reads: if the compensated force"
-        " is twice the weight, turn the sign of the mass round",
+        note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+        " compensated force is twice the weight, change the sign of the mass",
     ),
     "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
-    "ros2-admittance": Format(_admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME),
+    "ros2-admittance": Format(
+        _admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
+    ),
     "bota": Format(
         _bota,
         of_sensor=True,
         offsets=True,
-        note="the inertia is about the centre of mass; Bota does not say about which point it is",
+        note="the inertia is about the centre of mass; Bota does not document the reference point",
     ),
     "urdf": Format(_urdf, body=True),
     "sdf": Format(_sdf, body=True),

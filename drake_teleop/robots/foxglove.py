@@ -10,7 +10,7 @@ from typing import Any
 from drake_teleop.common.errors import DrakeTeleopError, install_extra
 from drake_teleop.common.writing import make_folder, naming
 from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.robots.lines import names_of
+from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated
 from drake_teleop.robots.udp import endpoint
 
@@ -34,7 +34,7 @@ class _Channel:
     def __init__(self, where: str) -> None:
         if importlib.util.find_spec("foxglove") is None:
             raise DrakeTeleopError(
-                "is written by the library foxglove-sdk, which is not installed",
+                "needs the library foxglove-sdk, which is not installed",
                 where=where,
                 remedy=install_extra("robots"),
             )
@@ -44,7 +44,7 @@ class _Channel:
         self._channel = foxglove.Channel(TOPIC, schema=_SCHEMA, context=self.context)
 
     def log(self, out: Compensated, ns: int | None) -> None:
-        data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": names_of(out.flags)}
+        data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH, wrench.tolist(), strict=True))
         self._channel.log(json.dumps(data).encode(), log_time=ns)

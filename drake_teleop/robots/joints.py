@@ -34,9 +34,9 @@ class PosedByJoints:
         parts = self._source.read(timeout_s)
         if parts is None:
             return None
-        return [self._told(part) for part in parts if part.stream != POSE]
+        return [self._converted(part) for part in parts if part.stream != POSE]
 
-    def _told(self, part: Part) -> Part:
+    def _converted(self, part: Part) -> Part:
         if part.stream != JOINTS:
             return part
         values = np.full(7, np.nan)  # an invalid pose, rejected later

@@ -15,13 +15,13 @@ import numpy as np
 
 from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading
 
-_LONGEST = 4096  # bytes per line
-_BLOCK = 65536
+_MAX_LINE_BYTES = 4096  # bytes per line
+_BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
     """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default."""
-    if len(line) > _LONGEST:
+    if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:
         data = json.loads(line)
@@ -35,19 +35,19 @@ def read_line(line: bytes, number: int) -> Reading:
     return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED
 
 
-def written_line(out: Compensated) -> str:
+def wrench_line(out: Compensated) -> str:
     """Return the line of a wrench."""
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
         "contact": out.contact.tolist(),
         "scaled": out.scaled.tolist(),
-        "flags": names_of(out.flags),
+        "flags": flag_names(out.flags),
     }
     return json.dumps(data)
 
 
-def names_of(flags: int) -> list[str]:
+def flag_names(flags: int) -> list[str]:
     """Return the names of the set flags, such as "out of range"."""
     return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
 
@@ -58,19 +58,19 @@ class LineSource:
     live = True
 
     def __init__(self, file: int, dt: float) -> None:
-        self.dt, self._file, self._rest, self._number, self._over = dt, file, b"", 0, False
+        self.dt, self._file, self._partial, self._number, self._ended = dt, file, b"", 0, False
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        if self._over:
+        if self._ended:
             return None
         if not select.select([self._file], [], [], timeout_s)[0]:
             return []
-        block = os.read(self._file, _BLOCK)
-        self._over = not block
-        *lines, self._rest = (self._rest + block).split(b"\n")
-        if self._over or len(self._rest) > _LONGEST:
-            lines, self._rest = [*lines, self._rest], b""
+        block = os.read(self._file, _BLOCK_BYTES)
+        self._ended = not block
+        *lines, self._partial = (self._partial + block).split(b"\n")
+        if self._ended or len(self._partial) > _MAX_LINE_BYTES:
+            lines, self._partial = [*lines, self._partial], b""
         found = []
         for line in lines:
             if line.strip():
@@ -90,7 +90,7 @@ class LineSink:
 
     def write(self, out: Compensated) -> None:
         """See `Sink`."""
-        self._file.write(written_line(out) + "\n")
+        self._file.write(wrench_line(out) + "\n")
         self._file.flush()
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
 
 
 @njit(cache=True)
-def doubts(values, largest, limits):
+def value_problem(values, largest, limits):
     """Return 0, `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
 
     Args:
@@ -32,7 +32,7 @@ def doubts(values, largest, limits):
 
 
 @njit(cache=True)
-def low_passed_into(x, low_pass, memory):
+def low_pass_into(x, low_pass, memory):
     """Filter a sample in place, by a second-order low-pass as in `scipy.signal.lfilter`.
 
     Args:
@@ -40,10 +40,10 @@ def low_passed_into(x, low_pass, memory):
         low_pass: (7,) b, a_1, a_2 and the steady-state memory at input 1.
         memory: (2, n); NaN starts in the steady state.
     """
-    anew = math.isnan(memory[0, 0])
+    start = math.isnan(memory[0, 0])
     for i in range(len(x)):
         u = x[i]
-        if anew:
+        if start:
             memory[0, i], memory[1, i] = low_pass[5] * u, low_pass[6] * u
         y = memory[0, i] + low_pass[0] * u
         memory[0, i] = memory[1, i] + u * low_pass[1] - y * low_pass[3]
@@ -52,14 +52,14 @@ def low_passed_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
+def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
     """Write contact and scaled wrench of a good reading to out (12,).
 
     Args:
         values: (15,) of the reading.
         phi, nothing: (10,) the load, and zeros.
         scales: (3,) see `scaled_wrench_into`.
-        low_pass, memory: see `low_passed_into`; low_pass may be empty.
+        low_pass, memory: see `low_pass_into`; low_pass may be empty.
         rest: (rows, 21); row `at` receives the reading and its unfiltered contact wrench.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
@@ -70,11 +70,11 @@ def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, res
     rest[at, :15] = values
     rest[at, 15:] = contact
     if len(low_pass) > 0:
-        low_passed_into(out, low_pass, memory)
+        low_pass_into(out, low_pass, memory)
 
 
 @njit(cache=True)
-def clipped(wrenches, limits):
+def clip(wrenches, limits):
     """Limit wrenches (12,) to the sensor's range (6,); return whether one exceeded it."""
     beyond = False
     for i in range(12):

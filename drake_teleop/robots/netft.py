@@ -17,7 +17,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.pace import Pace
+from drake_teleop.robots.pace import SampleClock
 from drake_teleop.robots.streams import WRENCH, Flag, Part
 
 PORT = 49152
@@ -26,9 +26,9 @@ RECORD = struct.Struct(">III6i")
 START, STOP = 2, 0
 _HEADER = 0x1234
 _SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
-_ASK_AGAIN_S, _FROZEN_S = 0.1, 0.05
-_MOST = 256  # records per call
-_PAGE_S, _PAGE_BYTES = 2.0, 1 << 20
+_REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
+_MAX_RECORDS = 256  # records per call
+_PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
 # Units of the box's page in N or N m.
 _UNITS = {
     "lbf": 4.4482216152605, "N": 1.0, "klbf": 4448.2216152605, "kN": 1e3,
@@ -47,7 +47,7 @@ class Record(NamedTuple):
     counts: tuple[int, ...]
 
 
-def unpacked_record(packet: bytes) -> Record | None:
+def unpack_record(packet: bytes) -> Record | None:
     """Return the record in a packet, None if it is invalid."""
     if len(packet) != RECORD.size:
         return None
@@ -65,34 +65,34 @@ class NetFtSource:
     streams: tuple[str, ...] = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
-        told = Address(address, PORT, known=("counts", "rate", "sign"))
-        counts, rate = told.numbers("counts", 2), told.numbers("rate", 1)
-        sign = told.sign()
+        parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
+        counts, rate = parsed.numbers("counts", 2), parsed.numbers("rate", 1)
+        sign = parsed.sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _page(told)
+            page = _read_page(parsed)
             counts = counts or page[:2]
             rate = rate or page[2:]
         self.dt = 1.0 / rate[0]
         self._per_count = sign / np.repeat(counts, 3)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._socket.connect((told.host, told.port))
+            self._socket.connect((parsed.host, parsed.port))
         except OSError as error:
             self._socket.close()
             raise DrakeTeleopError(str(error), where=address) from error
-        self._pace, self._number = Pace(self.dt), 0
-        self._heard = self._asked = -math.inf
+        self._pace, self._number = SampleClock(self.dt), 0
+        self._last_received = self._last_request = -math.inf
         self._measured, self._measured_at = -1, -math.inf
 
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `PartSource`."""
-        self._ask()
+        self._request_stream()
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
         try:
-            while len(found) < _MOST:
+            while len(found) < _MAX_RECORDS:
                 packet = self._socket.recv(RECORD.size + 1)
                 found.append(self.part(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
@@ -102,12 +102,12 @@ class NetFtSource:
 
     def part(self, packet: bytes, now: float) -> Part:
         """Return the wrench in a packet received at `now`, flagged if it is invalid."""
-        record = unpacked_record(packet)
+        record = unpack_record(packet)
         if record is None:
             return Part(WRENCH, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))
         # rdt_sequence has 32 bits and wraps around.
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
-        self._heard = now
+        self._last_received = now
         flags = 0
         if record.status & _SATURATED:
             flags = int(Flag.SATURATED)
@@ -115,15 +115,15 @@ class NetFtSource:
             flags = int(Flag.DAMAGED)
         if record.ft_sequence != self._measured:
             self._measured, self._measured_at = record.ft_sequence, now
-        elif now - self._measured_at > _FROZEN_S:
+        elif now - self._measured_at > _MAX_UNCHANGED_S:
             flags |= int(Flag.STALE)
         t = self._pace.time_of(self._number, now)
         return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
 
-    def _ask(self) -> None:
+    def _request_stream(self) -> None:
         now = time.monotonic()
-        if now - max(self._heard, self._asked) > _ASK_AGAIN_S:
-            self._asked = now
+        if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
+            self._last_request = now
             self._send(START)
 
     def _send(self, command: int) -> None:
@@ -136,15 +136,15 @@ class NetFtSource:
         self._socket.close()
 
 
-def _page(told: Address) -> list[float]:
+def _read_page(parsed: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
-    remedy = "or say them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
-    where = f"http://{told.host}/netftapi2.xml"
-    connection = HTTPConnection(told.host, timeout=_PAGE_S)
+    remedy = "or give them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
+    where = f"http://{parsed.host}/netftapi2.xml"
+    connection = HTTPConnection(parsed.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return page_of(connection.getresponse().read(_PAGE_BYTES))
+        return parse_page(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts, units and rate cannot be read ({error!r})", where=where, remedy=remedy
@@ -153,7 +153,7 @@ def _page(told: Address) -> list[float]:
         connection.close()
 
 
-def page_of(content: bytes) -> list[float]:
+def parse_page(content: bytes) -> list[float]:
     """Return counts of 1 N and 1 N m, and rate [Hz], from netftapi2.xml.
 
     Raises:
@@ -165,5 +165,5 @@ def page_of(content: bytes) -> list[float]:
     counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise ValueError("they are no positive numbers")
+        raise ValueError("not positive numbers")
     return values

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-_LEAST_S, _MOST_S = 1.0, 10.0  # span of our clock for measuring the period
+_MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
 _JUMP_S = 1.0  # a larger step of the number is a restart
 
 
-class Pace:
+class SampleClock:
     """Clock from sample numbers.
 
     The period is first the stated one, after a second the measured one, so that a wrong stated rate
@@ -28,9 +28,9 @@ class Pace:
         step = number - self._number
         if self._first is None or abs(step) * self._dt > _JUMP_S:
             self._first = number, now
-        elif now - self._first[1] >= _LEAST_S and number > self._first[0]:
+        elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
             self._period = (now - self._first[1]) / (number - self._first[0])
-            if now - self._first[1] > _MOST_S:
+            if now - self._first[1] > _MAX_SPAN_S:
                 self._first = number, now
         t = self._t + step * self._period
         if step > 0 or self._first == (number, now):

@@ -22,10 +22,12 @@ class Parts:
         self._wrench, self._motion = wrench, motion
         self.dt, self.two_clocks = wrench.dt, motion is not None
         streams = (wrench if motion is None else motion).streams
-        self.told = next((stream for stream in (POSE, IMU) if stream in streams), "")
-        if not self.told:
+        self.motion_stream = next((stream for stream in (POSE, IMU) if stream in streams), "")
+        if not self.motion_stream:
             raise DrakeTeleopError(
-                "tells no motion", where="the source", remedy="give --motion rtde://HOST, say"
+                "delivers no motion",
+                where="the source",
+                remedy="give --motion, such as rtde://HOST",
             )
 
     def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
@@ -34,12 +36,12 @@ class Parts:
         if self._motion is not None:
             parts, now = self._motion.read(0.0) or (), time.monotonic()
             found += [(part, now) for part in parts if part.stream != WRENCH]
-        told = self._wrench.read(timeout_s)
-        if told is None:
+        motion_stream = self._wrench.read(timeout_s)
+        if motion_stream is None:
             return None
         now = time.monotonic()
         alone = self._motion is None
-        return found + [(part, now) for part in told if alone or part.stream == WRENCH]
+        return found + [(part, now) for part in motion_stream if alone or part.stream == WRENCH]
 
     def close(self) -> None:
         """See `Source`."""

@@ -44,7 +44,7 @@ class LogSource:
     ) -> None:
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
-            raise DrakeTeleopError("poses at rest have no order in time", where=str(path))
+            raise DrakeTeleopError("static poses have no order in time", where=str(path))
         delay_s = 0.0
         if load is not None:
             log = accelerated(log) if load.weight_removed else log

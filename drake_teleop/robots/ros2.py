@@ -17,70 +17,74 @@ from drake_teleop.robots.address import Address
 PORT = 7447
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
 _NUMBER = struct.Struct("<qq")
-_SENT = struct.Struct("<qqB16s")
-_NAMED = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
+_ATTACHMENT = struct.Struct("<qqB16s")
+_OLD_PREFIX = b"\x0fsequence_number"  # prefix in rmw_zenoh 0.2.0 to 0.2.3 (Jazzy)
 
 
-def needed(where: str) -> None:
+def require_libraries(where: str) -> None:
     """Raise DrakeTeleopError if a library is missing."""
     for module, library in (("zenoh", "eclipse-zenoh"), ("rosbags", "rosbags")):
         if importlib.util.find_spec(module) is None:
             raise DrakeTeleopError(
-                f"ROS 2 is spoken by the library {library}, which is not installed",
+                f"ROS 2 needs the library {library}, which is not installed",
                 where=where,
                 remedy=install_extra("ros"),
             )
 
 
-def types() -> Any:
+def message_types() -> Any:
     """Return the store of ROS 2 message types of rosbags."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def opened(told: Address) -> Any:
+def open_session(address: Address) -> Any:
     """Return a session with a router, which may start later."""
     import zenoh
 
     config = zenoh.Config()
     retry = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-    for key, value in {
+    for topic_key, value in {
         "mode": "client",
-        "connect/endpoints": [f"tcp/{told.host}:{told.port}"],
+        "connect/endpoints": [f"tcp/{address.host}:{address.port}"],
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": False,
         "connect/retry": retry,
         "scouting/multicast/enabled": False,
     }.items():
-        config.insert_json5(key, json.dumps(value))
+        config.insert_json5(topic_key, json.dumps(value))
     return zenoh.open(config)
 
 
-def key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
+def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
     """Return the key of a topic, by default with any hash (Humble has none)."""
     return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
 
 
-def domain_of(told: Address) -> int:
+def domain_of(address: Address) -> int:
     """Return the parameter `domain`, by default 0; raise DrakeTeleopError if invalid."""
-    text = told.text_of("domain") or "0"
+    text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
-        raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=told.text)
+        raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=address.text)
     return int(text)
 
 
-def topic_of(told: Address, text: str) -> str:
+def topic_of(address: Address, text: str) -> str:
     """Return a topic name without leading slash; raise DrakeTeleopError if invalid."""
     topic = text.strip("/")
     if not topic or not topic.isascii() or not topic.replace("/", "_").isidentifier():
         raise DrakeTeleopError(
-            f"{text!r} is no topic", where=told.text, remedy="zenoh://HOST/ft_sensor/wrench, say"
+            f"{text!r} is not a topic",
+            where=address.text,
+            remedy="give one, such as zenoh://HOST/ft_sensor/wrench",
         )
     return topic
 
 
-def tokens(domain: int, session: str, node: str, topic: str, kind: str, hashed: str) -> list[str]:
+def liveliness_tokens(
+    domain: int, session: str, node: str, topic: str, kind: str, hashed: str
+) -> list[str]:
     """Return the liveliness tokens of a node with one publisher."""
     here = f"@ros2_lv/{domain}/{session}/0"
     name = "%" + topic.replace("/", "%")
@@ -92,15 +96,15 @@ def tokens(domain: int, session: str, node: str, topic: str, kind: str, hashed: 
 
 def attachment(number: int, ns: int, sender: bytes) -> bytes:
     """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
-    return _SENT.pack(number, ns, len(sender), sender)
+    return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
 
-def number_of(attached: bytes) -> int | None:
+def message_number(attached: bytes) -> int | None:
     """Return the number in an attachment, None without."""
-    if len(attached) == _SENT.size:
+    if len(attached) == _ATTACHMENT.size:
         return int(_NUMBER.unpack_from(attached)[0])
-    if attached.startswith(_NAMED) and len(attached) >= len(_NAMED) + 8:
-        return int(struct.unpack_from("<q", attached, len(_NAMED))[0])
+    if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
+        return int(struct.unpack_from("<q", attached, len(_OLD_PREFIX))[0])
     return None
 
 

@@ -13,12 +13,12 @@ from drake_teleop.robots.ros2 import (
     WRENCH_STAMPED,
     attachment,
     domain_of,
-    key,
-    needed,
-    opened,
-    tokens,
+    liveliness_tokens,
+    message_types,
+    open_session,
+    require_libraries,
+    topic_key,
     topic_of,
-    types,
 )
 from drake_teleop.robots.streams import Compensated
 
@@ -32,22 +32,22 @@ class Ros2Sink:
     """
 
     def __init__(self, address: str) -> None:
-        told = Address(address, PORT, known=("frame", "wrench", "domain"))
-        domain, topic = domain_of(told), topic_of(told, told.path)
-        which = told.choice("wrench", ("contact", "scaled"))
-        needed(address)
-        self._types, self._which = types(), which
-        self._frame = told.text_of("frame") or ""
+        parsed = Address(address, PORT, allowed=("frame", "wrench", "domain"))
+        domain, topic = domain_of(parsed), topic_of(parsed, parsed.path)
+        which = parsed.choice("wrench", ("contact", "scaled"))
+        require_libraries(address)
+        self._types, self._which = message_types(), which
+        self._frame = parsed.parameter("frame") or ""
         hashed = self._types.hash_rihs01(WRENCH_STAMPED)
-        self._session = opened(told)
+        self._session = open_session(parsed)
         session = str(self._session.info.zid())
         self._sender, self._number = bytes.fromhex(session.rjust(32, "0"))[:16], 0
         self._tokens = [
             self._session.liveliness().declare_token(token)
-            for token in tokens(domain, session, _NODE, topic, WRENCH_STAMPED, hashed)
+            for token in liveliness_tokens(domain, session, _NODE, topic, WRENCH_STAMPED, hashed)
         ]
         self._publisher = self._session.declare_publisher(
-            key(domain, topic, WRENCH_STAMPED, hashed), express=True
+            topic_key(domain, topic, WRENCH_STAMPED, hashed), express=True
         )
 
     def write(self, out: Compensated) -> None:
@@ -59,7 +59,7 @@ class Ros2Sink:
 
     def message(self, wrench: Array, ns: int) -> bytes:
         """Return WrenchStamped in CDR."""
-        kinds = self._types.types
+        kinds = self._types.message_types
         vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
         header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)
         parts = (vector(*map(float, part)) for part in np.split(wrench, 2))

@@ -17,12 +17,12 @@ from drake_teleop.robots.ros2 import (
     PORT,
     WRENCH_STAMPED,
     domain_of,
-    key,
-    needed,
-    number_of,
-    opened,
+    message_number,
+    message_types,
+    open_session,
+    require_libraries,
+    topic_key,
     topic_of,
-    types,
 )
 from drake_teleop.robots.streams import IMU, JOINTS, POSE, WRENCH, Flag, Part
 
@@ -35,8 +35,8 @@ KINDS = {
     JOINTS: "sensor_msgs/msg/JointState",
 }
 _STREAMS = {"tf": POSE}
-_MOST = 4096  # queued messages; newer ones are dropped
-_DEEPEST = 64  # frames in a chain
+_MAX_QUEUED = 4096  # queued messages; newer ones are dropped
+_MAX_FRAMES = 64  # frames in a chain
 
 
 class Messages:
@@ -52,7 +52,7 @@ class Messages:
     ) -> None:
         from rosbags.serde.errors import SerdeError
 
-        self._sign, self._frames, self._types = sign, frames, types()
+        self._sign, self._frames, self._types = sign, frames, message_types()
         self._joints = joints
         self._damaged = SerdeError
         self._links: dict[str, tuple[str, Array]] = {}
@@ -61,10 +61,10 @@ class Messages:
             self.parts(name, b"", b"")
         self._counts = dict.fromkeys(KINDS, 0)
 
-    def parts(self, name: str, message: bytes, attached: bytes) -> list[Part]:
+    def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
         """Return the parts of a CDR message with a name in `KINDS`, flagged if it is invalid."""
         self._counts[name] += 1
-        number = number_of(attached)
+        number = message_number(attachment)
         if number is None:
             number = self._counts[name]
         stream = _STREAMS.get(name, name)
@@ -73,13 +73,13 @@ class Messages:
         except self._damaged:
             return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
         if name == "tf":
-            told = self._posed(data)
+            parsed = self._transform_pose(data)
         else:
             values = self._values(name, data)
-            told = [] if values is None else [(data.header, values)]
+            parsed = [] if values is None else [(data.header, values)]
         return [
             Part(stream, number, stamp.sec + 1e-9 * stamp.nanosec, values)
-            for stamp, values in ((header.stamp, values) for header, values in told)
+            for stamp, values in ((header.stamp, values) for header, values in parsed)
         ]
 
     def _values(self, name: str, data: Any) -> Array | None:
@@ -90,12 +90,12 @@ class Messages:
         if name == POSE:
             return _pose(data.pose.position, data.pose.orientation)
         if name == JOINTS:
-            told = dict(zip(data.name, data.position, strict=False))
-            whole = self._joints and all(joint in told for joint in self._joints)
-            return np.array([told[joint] for joint in self._joints], float) if whole else None
+            parsed = dict(zip(data.name, data.position, strict=False))
+            whole = self._joints and all(joint in parsed for joint in self._joints)
+            return np.array([parsed[joint] for joint in self._joints], float) if whole else None
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
-    def _posed(self, data: Any) -> list[tuple[Any, Array]]:
+    def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
         """Return the pose of the child in the parent, if this message updates it."""
         newest = {each.child_frame_id: each for each in data.transforms}
         for child, each in newest.items():
@@ -105,7 +105,7 @@ class Messages:
             return []
         parent, frame = self._frames
         pose, header = np.array([1.0, 0, 0, 0, 0, 0, 0]), None
-        for _ in range(_DEEPEST):
+        for _ in range(_MAX_FRAMES):
             if frame == parent:
                 return [] if header is None else [(header, pose)]
             if frame not in self._links:
@@ -113,7 +113,7 @@ class Messages:
             if frame in newest:
                 header = newest[frame].header
             frame, link = self._links[frame]
-            pose = _moved(link, pose)
+            pose = _compose(link, pose)
         return []
 
 
@@ -124,38 +124,40 @@ class Ros2Source:
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
-        told = Address(address, PORT, known=("pose", "imu", "joints", "tf", "domain", "sign"))
-        self.dt, sign, domain = dt, told.sign(), domain_of(told)
-        topics = {WRENCH: topic_of(told, told.path)}
+        parsed = Address(address, PORT, allowed=("pose", "imu", "joints", "tf", "domain", "sign"))
+        self.dt, sign, domain = dt, parsed.sign(), domain_of(parsed)
+        topics = {WRENCH: topic_of(parsed, parsed.path)}
         for stream in (POSE, IMU, JOINTS):
-            if (text := told.text_of(stream)) is not None:
-                topics[stream] = topic_of(told, text)
+            if (text := parsed.parameter(stream)) is not None:
+                topics[stream] = topic_of(parsed, text)
         frames: tuple[str, ...] = ()
-        if (text := told.text_of("tf")) is not None:
+        if (text := parsed.parameter("tf")) is not None:
             frames, topics["tf"] = tuple(text.split(",")), "tf"
             if len(frames) != 2 or not all(frames):
                 raise DrakeTeleopError("tf is not PARENT,CHILD", where=address)
         if JOINTS in topics and not joints:
             raise DrakeTeleopError(
-                "joints are of an arm that is not known",
+                "joint positions need the model of the arm",
                 where=address,
                 remedy="give --model and --sensor-frame",
             )
         self.streams = tuple(_STREAMS.get(name, name) for name in topics)
-        needed(address)
+        require_libraries(address)
         self.messages = Messages(sign, frames, joints)
-        self._came: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
-        self._session = opened(told)
+        self._queue: queue.SimpleQueue[tuple[str, bytes, bytes]] = queue.SimpleQueue()
+        self._session = open_session(parsed)
         for stream, topic in topics.items():
-            self._session.declare_subscriber(key(domain, topic, KINDS[stream]), self._take(stream))
+            self._session.declare_subscriber(
+                topic_key(domain, topic, KINDS[stream]), self._callback(stream)
+            )
 
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `PartSource`."""
         found: list[Part] = []
         try:
-            found += self.messages.parts(*self._came.get(timeout=timeout_s))
-            while len(found) < _MOST:
-                found += self.messages.parts(*self._came.get_nowait())
+            found += self.messages.parts(*self._queue.get(timeout=timeout_s))
+            while len(found) < _MAX_QUEUED:
+                found += self.messages.parts(*self._queue.get_nowait())
         except queue.Empty:
             pass
         return found
@@ -164,12 +166,12 @@ class Ros2Source:
         """See `PartSource`."""
         self._session.close()
 
-    def _take(self, stream: str) -> Callable[[Any], None]:
+    def _callback(self, stream: str) -> Callable[[Any], None]:
         def take(sample: Any) -> None:
-            if self._came.qsize() < _MOST:
-                attached = sample.attachment
-                attached = b"" if attached is None else attached.to_bytes()
-                self._came.put((stream, sample.payload.to_bytes(), attached))
+            if self._queue.qsize() < _MAX_QUEUED:
+                attachment = sample.attachment
+                attachment = b"" if attachment is None else attachment.to_bytes()
+                self._queue.put((stream, sample.payload.to_bytes(), attachment))
 
         return take
 
@@ -182,7 +184,7 @@ def _pose(p: Any, q: Any) -> Array:
     return np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
 
 
-def _moved(a: Array, b: Array) -> Array:
+def _compose(a: Array, b: Array) -> Array:
     turn = tuple(a[:4].tolist())
     p = rotate(turn, tuple(b[4:].tolist()))
     return np.array([*multiply(turn, tuple(b[:4].tolist())), *(a[4:] + p)])

@@ -19,10 +19,10 @@ from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
-_FIRST_S = 10.0  # wait for the robot at the start
-_AGAIN_S = 0.2  # between two starts of the child
-_FIRST = 5  # samples for the rate
-_BLOCK = 65536
+_START_TIMEOUT_S = 10.0  # wait for the robot at the start
+_RESTART_PERIOD_S = 0.2  # between two starts of the child
+_RATE_SAMPLES = 5  # samples for the rate
+_BLOCK_BYTES = 65536
 
 
 class RtdeSource:
@@ -35,23 +35,23 @@ class RtdeSource:
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 
     def __init__(self, address: str) -> None:
-        told = Address(address, PORT, known=("sign",))
-        if told.port != PORT:
-            raise DrakeTeleopError("RTDE has one port, 30004", where=address)
+        parsed = Address(address, PORT, allowed=("sign",))
+        if parsed.port != PORT:
+            raise DrakeTeleopError("RTDE always uses port 30004", where=address)
         if importlib.util.find_spec("rtde_receive") is None:
             raise DrakeTeleopError(
-                "robots of UR are read by the library ur_rtde, which is not installed",
+                "UR robots need the library ur_rtde, which is not installed",
                 where=address,
                 remedy=install_extra("robots"),
             )
-        self._host, self._sign, self._rest, self._began = told.host, told.sign(), b"", 0.0
+        self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
         self._start()
         exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
-        until = time.monotonic() + _FIRST_S
-        while len(self._first) < _FIRST and (left := until - time.monotonic()) > 0.0:
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while len(self._first) < _RATE_SAMPLES and (left := deadline - time.monotonic()) > 0.0:
             self._first += self._samples(left)
-        if len(self._first) < _FIRST:
+        if len(self._first) < _RATE_SAMPLES:
             self.close()
             raise DrakeTeleopError("no robot answers on port 30004", where=address)
         spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
@@ -66,18 +66,18 @@ class RtdeSource:
         """Return the received samples; restart an ended child process."""
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
-        block = os.read(self._pipe, _BLOCK)
+        block = os.read(self._pipe, _BLOCK_BYTES)
         if not block:
-            if time.monotonic() - self._began > _AGAIN_S:
-                self._end()
+            if time.monotonic() - self._started > _RESTART_PERIOD_S:
+                self._stop()
                 self._start()
             else:
-                time.sleep(min(timeout_s, _AGAIN_S))
+                time.sleep(min(timeout_s, _RESTART_PERIOD_S))
             return []
-        block = self._rest + block
-        whole = len(block) - len(block) % SAMPLE.size
-        self._rest = block[whole:]
-        return list(SAMPLE.iter_unpack(block[:whole]))
+        block = self._partial + block
+        complete = len(block) - len(block) % SAMPLE.size
+        self._partial = block[complete:]
+        return list(SAMPLE.iter_unpack(block[:complete]))
 
     def _start(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"
@@ -89,25 +89,25 @@ class RtdeSource:
             stderr=subprocess.DEVNULL,
         )
         os.close(into)
-        self._rest, self._began = b"", time.monotonic()
+        self._partial, self._started = b"", time.monotonic()
 
-    def _end(self) -> None:
+    def _stop(self) -> None:
         self._child.kill()
         self._child.wait()
         os.close(self._pipe)
 
     def close(self) -> None:
         """See `PartSource`."""
-        self._end()
+        self._stop()
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
     """Return the parts of a sample."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
-    told = {
+    parsed = {
         WRENCH: sign * values[:6],
         POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
         ACCELERATION: values[12:15],
     }
-    return [Part(stream, number, t, each) for stream, each in told.items()]
+    return [Part(stream, number, t, each) for stream, each in parsed.items()]

@@ -13,7 +13,7 @@ import time
 SAMPLE = struct.Struct("<16d")
 """Time of the controller [s], raw wrench (6), TCP pose (6), tool acceleration (3)."""
 VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accelerometer")
-_POLL_S, _STILL_S = 0.0002, 1.0
+_POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
 def read(host: str, pipe: int) -> None:
@@ -22,7 +22,7 @@ def read(host: str, pipe: int) -> None:
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
     last, new = -1.0, time.monotonic()
-    while robot.isConnected() and time.monotonic() - new < _STILL_S:
+    while robot.isConnected() and time.monotonic() - new < _MAX_SILENCE_S:
         t = robot.getTimestamp()
         wrench, pose = robot.getFtRawWrench(), robot.getActualTCPPose()
         acceleration = robot.getActualToolAccelerometer()

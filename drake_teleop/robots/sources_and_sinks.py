@@ -10,7 +10,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
-from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
+from drake_teleop.robots.assembly import IDENTITY_POSE, Assembly, pose_from_rpy
 from drake_teleop.robots.joints import PosedByJoints, SensorPoseOfJoints
 from drake_teleop.robots.lines import LineSink, LineSource
 from drake_teleop.robots.parts import Parts
@@ -29,11 +29,11 @@ _SINKS = (
     " .mcap file"
 )
 _REPLAY = "replay:"
-_ANY_HZ = 1000.0
-_OF_PARTS = ("posed", "rtde", "netft", "zenoh")
+_UNUSED_RATE_HZ = 1000.0
+_PART_KINDS = ("posed", "rtde", "netft", "zenoh")
 
 
-def source_of(
+def open_source(
     address: str,
     load: Identification | None,
     *,
@@ -60,38 +60,38 @@ def source_of(
         DrakeTeleopError: for an invalid address, a missing rate, or an error of the source.
     """
     kind = _kind(address)
-    if kind in _OF_PARTS:
-        follow = load if isinstance(delay, str) else None
+    if kind in _PART_KINDS:
+        track = load if isinstance(delay, str) else None
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
-        parts = _parts(address, rate_hz, motion, arm)
+        parts = _open_parts(address, rate_hz, motion, arm)
         return Assembly(
             parts,
             cutoff_hz=cutoff_hz,
             delay_s=delay,
-            follow=follow,
+            track=track,
             X_FS=_pose(sensor_pose),
             weight_removed=load is not None and load.weight_removed,
         )
     if motion is not None or sensor_pose is not None or arm is not None:
         raise DrakeTeleopError(
-            "tells the motion of the sensor itself",
+            "delivers the motion of the sensor itself",
             where=address,
-            remedy="without --motion, --model and --sensor-pose",
+            remedy="remove --motion, --model and --sensor-pose",
         )
     if kind == "replay":
         path = address.removeprefix(_REPLAY)
         options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
         return LogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in ("-", "udp"):
-        raise DrakeTeleopError("is no source", where=address, remedy=_SOURCES)
+        raise DrakeTeleopError("is not a source", where=address, remedy=_SOURCES)
     if load is not None and load.weight_removed:
         raise without_orientation(address)
     dt = _period(rate_hz, address)
     return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
 
 
-def recorded(
+def open_recording(
     address: str,
     largest: Array | None,
     *,
@@ -103,12 +103,12 @@ def recorded(
     """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
-    rate_hz = None if kind == "netft" else _ANY_HZ
-    if kind in _OF_PARTS:
-        parts = _parts(address, rate_hz, motion, arm)
+    rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
+    if kind in _PART_KINDS:
+        parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose(sensor_pose))
     readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
-    return source_of(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
+    return open_source(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
 
 
 def is_file(address: str) -> bool:
@@ -116,7 +116,7 @@ def is_file(address: str) -> bool:
     return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
 
 
-def sink_of(address: str) -> Sink:
+def open_sink(address: str) -> Sink:
     """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
     kind, path = _kind(address), Path(address)
     if kind == "-":
@@ -132,7 +132,7 @@ def sink_of(address: str) -> Sink:
 
         return FoxgloveSink(address) if kind else McapSink(path)
     if not is_file(address):
-        raise DrakeTeleopError("is no sink", where=address, remedy=_SINKS)
+        raise DrakeTeleopError("is not a sink", where=address, remedy=_SINKS)
     return TableSink(path)
 
 
@@ -151,7 +151,9 @@ def _period(rate_hz: float | None, address: str) -> float:
     return 1.0 / rate_hz
 
 
-def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ()) -> PartSource:
+def _open_part_source(
+    address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
+) -> PartSource:
     kind = _kind(address)
     if kind == "posed":
         return PosedSource(address, _period(rate_hz, address))
@@ -167,27 +169,29 @@ def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ())
         from drake_teleop.robots.ros2_source import Ros2Source
 
         return Ros2Source(address, _period(rate_hz, address), joints)
-    raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
+    raise DrakeTeleopError(
+        "delivers no motion", where=address, remedy="rtde://HOST or zenoh://HOST"
+    )
 
 
-def _parts(
+def _open_parts(
     address: str, rate_hz: float | None, motion: str | None, arm: SensorPoseOfJoints | None
 ) -> Parts:
     names = () if arm is None else arm.joint_names
-    wrench = _of_parts(address, rate_hz, names)
+    wrench = _open_part_source(address, rate_hz, names)
     other: PartSource | None = None
     try:
-        other = None if motion is None else _of_parts(motion, 1.0 / wrench.dt, names)
+        other = None if motion is None else _open_part_source(motion, 1.0 / wrench.dt, names)
         if arm is None:
             return Parts(wrench, other)
-        told = wrench if other is None else other
-        if JOINTS not in told.streams:
+        motion_source = wrench if other is None else other
+        if JOINTS not in motion_source.streams:
             raise DrakeTeleopError(
-                "tells no joints of --model",
+                "delivers no joint positions for --model",
                 where=address if motion is None else motion,
-                remedy="zenoh://HOST/TOPIC?joints=/joint_states, say",
+                remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
             )
-        posed = PosedByJoints(told, arm)
+        posed = PosedByJoints(motion_source, arm)
         return Parts(posed) if other is None else Parts(wrench, posed)
     except BaseException:
         for each in (wrench, other):
@@ -197,4 +201,4 @@ def _parts(
 
 
 def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
-    return NOWHERE if sensor_pose is None else pose_of(sensor_pose)
+    return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)

@@ -34,7 +34,7 @@ class Flag(IntFlag):
     OTHER_LOAD = 4096  #: explained by another load; the wrench is not zero
 
 
-ONLY_SAID = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
+NONZERO_FLAGS = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
 """Flags with a nonzero wrench."""
 
 

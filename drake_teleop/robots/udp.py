@@ -24,36 +24,36 @@ THIS_MACHINE = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
 POSED = struct.Struct("<4sIQd13d")
 WRENCH = struct.Struct("<4sIQd12d")
-_IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
+_READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
-_MOST = 256  # packets per call
-_BUFFER = 1 << 20  # bytes: a tenth of a second at 8 kHz
+_MAX_PACKETS = 256  # packets per call
+_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
 _SATURATED = int(Flag.SATURATED)
 
 
-def packed(reading: Reading) -> bytes:
+def pack_reading(reading: Reading) -> bytes:
     """Return the packet of a reading."""
-    return READING.pack(_IN, reading.flags, reading.number, reading.t, *reading.values)
+    return READING.pack(_READING_TAG, reading.flags, reading.number, reading.t, *reading.values)
 
 
-def unpacked(packet: bytes) -> Reading:
+def unpack_reading(packet: bytes) -> Reading:
     """Return the reading in a packet, `DAMAGED` if it is invalid."""
-    if len(packet) != READING.size or packet[:4] != _IN:
+    if len(packet) != READING.size or packet[:4] != _READING_TAG:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
     return Reading(number, t, values, flags & _SATURATED)
 
 
-def packed_parts(wrench: Part, pose: Part) -> bytes:
+def pack_parts(wrench: Part, pose: Part) -> bytes:
     """Return the packet of a wrench and a pose."""
-    head = _POSED, wrench.flags, wrench.number, wrench.t
+    head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
     return POSED.pack(*head, *wrench.values, *pose.values)
 
 
-def unpacked_parts(packet: bytes) -> list[Part]:
+def unpack_parts(packet: bytes) -> list[Part]:
     """Return wrench and pose in a packet, a damaged wrench if it is invalid."""
-    if len(packet) != POSED.size or packet[:4] != _POSED:
+    if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
         return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
@@ -61,16 +61,16 @@ def unpacked_parts(packet: bytes) -> list[Part]:
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
-def packed_wrench(out: Compensated) -> bytes:
+def pack_wrench(out: Compensated) -> bytes:
     """Return the packet of a wrench."""
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
-    return _HEAD.pack(_OUT, out.flags, out.number, out.t) + b"".join(wrenches)
+    return _HEAD.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
-def unpacked_wrench(packet: bytes) -> Compensated:
+def unpack_wrench(packet: bytes) -> Compensated:
     """Return the wrench in a packet; raise DrakeTeleopError if it is invalid."""
-    if len(packet) != WRENCH.size or packet[:4] != _OUT:
-        raise DrakeTeleopError("is no wrench", where="packet")
+    if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
+        raise DrakeTeleopError("is not a wrench packet", where="packet")
     _, flags, number, t, *values = WRENCH.unpack(packet)
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
@@ -84,7 +84,9 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
         host, port = "", None
     if port is None:
         raise DrakeTeleopError(
-            "has no port from 0 to 65535", where=address, remedy="udp://127.0.0.1:49152, say"
+            "has no port from 0 to 65535",
+            where=address,
+            remedy="give one, such as udp://127.0.0.1:49152",
         )
     return host, port
 
@@ -105,7 +107,7 @@ class _Receiver:
         self.dt = dt
         self._socket = listening(*endpoint(address))
         self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
@@ -114,7 +116,7 @@ class _Receiver:
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
-                while len(found) < _MOST:
+                while len(found) < _MAX_PACKETS:
                     found.append(self._socket.recv(READING.size + 1))
         return found
 
@@ -129,7 +131,7 @@ class UdpSource(_Receiver):
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        return [unpacked(packet) for packet in self.packets(timeout_s)]
+        return [unpack_reading(packet) for packet in self.packets(timeout_s)]
 
 
 class PosedSource(_Receiver):
@@ -138,12 +140,12 @@ class PosedSource(_Receiver):
     streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
 
     def __init__(self, address: str, dt: float) -> None:
-        self._sign = Address(address, None, known=("sign",), host=THIS_MACHINE).sign()
+        self._sign = Address(address, None, allowed=("sign",), host=THIS_MACHINE).sign()
         super().__init__(address, dt)
 
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `PartSource`."""
-        parts = [part for packet in self.packets(timeout_s) for part in unpacked_parts(packet)]
+        parts = [part for packet in self.packets(timeout_s) for part in unpack_parts(packet)]
         signs = {streams.WRENCH: self._sign}
         return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
 
@@ -158,12 +160,10 @@ class UdpSink:
     def write(self, out: Compensated) -> None:
         """Send a wrench; packets that cannot be sent now are dropped."""
         try:
-            self._socket.sendto(packed_wrench(out), self._to)
+            self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:
             if isinstance(error, socket.gaierror):
-                raise DrakeTeleopError(
-                    "is not known", where=self._to[0], remedy="give a host"
-                ) from error
+                raise DrakeTeleopError("is not a known host", where=self._to[0]) from error
 
     def close(self) -> None:
         """See `Sink`."""

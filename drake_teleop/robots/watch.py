@@ -25,17 +25,17 @@ from drake_teleop.robots.streams import Flag
 
 MODEL_ERROR = 0.02
 """Relative error of the load's wrench by gains and clocks."""
-LEAST = np.repeat([0.05, 0.0025], 3)
+MIN_NOISE = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
-_NEVER = 1e-12  # accuracy at which another load would replace the present one
+_NEVER_REPLACED = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
-_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
+_NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
     """Return the noise (6,) of a reading [N, N m] from the low-passed residual, assumed white."""
-    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _BANDWIDTH * cutoff_hz * dt)
-    return np.maximum(load.residual_rms / math.sqrt(share), LEAST * math.sqrt(1e-3 / dt))
+    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
+    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
 class Watch:
@@ -45,7 +45,7 @@ class Watch:
         noise = raw_noise(load, dt, cutoff_hz)
         # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_parameters(
-            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER
+            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER_REPLACED
         )
         self._phi = usable_phi(load)[0]
         self._covariance = finite_covariance(self._phi, load.covariance)

@@ -23,7 +23,7 @@ from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, val
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.calibrate import calibrate
-from drake_teleop.robots.calibration import Look, look, missing_motion
+from drake_teleop.robots.calibration import Evaluation, best_motion, evaluate_record
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.recording import PartRecorder, Recorder
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Flag, Part, Reading
@@ -109,10 +109,10 @@ def test_a_source_that_fails_loses_no_record_and_no_earlier_one(tmp_path: Path) 
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def looked_at(values: np.ndarray, until: str, path: Path) -> Look:
+def looked_at(values: np.ndarray, until: str, path: Path) -> Evaluation:
     log = Log(DT * np.arange(len(values)), *np.split(values, [6, 9, 12], axis=1))
     write_log(log, path)
-    return look(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
+    return evaluate_record(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
 
 
 def test_about_one_axis_the_inertia_about_the_others_stays_unknown(tmp_path: Path) -> None:
@@ -179,10 +179,10 @@ def test_the_motion_that_was_not_made_is_missing(axis: int) -> None:
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
     errors = errors_of(read_tolerance("inertia 1 %"), PHI)
-    words = missing_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
+    words = best_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
     assert f"swing the wrist about {'xyz'[axis]}" in words
     rest = np.tile(9.81 * np.eye(3)[axis], (400, 1)), np.zeros((400, 3)), np.zeros((400, 3))
-    words = missing_motion(rest, DT, 30.0, errors_of(read_tolerance("mass 1 %"), PHI), NOISE)
+    words = best_motion(rest, DT, 30.0, errors_of(read_tolerance("mass 1 %"), PHI), NOISE)
     assert f"about {'xyz'[axis]}" not in words and "turn" in words
 
 

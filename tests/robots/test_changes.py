@@ -81,7 +81,7 @@ def compensated(
 ) -> tuple[list[Compensated], list[str]]:
     """What came out, and what was said but for the flags."""
     said: list[str] = []
-    sought = Changes(DT, live=live, say=said.append) if looked_for else None
+    sought = Changes(DT, live=live, report=said.append) if looked_for else None
     kept = Kept()
     compensator = Compensator(LOAD, DT, watch=Watch(LOAD, DT, 30.0))
     # As fast as it comes: the clock of the loop is that of the readings.
@@ -185,20 +185,20 @@ def test_a_failing_explanation_does_not_end_the_loop(monkeypatch: pytest.MonkeyP
     def fail(rows: Values, dt: float) -> list[tuple[float, str]]:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(changes, "reports", fail)
+    monkeypatch.setattr(changes, "find_changes", fail)
     values = stream(seconds=8.0)
     tare(values, round(4.0 / DT))
     out, said = compensated(values)
     assert len(out) == len(values)
-    assert said and all("could not be looked for (singular)" in words for words in said)
+    assert said and all("another load failed (singular)" in words for words in said)
 
 
 def test_lost_readings_and_a_clock_that_was_set() -> None:
     """What is explained are the last 20 s, in order, and only what came after the clock was set."""
     seen = []
-    sought = Changes(DT, live=False, say=print)
-    sought._beside.shutdown()
-    sought._next = np.inf
+    sought = Changes(DT, live=False, report=print)
+    sought._executor.shutdown()
+    sought._next_attempt = np.inf
     row = np.zeros(15)
     for k, t in enumerate([0.0, *(50.0 + DT * np.arange(11_000))]):
         sought.take(Reading(k, t, row + t), int(Flag.STALE if k == 500 else 0))

@@ -142,15 +142,15 @@ def test_a_bad_reading_is_zero_and_the_next_is_not(name: str, flag: Flag) -> Non
 
 def test_nothing_for_a_while_is_zero_and_then_it_settles_anew() -> None:
     compensator = Compensator(load(), DT)
-    first = compensator.idle(0.0)
+    first = compensator.stale_output(0.0)
     assert first is not None and first.flags == Flag.STALE
     for reading in readings(20, touched=5.0):
         compensator.step(reading, reading.t)
     last = 19 * DT
-    assert compensator.idle(last + 0.9 * STALE_S) is None
-    assert compensator.left(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
-    assert compensator.left(last + 1.1 * STALE_S) == 0.0
-    stale = compensator.idle(last + 1.1 * STALE_S)
+    assert compensator.stale_output(last + 0.9 * STALE_S) is None
+    assert compensator.time_to_stale(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
+    assert compensator.time_to_stale(last + 1.1 * STALE_S) == 0.0
+    stale = compensator.stale_output(last + 1.1 * STALE_S)
     assert stale is not None and stale.flags == Flag.STALE and not stale.contact.any()
     again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
     out = compensator.step(again, again.t)
@@ -231,8 +231,9 @@ def test_what_waits_is_clipped_whenever_it_comes_out() -> None:
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("free", "done"), ("short", "not 0.5 s"), ("moving", "it moves"), ("push", "is touched"),
-     ("wavers", "wavers")],
+    [("free", "done"), ("short", "fewer than 0.5 s"), ("moving", "the sensor moves"),
+     ("push", "contact, or"),
+     ("wavers", "the wrench varies")],
 )  # fmt: skip
 def test_a_tare_refuses_and_says_why(name: str, said: str) -> None:
     compensator, count = Compensator(load(), DT), round(TARE_S / DT)

@@ -10,16 +10,16 @@ from test_reading_assembly import X_FS, Told, played, truth
 
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.delay_following import EVERY_S, DelayFollower
+from drake_teleop.robots.delay_following import SAMPLE_PERIOD_S, DelayTracker
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import POSE, WRENCH
 
-DT = 1.01 * EVERY_S
+DT = 1.01 * SAMPLE_PERIOD_S
 NOISE = np.repeat([0.05, 0.0025], 3)
 
 
 def followed(
-    follower: DelayFollower, start: float, stop: float, late: float, *, push: float = 0.0
+    follower: DelayTracker, start: float, stop: float, late: float, *, push: float = 0.0
 ) -> None:
     """Wrenches with noise and drifted offsets, and motions whose stamps are `late`.
 
@@ -39,7 +39,7 @@ def followed(
 
 @pytest.mark.parametrize("late", [-0.006, 0.011])
 def test_it_is_found_and_followed(late: float) -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.0)
+    follower = DelayTracker(load(), 0.001, 30.0, 0.0)
     followed(follower, 0.0, 3.0, late)
     assert follower.delay_s == pytest.approx(late, abs=2e-4)
     followed(follower, 3.0, 5.0, late + 0.003)
@@ -47,7 +47,7 @@ def test_it_is_found_and_followed(late: float) -> None:
 
 
 def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+    follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     followed(follower, 0.0, 1.0, 0.005)
     followed(follower, 1.0, 2.0, 0.005, push=5.0)
     assert follower.delay_s == pytest.approx(0.005, abs=5e-4)
@@ -58,7 +58,7 @@ def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
 
 
 def test_a_tool_at_rest_shows_nothing() -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+    follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     rest, rng = truth(0.3)[1], np.random.default_rng(0)
     rest[3:] = 0.0
     still = non_contact_wrench(*np.split(rest, 3), PHI) + OFFSETS
@@ -71,7 +71,7 @@ def test_a_tool_at_rest_shows_nothing() -> None:
 
 def test_what_waits_for_its_motion_gets_the_right_one() -> None:
     """Without being told that poses are stamped 4 ms late."""
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, follow=load())
+    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, track=load())
     good = [each for each in played(assembly, 1.6, later=0.004) if not each.flags]
     assert assembly.delay_s == pytest.approx(0.004, abs=2e-4)
     assert good[-1].t > 1.6 - 0.035 - WRENCH_DT

@@ -136,7 +136,7 @@ def test_what_is_read_back_is_the_load(name):
     target, _, other = name.partition(" ")
     of_sensor = FORMATS[target].of_sensor
     text, warnings = export(FOUND, target, **({} if of_sensor else TURNED))
-    assert FORMATS[target].inertia == (not any("no place for" in text for text in warnings))
+    assert FORMATS[target].inertia == (not any("no field for" in text for text in warnings))
     mass, com, inertia = (by_mujoco if other else READERS[target])(text)
     com_0, inertia_0 = (COM, INERTIA) if of_sensor else in_flange()
     assert mass == pytest.approx(MASS, rel=1e-9)
@@ -150,7 +150,7 @@ def test_a_ur_and_an_xarm_get_a_call():
     text, _ = export(FOUND, "ur", **TURNED)
     assert re.fullmatch(r"set_target_payload\([^,]+, \[([^,]+, ){2}[^,]+\], \[.*\]\)\n", text)
     text, warnings = export(FOUND, "xarm", **TURNED)
-    assert "no place for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
+    assert "no field for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
 
 
 def test_a_franka_gets_the_identity():
@@ -190,14 +190,14 @@ def test_what_is_not_identified_is_not_to_be_entered():
 
 def test_what_cannot_be_is_one_line():
     nobody = dataclasses.replace(FOUND, phi=FOUND.phi * [1, 1, 1, 1, -1, 1, 1, 1, 1, 1])
-    with pytest.raises(DrakeTeleopError, match=r"no body has these values.*consistent"):
+    with pytest.raises(DrakeTeleopError, match=r"not physically consistent.*consistent"):
         export(nobody, "urdf")
-    assert any("no body" in text for text in export(nobody, "ur")[1])
+    assert any("not physically consistent" in text for text in export(nobody, "ur")[1])
     with pytest.raises(DrakeTeleopError, match="the sign of the wrench is wrong"):
         export(dataclasses.replace(FOUND, phi=-FOUND.phi), "ur")
     with pytest.raises(DrakeTeleopError, match="kth takes its values in the sensor's frame"):
         export(FOUND, "kth", **TURNED)
-    with pytest.raises(DrakeTeleopError, match=r"'kuka' is no target.*ur, franka"):
+    with pytest.raises(DrakeTeleopError, match=r"'kuka' is not a target.*ur, franka"):
         export(FOUND, "kuka")
 
 

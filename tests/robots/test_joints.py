@@ -25,7 +25,7 @@ from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.joints import PosedByJoints
 from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.ros2_source import Messages
-from drake_teleop.robots.sources_and_sinks import source_of
+from drake_teleop.robots.sources_and_sinks import open_source
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.joint_poses import arm_of
@@ -138,10 +138,10 @@ def test_the_motion_is_that_of_the_sensor(model: Path) -> None:
 
 def test_what_is_asked_for_goes_together(model: Path) -> None:
     arm, address = arm_of(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
-    with pytest.raises(DrakeTeleopError, match="joints are of an arm that is not known"):
-        source_of(address, None, rate_hz=500.0)
-    with pytest.raises(DrakeTeleopError, match="tells no joints of --model"):
-        source_of("posed://127.0.0.1:0", None, rate_hz=500.0, arm=arm)
+    with pytest.raises(DrakeTeleopError, match="joint positions need the model of the arm"):
+        open_source(address, None, rate_hz=500.0)
+    with pytest.raises(DrakeTeleopError, match="delivers no joint positions for --model"):
+        open_source("posed://127.0.0.1:0", None, rate_hz=500.0, arm=arm)
     with pytest.raises(SystemExit):
         main(["compensate", "udp://:1", "--rate", "1", "--load", "x", "--sensor-frame", "tool"])
 

@@ -27,10 +27,10 @@ from websockets.sync.client import connect
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.netft import NetFtSource, page_of
+from drake_teleop.robots.netft import NetFtSource, parse_page
 from drake_teleop.robots.ros2_source import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
-from drake_teleop.robots.sources_and_sinks import sink_of
+from drake_teleop.robots.sources_and_sinks import open_sink
 from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,
@@ -75,7 +75,7 @@ class Seen(list[Compensated]):
         while time.monotonic() < until:
             parts = source.read(0.01)
             assert parts is not None
-            if (stale := compensator.idle(time.monotonic())) and not parts:
+            if (stale := compensator.stale_output(time.monotonic())) and not parts:
                 self._take(stale)
             self.parts += parts
             for part in parts:
@@ -172,7 +172,7 @@ def test_ros_2() -> None:
 def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
     wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     with peer("ros_echo", free_port()) as (port, lines):
-        sink = sink_of(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
+        sink = open_sink(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
         seen: list[str] = []
         reader = threading.Thread(target=lambda: seen.extend(lines))
         reader.start()
@@ -196,7 +196,7 @@ def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
 def test_foxglove_and_mcap(tmp_path: Path) -> None:
     path = tmp_path / "new" / "out.mcap"
     rows = [Compensated(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
-    file, live = sink_of(str(path)), sink_of("foxglove://127.0.0.1:0")
+    file, live = open_sink(str(path)), open_sink("foxglove://127.0.0.1:0")
     with connect(f"ws://127.0.0.1:{live.port}", subprotocols=["foxglove.sdk.v1"]) as page:
         page.recv()
         channel = json.loads(page.recv())["channels"][0]["id"]
@@ -236,9 +236,9 @@ def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, n
 def test_a_box_is_asked_for_its_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
-    assert page_of(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+    assert parse_page(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
-            page_of(bad)
-    with pytest.raises(DrakeTeleopError, match="or say them: netft://HOST"):
+            parse_page(bad)
+    with pytest.raises(DrakeTeleopError, match="or give them: netft://HOST"):
         NetFtSource("netft://127.0.0.9")

@@ -15,7 +15,7 @@ from drake_teleop.logs.read.rotations import rotation_matrices
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.sources_and_sinks import source_of
+from drake_teleop.robots.sources_and_sinks import open_source
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
@@ -109,7 +109,7 @@ def test_the_inertia_alone_is_subtracted_where_the_robot_has_removed_the_weight(
         Assembly(Parts(Told(WRENCH, IMU)), weight_removed=True)
     weightless = dataclasses.replace(load(), weight_removed=True)
     with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
-        source_of("udp://:0", weightless, rate_hz=500.0)
+        open_source("udp://:0", weightless, rate_hz=500.0)
 
 
 def test_two_clocks() -> None:
@@ -176,5 +176,5 @@ def test_an_imu_tells_it_too() -> None:
 
 
 def test_a_wrench_alone_is_not_enough() -> None:
-    with pytest.raises(DrakeTeleopError, match="tells no motion; give --motion"):
+    with pytest.raises(DrakeTeleopError, match="delivers no motion; give --motion"):
         Assembly(Parts(Told(WRENCH)))

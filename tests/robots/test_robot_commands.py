@@ -89,7 +89,7 @@ class Peer:
         if self._answers is not None:
             with contextlib.suppress(BlockingIOError):
                 while True:
-                    self.heard.append(udp.unpacked_wrench(self._answers.recv(1000)))
+                    self.heard.append(udp.unpack_wrench(self._answers.recv(1000)))
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def touched(count: int) -> list[Reading]:
 
 def test_a_load_is_found_in_a_stream(here) -> None:
     rows = recorded(40.0, [0, 1, 2])
-    packets = [udp.packed(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
+    packets = [udp.pack_reading(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
     with Peer(packets, 0.1 * DT):
         type_in("docs/robot.md", "drake-teleop calibrate udp")
     found = json.loads(Path("out/load/identification.json").read_text())
@@ -118,7 +118,7 @@ def test_a_load_is_found_in_a_stream(here) -> None:
 
 
 def test_a_tool_is_taken_out_of_a_stream(here, answers, capfd) -> None:
-    with Peer([udp.packed(row) for row in touched(800)], 0.001, answers) as peer:
+    with Peer([udp.pack_reading(row) for row in touched(800)], 0.001, answers) as peer:
         type_in("docs/robot.md", "drake-teleop compensate udp")
     assert "tare" in capfd.readouterr().err
     last = [row for row in peer.heard if not row.flags][-1]
@@ -129,7 +129,7 @@ def test_a_tool_is_taken_out_of_a_stream(here, answers, capfd) -> None:
 def test_a_tool_is_taken_out_of_a_stream_with_poses(here, answers) -> None:
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.1, 0.3])
     packets = [
-        udp.packed_parts(
+        udp.pack_parts(
             Part(WRENCH, row.number, row.t, -row.values[:6]), Part(POSE, row.number, row.t, pose)
         )
         for row in touched(300)

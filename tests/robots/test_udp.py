@@ -23,8 +23,8 @@ from drake_teleop.common.writing import CannotWrite
 from drake_teleop.robots import table
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.lines import LineSource, read_line, written_line
-from drake_teleop.robots.sources_and_sinks import sink_of, source_of
+from drake_teleop.robots.lines import LineSource, read_line, wrench_line
+from drake_teleop.robots.sources_and_sinks import open_sink, open_source
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
@@ -38,18 +38,18 @@ def line_of(reading) -> bytes:
 
 def test_packets_and_lines_are_read_as_they_were_written() -> None:
     reading = readings(3)[2]
-    back = udp.unpacked(udp.packed(reading._replace(flags=int(Flag.SATURATED))))
+    back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(Flag.SATURATED))))
     assert back[:2] == reading[:2] and back.flags == Flag.SATURATED
     np.testing.assert_array_equal(back.values, reading.values)
     back = read_line(line_of(reading), 7)
     assert back.number == 7
     np.testing.assert_array_equal(back.values, reading.values)
     out = Compensated(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
-    again = udp.unpacked_wrench(udp.packed_wrench(out))
+    again = udp.unpack_wrench(udp.pack_wrench(out))
     assert again.flags == 34 and again.scaled.tolist() == out.scaled.tolist()
-    assert json.loads(written_line(out))["flags"] == ["damaged", "stale"]
-    with pytest.raises(DrakeTeleopError, match="is no wrench"):
-        udp.unpacked_wrench(b"x")
+    assert json.loads(wrench_line(out))["flags"] == ["damaged", "stale"]
+    with pytest.raises(DrakeTeleopError, match="is not a wrench packet"):
+        udp.unpack_wrench(b"x")
 
 
 def test_the_header_says_the_same() -> None:
@@ -70,7 +70,7 @@ def test_the_header_says_the_same() -> None:
 def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> None:
     """10^4 of them, between good ones; the fuzz target `wrenches` makes more."""
     rng, compensator = random.Random(4), Compensator(load(), DT, gamma=2.0)
-    good = [udp.packed(each) if kind == "packet" else line_of(each) for each in readings(50)]
+    good = [udp.pack_reading(each) if kind == "packet" else line_of(each) for each in readings(50)]
     flags = 0
     for k in range(5000):
         data = bytearray(good[k % 50])
@@ -78,7 +78,7 @@ def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> Non
             data[rng.randrange(len(data))] = rng.randrange(256)
         if rng.random() < 0.1:
             data = data[: rng.randrange(len(data))]
-        reading = udp.unpacked(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
+        reading = udp.unpack_reading(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
         out = compensator.step(reading, k * DT)
         assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
         flags |= out.flags
@@ -102,17 +102,17 @@ def test_a_number_that_no_packet_and_no_table_holds_is_damage(number) -> None:
     assert read_line(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED
     largest = read_line(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
     out = Compensator(load(), DT).step(largest, 0.0)
-    assert udp.unpacked_wrench(udp.packed_wrench(out)).number == 2**64 - 1
+    assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
 
 def test_from_socket_to_socket_on_this_machine_alone() -> None:
     source = udp.UdpSource("udp://:0", DT)
     with udp.listening(udp.THIS_MACHINE, 0) as there:
         there.settimeout(5.0)
-        sink = sink_of(f"udp://127.0.0.1:{there.getsockname()[1]}")
+        sink = open_sink(f"udp://127.0.0.1:{there.getsockname()[1]}")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for reading in readings(3, touched=5.0):
-                sender.sendto(udp.packed(reading), ("127.0.0.1", source.port))
+                sender.sendto(udp.pack_reading(reading), ("127.0.0.1", source.port))
             sender.sendto(b"x" * 1000, ("127.0.0.1", source.port))
         assert source._socket.getsockname()[0] == "127.0.0.1"
         found = source.read(5.0)
@@ -120,7 +120,7 @@ def test_from_socket_to_socket_on_this_machine_alone() -> None:
         compensator = Compensator(load(), DT)
         for reading in found:
             sink.write(compensator.step(reading, reading.t))
-        back = [udp.unpacked_wrench(there.recv(1000)) for _ in range(4)]
+        back = [udp.unpack_wrench(there.recv(1000)) for _ in range(4)]
     assert [row.flags for row in back] == [0, 0, 0, Flag.DAMAGED]
     np.testing.assert_allclose(back[2].contact[0], 5.0, atol=1e-9)
     assert source.read(0.0) == []
@@ -133,7 +133,7 @@ def test_wrench_and_pose_in_a_packet() -> None:
     pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
     source = udp.PosedSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for packet in (udp.packed_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
+        for packet in (udp.pack_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
             sender.sendto(packet, ("127.0.0.1", source.port))
     assert source._socket.getsockname()[0] == "127.0.0.1"
     found = source.read(5.0)
@@ -150,8 +150,8 @@ def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
     os.write(into, lines[:1000])
     os.write(into, lines[1000:] + b"\n{}\n")
     os.close(into)
-    sink, said = sink_of(str(tmp_path / "x" / "out.csv")), []
-    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, say=said.append)
+    sink, said = open_sink(str(tmp_path / "x" / "out.csv")), []
+    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, report=said.append)
     os.close(out)
     sink.close()
     table = pl.read_csv(tmp_path / "x" / "out.csv")
@@ -277,7 +277,7 @@ class Interrupted:
 
 
 def test_ctrl_c_ends_it_with_what_there_was(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Interrupted(), Compensator(load(), DT), sink_of("-")) == {"wrenches": 1}
+    assert run(Interrupted(), Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
     assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
@@ -291,7 +291,7 @@ def test_the_control_port_tares_and_says_so() -> None:
             control.answer(Compensator(load(), DT).tare)
         said = [asker.recv(100) for _ in range(2)]
     control.close()
-    assert said[0].startswith(b"refused: there are not 0.5 s") and said[1].startswith(b"unknown")
+    assert said[0].startswith(b"refused: fewer than 0.5 s") and said[1].startswith(b"unknown")
 
 
 @pytest.mark.parametrize(
@@ -300,12 +300,12 @@ def test_the_control_port_tares_and_says_so() -> None:
 )
 def test_an_address_that_is_none(address: str) -> None:
     with pytest.raises(DrakeTeleopError):
-        source_of(address, load(), rate_hz=500.0)
+        open_source(address, load(), rate_hz=500.0)
     if address != "log.csv":
         with pytest.raises(DrakeTeleopError):
-            sink_of(address)
+            open_sink(address)
 
 
 def test_a_live_source_needs_its_rate() -> None:
     with pytest.raises(DrakeTeleopError, match="give --rate HZ"):
-        source_of("udp://:0", load())
+        open_source("udp://:0", load())
