@@ -32,8 +32,7 @@ from scipy.signal import lfilter
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
-from drake_teleop.robots.calibrate import calibrate
-from drake_teleop.robots.calibration import Evaluation
+from drake_teleop.robots.calibration import Evaluation, calibrate
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Reading
 

@@ -13,12 +13,10 @@ import numpy as np
 
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.netft import RECORD, NetFtSource
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.ros2 import attachment, message_types
-from drake_teleop.robots.ros2_source import KINDS, Messages
+from drake_teleop.robots.ros2 import KINDS, Messages, attachment, message_types
 from drake_teleop.robots.rtde import parts_of
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import IMU, JOINTS, NONZERO_FLAGS, POSE, WRENCH, Part, Reading

@@ -34,10 +34,9 @@ from drake_teleop.load.tolerance import (
     sizes_of,
     values_of,
 )
-from drake_teleop.robots.calibrate import DEFAULT_TOLERANCE, calibrate
-from drake_teleop.robots.calibration import Evaluation
-from drake_teleop.robots.joints import SensorPoseOfJoints
-from drake_teleop.robots.sources_and_sinks import open_recording
+from drake_teleop.robots.assembly import SensorPoseOfJoints
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
+from drake_teleop.robots.connections import open_recording
 
 _BAR, _DECADES = 24, 3.0  # cells, and decades of the half-width over the tolerance
 

@@ -514,9 +514,11 @@ def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None,
     Prints the load of an identification.json in the format, the units and the frame of a robot, of
     a compensation or of a model, and on stderr what it drops and what is not identified.
     """
-    from drake_teleop.robots.export import export_command
+    from drake_teleop.load.identification import Identification
+    from drake_teleop.robots.export import export as export_load
 
-    text, warnings = export_command(identification, to, sensor_pose, int(sign))
+    found = Identification.load(identification)
+    text, warnings = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for warning in warnings:
         click.echo(f"warning: {warning}", err=True)
     click.echo(text, nl=False)

@@ -6,22 +6,34 @@ Motions are derivatives of poses (docs/robot.md, "Methods").
 from __future__ import annotations
 
 import math
+import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
 from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, STALE_S
-from drake_teleop.robots.delay_following import DelayTracker
-from drake_teleop.robots.export import rotation_about
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.streams import IMU, VALUES, WRENCH, Flag, Part, Reading
+from drake_teleop.robots.delay_tracking import DelayTracker
+from drake_teleop.robots.export import rotation_rpy
+from drake_teleop.robots.streams import (
+    IMU,
+    JOINTS,
+    POSE,
+    VALUES,
+    WRENCH,
+    Flag,
+    Part,
+    PartSource,
+    Reading,
+)
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
 IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
@@ -29,6 +41,87 @@ IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
 _BUFFER_S = 0.5  # buffer of motions and wrenches
 _MIN_DT_S, _MAX_TIME_S, _MAX_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
 _PERIOD_SAMPLES = 20  # for the median period of the motion
+
+
+class Parts:
+    """One or two sources as one; raise DrakeTeleopError if there is no motion.
+
+    Attributes:
+        motion_stream: stream of the motion: poses if available, else an IMU.
+        two_clocks: wrench and motion have different clocks.
+    """
+
+    live = True
+
+    def __init__(self, wrench: PartSource, motion: PartSource | None = None) -> None:
+        self._wrench, self._motion = wrench, motion
+        self.dt, self.two_clocks = wrench.dt, motion is not None
+        streams = (wrench if motion is None else motion).streams
+        self.motion_stream = next((stream for stream in (POSE, IMU) if stream in streams), "")
+        if not self.motion_stream:
+            raise DrakeTeleopError(
+                "delivers no motion",
+                where="the source",
+                remedy="give --motion, such as rtde://HOST",
+            )
+
+    def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
+        """Return parts with their times of arrival."""
+        found: list[tuple[Part, float]] = []
+        if self._motion is not None:
+            motions, now = self._motion.read(0.0) or (), time.monotonic()
+            found += [(part, now) for part in motions if part.stream != WRENCH]
+        parts = self._wrench.read(timeout_s)
+        if parts is None:
+            return None
+        now = time.monotonic()
+        alone = self._motion is None
+        return found + [(part, now) for part in parts if alone or part.stream == WRENCH]
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._wrench.close()
+        if self._motion is not None:
+            self._motion.close()
+
+
+class SensorPoseOfJoints(Protocol):
+    """Kinematics of an arm, such as `station.slave.joint_poses.Arm`."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names from the base outwards."""
+
+    def pose(self, q: Array) -> Array:
+        """Return the pose X_WS (7,) at q (n,), as [w x y z, position]."""
+
+
+class PosedByJoints:
+    """Source that converts joint positions to poses of S."""
+
+    def __init__(self, source: PartSource, arm: SensorPoseOfJoints) -> None:
+        self._source, self._arm, self.dt = source, arm, source.dt
+        others = (stream for stream in source.streams if stream not in (JOINTS, POSE))
+        self.streams: tuple[str, ...] = (*others, POSE)
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `PartSource`."""
+        parts = self._source.read(timeout_s)
+        if parts is None:
+            return None
+        return [self._converted(part) for part in parts if part.stream != POSE]
+
+    def _converted(self, part: Part) -> Part:
+        if part.stream != JOINTS:
+            return part
+        values = np.full(7, np.nan)  # an invalid pose, rejected later
+        if part.values.shape == (len(self._arm.joint_names),):
+            values = self._arm.pose(part.values)
+        return part._replace(stream=POSE, values=values)
+
+    def close(self) -> None:
+        """See `PartSource`."""
+        self._source.close()
 
 
 class MotionWindow:
@@ -118,9 +211,7 @@ def _axis(A: Array) -> Array:
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
     """Return quaternion and position (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
-    roll, pitch, yaw = np.radians(numbers[3:])
-    R = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
-    return np.concatenate([quaternions(R[None])[0], numbers[:3]])
+    return np.concatenate([quaternions(rotation_rpy(numbers[3:])[None])[0], numbers[:3]])
 
 
 class _ClockOffset:

@@ -1,10 +1,13 @@
-"""Decision whether a load is known well enough, and the best next motion (docs/robot.md)."""
+"""Identification from a stream until the requested parameters are known (docs/robot.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +15,7 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.writing import set_aside
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
@@ -19,6 +23,8 @@ from drake_teleop.logs.causes.cause import CHANGES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.robots.recording import Records
+from drake_teleop.robots.streams import Source
 
 CONFIDENCE = 0.9998
 """Level of the interval that must be within the tolerance."""
@@ -181,3 +187,81 @@ def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[s
             rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
             share = rate * _MOTION_S / _MOTION_SAMPLES
             yield words.format(axis=axis), share * (rows.T @ rows)
+
+
+DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
+"""Default tolerances."""
+_IDLE_S = 0.05
+_T = TypeVar("_T")
+
+
+def calibrate(
+    source: Source[_T],
+    recorder: Records[_T],
+    path: Path,
+    tolerance: Tolerance,
+    *,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    seconds: float = 120.0,
+    show: Callable[[Evaluation], None] = lambda _: None,
+) -> list[Evaluation]:
+    """Record a stream until the tolerance is met, the source ends or the time is over.
+
+    Args:
+        path: file of the record; the last result refers to it.
+        cutoff_hz, delay: see `identify_log`.
+        seconds: maximum length of the record.
+        show: callback for each result.
+
+    Returns:
+        All results.
+
+    Raises:
+        DrakeTeleopError: if too few samples came, or the record cannot be written.
+    """
+    results: list[Evaluation] = []
+    next_length_s = FIRST_RECORD_S
+    earlier = [path.with_name(name) for name in recorder.files] if source.live else []
+    pending: Future[Evaluation] | None = None
+
+    def evaluate() -> Evaluation:
+        previous = results[-1] if results else None
+        return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
+
+    def finish(result: Evaluation) -> bool:
+        results.append(result)
+        show(result)
+        return bool(result.known.all())
+
+    def write_record() -> None:
+        if recorder.seconds:
+            set_aside(*earlier)
+            earlier.clear()
+        recorder.write(path)
+
+    done = False
+    try:
+        with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
+            while not done and (samples := source.read(_IDLE_S)) is not None:
+                for sample in samples:
+                    recorder.take(sample)
+                    if pending is None and recorder.seconds >= next_length_s:
+                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.seconds)
+                        write_record()
+                        pending = executor.submit(evaluate)
+                    if pending is not None and (not source.live or pending.done()):
+                        done, pending = finish(pending.result()), None
+                        if done:
+                            break
+                done = done or recorder.seconds >= seconds
+    except Exception:
+        if recorder.seconds:
+            write_record()
+        raise
+    if pending is not None:
+        finish(pending.result())
+    if not results or not results[-1].known.all():
+        write_record()
+        finish(evaluate())
+    return results

@@ -8,22 +8,20 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.writing import set_aside
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
-from drake_teleop.robots.detector import Detector
-from drake_teleop.robots.joints import SensorPoseOfJoints
+from drake_teleop.robots.connections import is_file, open_sink, open_source
 from drake_teleop.robots.lines import flag_names
-from drake_teleop.robots.sources_and_sinks import is_file, open_sink, open_source
-from drake_teleop.robots.streams import Compensated, Sink, Source
+from drake_teleop.robots.streams import Compensated, Reading, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import Detector, Watch
 
 _IDLE_S = 0.01  # period of zero wrenches while nothing comes
 
@@ -53,7 +51,7 @@ class Control:
 
 
 def run(
-    source: Source,
+    source: Source[Reading],
     compensator: Compensator,
     sink: Sink,
     *,
@@ -114,44 +112,29 @@ def compensate_command(
     *,
     sigma: float = 0.0,
     gamma: float = 1.0,
-    rate_hz: float | None = None,
+    cutoff_hz: float | None = 30.0,
     largest: tuple[float, float] | None = None,
     predicted: bool = False,
     tare: bool = False,
     watch: bool = False,
     free: Path | None = None,
     control: int | None = None,
-    real_time: bool = False,
-    cutoff_hz: float | None = 30.0,
-    delay: str | float = "auto",
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
+    **stream: Any,
 ) -> None:
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        sigma, gamma, cutoff_hz, predicted: see `Compensator`; other options: `open_source`.
+        sigma, gamma, cutoff_hz, predicted: see `Compensator`.
         largest: range of the sensor [N], [N m].
         free: log of free motion, see `Detector`.
         control: port of `Control`.
+        stream: see `open_source`.
 
     Raises:
         DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
-    readings = open_source(
-        source,
-        found,
-        rate_hz=rate_hz,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-        real_time=real_time,
-        motion=motion,
-        sensor_pose=sensor_pose,
-        arm=arm,
-    )
-    limits: Array | None = None if largest is None else np.repeat(largest, 3)
+    readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
     compensator = Compensator(
         found,
         readings.dt,
@@ -160,7 +143,7 @@ def compensate_command(
         cutoff_hz=cutoff_hz,
         wait=getattr(readings, "wait", 0),
         predicted=predicted,
-        largest=limits,
+        largest=None if largest is None else np.repeat(largest, 3),
         watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
         detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
     )
@@ -193,7 +176,7 @@ def compensate_command(
         if isinstance(readings, Assembly):
             report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
-        with ExitStack() as last:
+        with ExitStack() as stack:
             for each in (wrenches, readings, control_port, changes):
                 if each is not None:
-                    last.callback(each.close)
+                    stack.callback(each.close)

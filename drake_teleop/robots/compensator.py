@@ -18,8 +18,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.robots.detector import Detector
-from drake_teleop.robots.live_step import (
+from drake_teleop.robots.compensation_step import (
     AT_RANGE,
     NOT_FINITE,
     TOO_LARGE,
@@ -28,7 +27,7 @@ from drake_teleop.robots.live_step import (
     value_problem,
 )
 from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Flag, Reading
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import Detector, Watch
 
 STALE_S = 0.05
 """Age above which the wrench is zero [s]."""

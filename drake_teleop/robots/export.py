@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -66,14 +65,14 @@ def export(
     found: Identification,
     to: str,
     *,
-    R_FS: Array | None = None,
-    p_FoSo_F: Array | None = None,
+    sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
     """Return the text for a target of `FORMATS`, and warnings of dropped and unidentified values.
 
     Args:
-        R_FS, p_FoSo_F: pose [m] of the sensor in the frame F of the values; None: F is S.
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the values,
+            as in a URDF; None: F is S.
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
 
     Raises:
@@ -92,18 +91,16 @@ def export(
             where="export",
             remedy="use a wrench without the robot's payload compensation, or `compensate`",
         )
-    posed = R_FS is not None or p_FoSo_F is not None
-    if posed and format.of_sensor:
+    if sensor_pose is not None and format.of_sensor:
         raise DrakeTeleopError(
             f"{to} takes its values in the sensor's frame",
             where="export",
-            remedy="leave out the sensor's pose",
+            remedy="remove the sensor's pose",
         )
-    phi = transform_phi(
-        found.phi,
-        np.eye(3) if R_FS is None else R_FS,
-        np.zeros(3) if p_FoSo_F is None else p_FoSo_F,
-    )
+    R_FS, p_FoSo_F = np.eye(3), np.zeros(3)
+    if sensor_pose is not None:
+        R_FS, p_FoSo_F = rotation_rpy(sensor_pose[3:]), np.array(sensor_pose[:3])
+    phi = transform_phi(found.phi, R_FS, p_FoSo_F)
     if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
         raise DrakeTeleopError(
             f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
@@ -117,23 +114,7 @@ def export(
     return notes + format.write(load), warnings
 
 
-def export_command(
-    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: int
-) -> tuple[str, list[str]]:
-    """Return text and warnings of the command `export`.
-
-    Args:
-        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in F, as in a URDF.
-    """
-    found = Identification.load(identification)
-    if sensor_pose is None:
-        return export(found, to, sign=sign)
-    roll, pitch, yaw = np.radians(sensor_pose[3:])
-    R_FS = rotation_about(2, yaw) @ rotation_about(1, pitch) @ rotation_about(0, roll)
-    return export(found, to, R_FS=R_FS, p_FoSo_F=np.array(sensor_pose[:3]), sign=sign)
-
-
-def rotation_about(axis: int, angle: float) -> Array:
+def _rotation_about(axis: int, angle: float) -> Array:
     """Return the rotation matrix about the axis 0, 1 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
@@ -141,6 +122,12 @@ def rotation_about(axis: int, angle: float) -> Array:
     R[j, i] = np.sin(angle)
     R[i, j] = -R[j, i]
     return R
+
+
+def rotation_rpy(angles: Sequence[float]) -> Array:
+    """Return the rotation matrix of roll, pitch, yaw [deg] about fixed axes, as in a URDF."""
+    roll, pitch, yaw = np.radians(angles)
+    return _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
 
 
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:

@@ -17,7 +17,6 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.pace import SampleClock
 from drake_teleop.robots.streams import WRENCH, Flag, Part
 
 PORT = 49152
@@ -136,12 +135,12 @@ class NetFtSource:
         self._socket.close()
 
 
-def _read_page(parsed: Address) -> list[float]:
+def _read_page(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
     remedy = "or give them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
-    where = f"http://{parsed.host}/netftapi2.xml"
-    connection = HTTPConnection(parsed.host, timeout=_PAGE_TIMEOUT_S)
+    where = f"http://{address.host}/netftapi2.xml"
+    connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
         return parse_page(connection.getresponse().read(_MAX_PAGE_BYTES))
@@ -167,3 +166,39 @@ def parse_page(content: bytes) -> list[float]:
     if not all(0.0 < value < 1e12 for value in values):
         raise ValueError("not positive numbers")
     return values
+
+
+_MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
+_JUMP_S = 1.0  # a larger step of the number is a restart
+
+
+class SampleClock:
+    """Clock from sample numbers.
+
+    The period is first the stated one, after a second the measured one, so that a wrong stated rate
+    causes no growing delay.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self._dt = self._period = dt
+        self._number, self._t = 0, 0.0
+        self._first: tuple[int, float] | None = None
+
+    def time_of(self, number: int, now: float) -> float:
+        """Return the time of a sample, on its own clock [s].
+
+        Args:
+            number: smaller than before if out of order or after a restart.
+            now: our monotonic clock [s].
+        """
+        step = number - self._number
+        if self._first is None or abs(step) * self._dt > _JUMP_S:
+            self._first = number, now
+        elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
+            self._period = (now - self._first[1]) / (number - self._first[0])
+            if now - self._first[1] > _MAX_SPAN_S:
+                self._first = number, now
+        t = self._t + step * self._period
+        if step > 0 or self._first == (number, now):
+            self._number, self._t = number, t
+        return t

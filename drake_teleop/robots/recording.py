@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -19,8 +19,8 @@ from drake_teleop.common.writing import write_table, write_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
 
 _INVALID_FLAGS = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
@@ -32,10 +32,10 @@ _COLUMNS = {
 _GRAVITY = 9.81  # as in `compensate`
 _NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
 _CLOCK_SAMPLES = 50  # successive samples that confirm another clock
-_T = TypeVar("_T", contravariant=True)
+_T = TypeVar("_T")
 
 
-class Records(Protocol[_T]):
+class Records(Generic[_T]):
     """Collector of samples.
 
     Attributes:
@@ -46,22 +46,7 @@ class Records(Protocol[_T]):
 
     file: str
     files: tuple[str, ...]
-    left_out: int
-    began_anew: int
 
-    @property
-    def seconds(self) -> float:
-        """Length of the record [s]."""
-        ...
-
-    def take(self, sample: _T) -> None:
-        """Add a sample if it is good."""
-
-    def write(self, path: Path) -> None:
-        """Write the log; raise DrakeTeleopError if there are too few samples."""
-
-
-class _Record:
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
         self.left_out, self.began_anew = 0, 0
@@ -73,11 +58,8 @@ class _Record:
 
     def _add(self, stream: str, t: float, values: Array, flags: int, now: float = 0.0) -> None:
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        if (
-            not finite
-            or flags & _INVALID_FLAGS
-            or (np.abs(values[:6]) >= self._largest[stream]).any()
-        ):
+        saturated = (np.abs(values[:6]) >= self._largest[stream]).any()
+        if not finite or flags & _INVALID_FLAGS or saturated:
             self.left_out += 1
             return
         samples, other = self._part[stream], self._other_clock[stream]
@@ -96,10 +78,19 @@ class _Record:
 
     @property
     def seconds(self) -> float:
+        """Length of the record [s]."""
         return _seconds(self._longest_part())
 
+    def take(self, sample: _T) -> None:
+        """Add a sample if it is good."""
+        raise NotImplementedError
 
-class Recorder(_Record):
+    def write(self, path: Path) -> None:
+        """Write the log; raise DrakeTeleopError if there are too few samples."""
+        raise NotImplementedError
+
+
+class Recorder(Records[Reading]):
     """`Records` of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
     file = "log.parquet"
@@ -108,9 +99,9 @@ class Recorder(_Record):
     def __init__(self, largest: Array | None = None) -> None:
         super().__init__({WRENCH: largest})
 
-    def take(self, reading: Reading) -> None:
+    def take(self, sample: Reading) -> None:
         """See `Records`."""
-        self._add(WRENCH, reading.t, reading.values, reading.flags)
+        self._add(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
         """See `Records`."""
@@ -119,7 +110,7 @@ class Recorder(_Record):
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
 
-class PartRecorder(_Record):
+class PartRecorder(Records[tuple[Part, float]]):
     """`Records` of parts; `X_FS` as in `Assembly`."""
 
     file = "log.yaml"

@@ -105,9 +105,9 @@ def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
     """Return the parts of a sample."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
-    parsed = {
+    values_of_stream = {
         WRENCH: sign * values[:6],
         POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
         ACCELERATION: values[12:15],
     }
-    return [Part(stream, number, t, each) for stream, each in parsed.items()]
+    return [Part(stream, number, t, each) for stream, each in values_of_stream.items()]

@@ -6,12 +6,13 @@ Readings are in the sensor's frame S, in SI, with the sign of Eq. (1): wrench of
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
 
+_T = TypeVar("_T")
 VALUES = 15
 """Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
@@ -79,19 +80,19 @@ DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(Flag.DAMAGED))
 """Reading for invalid packets."""
 
 
-class Source(Protocol):
-    """Source of readings.
+class Source(Protocol[_T]):
+    """Source of readings, or of other samples.
 
     Attributes:
-        dt: period of the readings [s].
+        dt: period of the samples [s].
         live: whether they arrive in real time; else as fast as they are read.
     """
 
     dt: float
     live: bool
 
-    def read(self, timeout_s: float) -> list[Reading] | None:
-        """Return the readings after waiting for the first; [] if none, None at the end."""
+    def read(self, timeout_s: float) -> list[_T] | None:
+        """Return the samples after waiting for the first; [] if none, None at the end."""
 
     def close(self) -> None:
         """Close the source."""

@@ -1,16 +1,23 @@
 """Detection of contact or of another load, sample by sample: `--watch`.
 
-A lasting push looks like another load only if it turns with the tool.
+A lasting push looks like another load only if it turns with the tool. With `--free LOG`, contact
+is detected as by `detect`, with a noise floor fitted to a log of free motion.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.contact.detection import ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
+from drake_teleop.load.contact.statistics import RARE
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.watched import (
@@ -20,7 +27,11 @@ from drake_teleop.load.online.watched import (
     watched_state,
     watched_update,
 )
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.compensation_step import low_pass_into
+from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import Flag
 
 MODEL_ERROR = 0.02
@@ -66,3 +77,109 @@ class Watch:
         if state == OTHER_LOAD:
             return int(Flag.OTHER_LOAD)
         return int(Flag.IN_CONTACT) if state == DISTURBED else 0
+
+
+MEAN_TIME_S = 3.0
+"""Time constant of the mean [s]."""
+_GRAVITY_HZ = 0.5
+_STATISTIC = "level"
+_RATE_TOLERANCE = 0.05
+
+
+class Detector:
+    """Contact detection by the noise floor of a log after the causal low-pass.
+
+    Gravity is the specific force below `_GRAVITY_HZ`.
+
+    Args:
+        free: log of free motion of the load, at the rate of the stream.
+        delay: delay of the log, see `eliminate_log`.
+
+    Raises:
+        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
+    """
+
+    def __init__(
+        self,
+        load: Identification,
+        free: Path,
+        dt: float,
+        cutoff_hz: float | None,
+        delay: str | float = "auto",
+    ) -> None:
+        if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
+            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
+        source = LogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
+        if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
+            raise DrakeTeleopError(
+                f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
+                where=str(free),
+                remedy="use the log that `calibrate` wrote from this stream",
+            )
+        self._fast, self._slow = (_low_pass(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        readings = [each for each in source.read(0.0) or () if not each.flags]
+        values = np.array([each.values for each in readings]).reshape(-1, 15)
+        phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
+        contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
+        contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
+        rows = self._low_passed(np.hstack([contact, values[:, 6:]]))
+        # Skip the transient of the low-passes.
+        settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
+        hold = round(1.0 / (cutoff_hz * dt))
+        fade = float(np.exp(-1.0 / hold))
+        covariance = finite_covariance(phi, load.covariance, tared=True)
+        contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
+        floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
+        threshold = max(RARE, floor.threshold(_STATISTIC))
+        self._settings = ContactDetector(
+            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
+        ).settings
+        self.restart()
+        self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset all but the noise floor."""
+        self._memory = ContactDetector.initial_memory()
+        self._filters = np.full((2, 12), np.nan)
+
+    def _low_passed(self, rows: Array) -> Array:
+        """Return low-passed contact, motion and acceleration (N, 18)."""
+        filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
+        out = np.empty((len(rows), 18))
+        for row, to in zip(rows, out, strict=True):
+            to[:6] = row[:6]
+            low_pass_into(to[:6], self._fast, contacts)
+            _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
+        return out
+
+    def flags(self, values: Array, contact: Array) -> int:
+        """Return the flags of a good reading (15,) with low-passed contact wrench (6,)."""
+        touched = _detect(
+            self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
+        )
+        return int(Flag.IN_CONTACT) if touched else 0
+
+
+def _low_pass(dt: float, cutoff_hz: float) -> Array:
+    b, a, settled = low_pass_coefficients(dt, cutoff_hz)
+    return np.concatenate([b, a[1:], settled])
+
+
+@njit(cache=True)
+def _filter_motion_into(values, fast, slow, filters, out):
+    """Write low-passed motion (9,) and acceleration without gravity (3,)."""
+    out[:9] = values[6:]
+    low_pass_into(out[:9], fast, filters[:, :9])
+    out[9:] = values[6:9]
+    low_pass_into(out[9:], slow, filters[:, 9:])
+    for i in range(3):
+        out[9 + i] = out[i] - out[9 + i]
+
+
+@njit(cache=True)
+def _detect(memory, values, contact, fast, slow, filters, settings):
+    filtered = np.empty(12)
+    _filter_motion_into(values, fast, slow, filters, filtered)
+    s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
+    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)

@@ -22,9 +22,8 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, values_of
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.calibrate import calibrate
-from drake_teleop.robots.calibration import Evaluation, best_motion, evaluate_record
-from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.assembly import Parts
+from drake_teleop.robots.calibration import Evaluation, best_motion, calibrate, evaluate_record
 from drake_teleop.robots.recording import PartRecorder, Recorder
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Flag, Part, Reading
 

@@ -24,7 +24,7 @@ INERTIA = np.array([[4.1e-3, 3e-4, -2e-4], [3e-4, 5.2e-3, 1e-4], [-2e-4, 1e-4, 3
 OFFSETS = np.array([1.5, -2.5, 3.5, 0.1, -0.2, 0.3])
 X_FS = RigidTransform(RollPitchYaw(np.radians([20.0, -35.0, 110.0])), [0.01, -0.02, 0.045])
 POSE = ("0.01", "-0.02", "0.045", "20", "-35", "110")
-TURNED = {"R_FS": X_FS.rotation().matrix(), "p_FoSo_F": X_FS.translation()}
+TURNED = {"sensor_pose": tuple(map(float, POSE))}
 
 FOUND = Identification(
     phi=phi_from_mass_com_inertia(MASS, COM, INERTIA),

@@ -21,11 +21,9 @@ from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
-from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.joints import PosedByJoints
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.ros2_source import Messages
-from drake_teleop.robots.sources_and_sinks import open_source
+from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
+from drake_teleop.robots.connections import open_source
+from drake_teleop.robots.ros2 import Messages
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.joint_poses import arm_of

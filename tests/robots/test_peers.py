@@ -27,10 +27,10 @@ from websockets.sync.client import connect
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.connections import open_sink
 from drake_teleop.robots.netft import NetFtSource, parse_page
-from drake_teleop.robots.ros2_source import Ros2Source
+from drake_teleop.robots.ros2 import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
-from drake_teleop.robots.sources_and_sinks import open_sink
 from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,

@@ -12,10 +12,9 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.rotations import rotation_matrices
-from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.sources_and_sinks import open_source
+from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])

@@ -23,8 +23,8 @@ from drake_teleop.common.writing import CannotWrite
 from drake_teleop.robots import table
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
+from drake_teleop.robots.connections import open_sink, open_source
 from drake_teleop.robots.lines import LineSource, read_line, wrench_line
-from drake_teleop.robots.sources_and_sinks import open_sink, open_source
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()

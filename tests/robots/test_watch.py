@@ -13,9 +13,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.streams import Flag, Reading
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import Detector, Watch
 
 DT = 0.002
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))

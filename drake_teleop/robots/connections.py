@@ -10,13 +10,18 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
-from drake_teleop.robots.assembly import IDENTITY_POSE, Assembly, pose_from_rpy
-from drake_teleop.robots.joints import PosedByJoints, SensorPoseOfJoints
+from drake_teleop.robots.assembly import (
+    IDENTITY_POSE,
+    Assembly,
+    Parts,
+    PosedByJoints,
+    SensorPoseOfJoints,
+    pose_from_rpy,
+)
 from drake_teleop.robots.lines import LineSink, LineSource
-from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
-from drake_teleop.robots.streams import JOINTS, PartSource, Sink, Source
+from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
@@ -44,7 +49,7 @@ def open_source(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
-) -> Source:
+) -> Source[Reading]:
     """Return the source at an address (docs/robot.md).
 
     Args:
@@ -99,7 +104,7 @@ def open_recording(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
-) -> tuple[Any, Records[Any]]:
+) -> tuple[Source[Any], Records[Any]]:
     """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
@@ -124,7 +129,7 @@ def open_sink(address: str) -> Sink:
     if kind == "udp":
         return UdpSink(address)
     if kind == "zenoh":
-        from drake_teleop.robots.ros2_sink import Ros2Sink
+        from drake_teleop.robots.ros2 import Ros2Sink
 
         return Ros2Sink(address)
     if kind == "foxglove" or (is_file(address) and path.suffix == ".mcap"):
@@ -166,7 +171,7 @@ def _open_part_source(
 
         return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
     if kind == "zenoh":
-        from drake_teleop.robots.ros2_source import Ros2Source
+        from drake_teleop.robots.ros2 import Ros2Source
 
         return Ros2Source(address, _period(rate_hz, address), joints)
     raise DrakeTeleopError(
