@@ -39,6 +39,8 @@ RATE_TOLERANCE = 0.05
 """Tolerated relative error of the rate, over `_RATE_READINGS` readings and `_RATE_S`."""
 TARE_S = 0.5
 """Time at rest before a tare [s]."""
+MAX_OFFSET_DRIFT = np.repeat([5.0, 0.25], 3)
+"""Maximum drift of the offsets [N, N m]."""
 _RATE_READINGS, _RATE_S = 200, 0.4  # readings, [s]: longer than a burst
 _MAX_TIME_S = 1e12  # [s]
 _MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
@@ -57,6 +59,29 @@ _MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02
 _MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
+class _RateCheck:
+    """Comparison of the measured rate of the readings with the stated one."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt, self._readings = dt, max(_RATE_READINGS, round(_RATE_S / dt))
+        self._start_t, self._start_number = 0.0, 0
+        self.reset()
+
+    def reset(self) -> None:
+        self._count, self._flag = 0, 0
+
+    def flag(self, reading: Reading) -> int:
+        """Return the result of the last complete interval, 0 or `WRONG_RATE`."""
+        if self._count == 0:
+            self._start_t, self._start_number = reading.t, reading.number
+        self._count += 1
+        if self._count > self._readings:
+            spacing = (reading.t - self._start_t) / max(1, reading.number - self._start_number)
+            wrong = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
+            self._flag, self._count = _WRONG_RATE if wrong else 0, 0
+        return self._flag
+
+
 class Compensator:
     """Conversion of readings to wrenches.
 
@@ -66,12 +91,11 @@ class Compensator:
         predicted: extrapolate over wait and low-pass.
         largest: (6,) range of the sensor [N, N m].
         detector: flags contact instead of `watch`.
-        tare_limit: maximum drift of the offsets [N], [N m].
 
     Attributes:
         offsets: (6,) of the sensor [N, N m].
         lag_s: delay of a slow contact without prediction [s].
-        rested: number of successive good readings.
+        good_count: number of successive good readings.
     """
 
     def __init__(
@@ -87,7 +111,6 @@ class Compensator:
         largest: Array | None = None,
         watch: Watch | None = None,
         detector: Detector | None = None,
-        tare_limit: tuple[float, float] = (5.0, 0.25),
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
         self._scales, self._dt = np.array([sigma, sigma, gamma], float), dt
@@ -102,19 +125,12 @@ class Compensator:
             [np.minimum(_MAX_VALUES[:6], 2.0 * self._range), _MAX_VALUES[6:]]
         )
         self._noise_limit = np.maximum(_MAX_NOISE_RATIO * load.residual_rms, _MIN_NOISE_LIMIT)
-        self._tare_limit = np.repeat(tare_limit, 3)
         self._memory = np.full((2, 12), np.nan)
         self._delay_line: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
         self._min_offset = math.inf  # least (now - t)
         self._last_in_time = -math.inf  # arrival of the last reading in time
-        self._rate_start_t, self._rate_start_number, self._rate_count, self._rate_result = (
-            0.0,
-            0,
-            0,
-            0,
-        )
-        self._rate_readings = max(_RATE_READINGS, round(_RATE_S / dt))
+        self._rate = _RateCheck(dt)
         self._tare_rows = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
         self.good_count = 0
         # Load compiled code now; otherwise the first readings would be stale.
@@ -166,7 +182,7 @@ class Compensator:
         if (spread[VALUES:] > self._noise_limit).any():
             return "refused: the wrench varies, as in contact"
         step = self._tare_rows[:, VALUES:].mean(axis=0)
-        if (np.abs(step) > self._tare_limit).any():
+        if (np.abs(step) > MAX_OFFSET_DRIFT).any():
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
                 f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
@@ -207,21 +223,21 @@ class Compensator:
             return flags | int(Flag.REORDERED)
         if started and reading.number <= self._number:
             return self._restart_clock(reading, ahead, flags | int(Flag.RESTART))
-        self._min_offset = min(
-            ahead, self._min_offset + (CLOCK_DRIFT * self._dt if started else 0.0)
-        )
+        drift = CLOCK_DRIFT * self._dt if started else 0.0
+        self._min_offset = min(ahead, self._min_offset + drift)
         if ahead - self._min_offset <= STALE_S:
             self._last_in_time = now
         elif now - self._last_in_time > JUMP_S:
             return self._restart_clock(reading, ahead, flags | int(Flag.CLOCK_JUMP))
         else:
             flags |= _STALE
-        return flags | self._rate_flag(reading)
+        return flags | self._rate.flag(reading)
 
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
         """Accept the clock of this reading and restart."""
         self._min_offset, self._number, self._t = ahead, reading.number, reading.t
-        self._rate_count, self._rate_result, self.good_count = 0, 0, 0
+        self._rate.reset()
+        self.good_count = 0
         self._now = self._last_in_time = reading.t + ahead
         self._reset_filters()
         return flags
@@ -231,18 +247,6 @@ class Compensator:
         if self._detector is not None:
             self._detector.restart()
         self._delay_line.clear()
-
-    def _rate_flag(self, reading: Reading) -> int:
-        if self._rate_count == 0:
-            self._rate_start_t, self._rate_start_number = reading.t, reading.number
-        self._rate_count += 1
-        if self._rate_count > self._rate_readings:
-            spacing = (reading.t - self._rate_start_t) / max(
-                1, reading.number - self._rate_start_number
-            )
-            off = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
-            self._rate_result, self._rate_count = _WRONG_RATE if off else 0, 0
-        return self._rate_result
 
     def _eliminate(self, values: Array) -> Array:
         """Return low-passed contact and scaled wrench (12,)."""

@@ -16,6 +16,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.compensator import MAX_OFFSET_DRIFT
 from drake_teleop.robots.watch import MODEL_ERROR, raw_noise
 
 FADE_TIME_S = 10.0
@@ -32,7 +33,6 @@ TRACKING_ERROR_S = 0.004
 """The same when the delay is known, in addition to the remaining correction [s]."""
 SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
-_OFFSETS = np.repeat([5.0, 0.25], 3)  # maximum drift, as for a tare [N, N m]
 _SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
 
 Motion = tuple[float, Array]
@@ -64,31 +64,30 @@ class DelayTracker:
         elapsed = t - self._t
         if 0.0 <= elapsed < SAMPLE_PERIOD_S or step <= 0.0:
             return
-        if (
-            not 0.0 <= t - self._fitted < FADE_TIME_S
-        ):  # another clock, or no explained sample for long
+        # Another clock, or no explained sample for long.
+        if not 0.0 <= t - self._fitted < FADE_TIME_S:
             self._reset(t)
             elapsed = 0.0
         self._t = t
-        for row, (_, of) in zip(self._wrenches, (at, before, after), strict=True):
-            non_contact_wrench_into(of[:3], of[3:6], of[6:], self._phi, row)
+        for row, (_, motion) in zip(self._wrenches, (at, before, after), strict=True):
+            non_contact_wrench_into(motion[:3], motion[3:6], motion[6:], self._phi, row)
         slope = (self._wrenches[2] - self._wrenches[1]) / step
         residual = wrench - self._wrenches[0]
         if self._is_explained(residual, slope):
             # The sums refer to zero delay; the motion is already shifted by the present one.
             residual = residual + slope * self.delay_s
-            fades = math.exp(-(t - self._fitted) / FADE_TIME_S)
+            fade = math.exp(-(t - self._fitted) / FADE_TIME_S)
             self._fitted, self._samples = t, self._samples + 1
-            self._count = fades * self._count + 1.0
+            self._count = fade * self._count + 1.0
             products = slope, residual, slope * slope, slope * residual, residual * residual
-            self._sums = fades * self._sums + np.stack(products)
+            self._sums = fade * self._sums + np.stack(products)
             self._slew_delay(min(elapsed, FADE_TIME_S))
 
     def _is_explained(self, residual: Array, slope: Array) -> bool:
         """Return whether the residual is explained without contact."""
         starting = self._samples < _MIN_SAMPLES
         limit = _SIGMAS * self._noise + self._delay_error * np.abs(slope)
-        limit += MODEL_ERROR * np.abs(self._wrenches[0]) + starting * _OFFSETS
+        limit += MODEL_ERROR * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT
         offsets = self._offsets
         if not starting:
             offsets = (self._sums[1] - self._sums[0] * self.delay_s) / self._count

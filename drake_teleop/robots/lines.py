@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading
+from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading, Sink, Source
 
 _MAX_LINE_BYTES = 4096  # bytes per line
 _BLOCK_BYTES = 65536
@@ -52,7 +52,7 @@ def flag_names(flags: int) -> list[str]:
     return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
 
 
-class LineSource:
+class LineSource(Source[Reading]):
     """Readings from a growing file, such as standard input."""
 
     live = True
@@ -78,11 +78,8 @@ class LineSource:
                 self._number += 1
         return found
 
-    def close(self) -> None:
-        """See `Source`."""
 
-
-class LineSink:
+class LineSink(Sink):
     """Unbuffered lines in a text file, such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
@@ -92,6 +89,3 @@ class LineSink:
         """See `Sink`."""
         self._file.write(wrench_line(out) + "\n")
         self._file.flush()
-
-    def close(self) -> None:
-        """See `Sink`."""

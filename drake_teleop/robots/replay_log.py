@@ -15,10 +15,10 @@ from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import measured, undelayed
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.streams import Flag, Reading
+from drake_teleop.robots.streams import Flag, Reading, Source
 
 
-class LogSource:
+class LogSource(Source[Reading]):
     """Readings of a log. The motion comes late by its delay, `wait` readings.
 
     Args:
@@ -76,6 +76,3 @@ class LogSource:
             Reading(k, float(self._t[k]), self._values[k], int(self._flags[k]))
             for k in range(first, self._at)
         ]
-
-    def close(self) -> None:
-        """See `Source`."""

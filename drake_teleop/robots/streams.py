@@ -96,6 +96,7 @@ class Source(Protocol[_T]):
 
     def close(self) -> None:
         """Close the source."""
+        return
 
 
 class PartSource(Protocol):
@@ -119,3 +120,4 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Close the sink."""
+        return
