@@ -1,4 +1,4 @@
-"""Each source against a peer in a process of its own, which does all that can go wrong."""
+"""Each source against a simulated device in another process, with all kinds of faults."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OFFSETS = np.array([0.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 @contextmanager
 def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
-    """The peer while it runs: where it is, and what it says later."""
+    """Yield address and later output of a running peer."""
     with subprocess.Popen([sys.executable, PEER, *words], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         lines = (line.decode().strip() for line in process.stdout)
@@ -63,10 +63,10 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
 
 
 class Seen(list[Compensated]):
-    """What the loop of `compensate` makes of a source, with the times when."""
+    """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(self, source: Source, last: int, end: Flag = Flag.RESTART) -> None:
-        """Until a good wrench of the last number after that flag; the tool is at rest."""
+        """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
         self.parts: list[Part] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
@@ -169,7 +169,7 @@ def test_ros_2() -> None:
     seen.check(flags | Flag.CLOCK_JUMP)
 
 
-def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
+def test_ros_2_node_receives_the_wrench() -> None:
     wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     with peer("ros_echo", free_port()) as (port, lines):
         sink = open_sink(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
@@ -221,7 +221,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])
-def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, named: bool) -> None:
+def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=1,1&rate=1000&sign=1")
     compensator, flags = Compensator(load(), source.dt), []
     for k in range(round(2.5 * real_hz)):
@@ -233,7 +233,7 @@ def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, n
     assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
 
 
-def test_a_box_is_asked_for_its_counts_units_and_rate() -> None:
+def test_netft_page_contains_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
     assert parse_page(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
