@@ -182,7 +182,7 @@ def test_call_at_calls_functions_and_propagates_exceptions():
 
 
 def test_other_argument_types_recompile_the_caller():
-    assert _compiled._text(_call) != _compiled._text(_call_other)
+    assert _compiled._constant_text(_call) != _compiled._constant_text(_call_other)
 
 
 def test_borrowing_function_fills_arrays_and_its_callee_allocates():
@@ -297,7 +297,7 @@ def test_no_cache_without_a_writable_folder(monkeypatch):
 
 
 def test_full_disk_raises_no_error(tmp_path):
-    files = _compiled._Files(tmp_path / "absent", _compiled.njit()(vectors.cross))
+    files = _compiled._CacheFiles(tmp_path / "absent", _compiled.njit()(vectors.cross))
     files.save("key", "code")
     assert files.load("key") is None
 
@@ -309,7 +309,7 @@ def _kept(x):
 
 def test_untrusted_cache_file_is_not_loaded(tmp_path):
     """Loading a pickle executes code."""
-    files, planted = _compiled._Files(tmp_path, _kept), tmp_path / "planted"
+    files, planted = _compiled._CacheFiles(tmp_path, _kept), tmp_path / "planted"
     files.save("key", 3)
     (path,) = tmp_path.glob("*.nbc")
     assert files.load("key") == 3
@@ -318,13 +318,13 @@ def test_untrusted_cache_file_is_not_loaded(tmp_path):
     assert files.load("key") is None and not planted.exists()
     owner = Path(_compiled.__file__).stat().st_uid
     for uid, ours in ((os.getuid(), True), (0, True), (owner, True), (owner + 12345, False)):
-        assert _compiled._is_ours(SimpleNamespace(st_uid=uid, st_mode=0o100664)) == ours
+        assert _compiled._is_trusted(SimpleNamespace(st_uid=uid, st_mode=0o100664)) == ours
 
 
 def test_cache_file_is_not_writable_by_others(tmp_path):
     earlier = os.umask(0)
     try:
-        _compiled._Files(tmp_path, _kept).save("key", 3)
+        _compiled._CacheFiles(tmp_path, _kept).save("key", 3)
     finally:
         os.umask(earlier)
     assert [path.stat().st_mode & 0o777 for path in tmp_path.iterdir()] == [0o644]

@@ -25,8 +25,8 @@ ALIASES = "a: &a [1, 1]\n" + "\n".join(
     f"{to}: &{to} [{', '.join([f'*{of}'] * 20)}]" for of, to in zip("abcd", "bcde", strict=True)
 )
 ALL_READERS = {
-    "a field twice": ("channel: {}\nchannel: {}", ":channel: stands there twice (line 2)"),
-    "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: stands there twice"),
+    "a field twice": ("channel: {}\nchannel: {}", ":channel: is defined twice (line 2)"),
+    "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: is defined twice"),
     "a number for a name": ("3: 1", "a field's name is a word, not '3'"),
     "a flag for a name": ("true: 1", "a field's name is a word, not 'true'"),
     "a list for a name": ("[1, 2]: 1", "a field's name is a word"),
@@ -39,11 +39,11 @@ ALL_READERS = {
     "aliases of aliases": (ALIASES, "there are more than 50000 values"),
     "the name of a tag": ("operator: {task: {_tag: 3}}", ":operator.task._tag: there is no such"),
     "code": ("a: !!python/object/apply:os.system [ls]", ":a: a list takes no tag"),
-    "bytes": ("a: !!binary aGk=", ":a: 'aGk=' with the tag 'binary' means nothing"),
-    "a word that is called a number": ("a: !!int x", ":a: 'x' with the tag 'int' means nothing"),
+    "bytes": ("a: !!binary aGk=", ":a: 'aGk=' does not match the tag 'binary'"),
+    "a word that is called a number": ("a: !!int x", ":a: 'x' does not match the tag 'int'"),
     "two documents": ("--- 1\n--- 2", "is not YAML (line 2"),
     "a character of control": ("a: \x00", "is not YAML"),
-    "another encoding": ("a: \xff", "is no text in UTF-8"),
+    "another encoding": ("a: \xff", "is not UTF-8 text"),
 }
 
 
@@ -129,9 +129,9 @@ def test_trajectory_with_unknown_field_raises(tmp_path):
     [
         ("[" * 200_000, "nested too deeply"),
         ('{"phi": ' * 200_000, "nested too deeply"),
-        ('{"phi": 1, "phi": 2}', ":phi: stands there twice"),
+        ('{"phi": 1, "phi": 2}', ":phi: is defined twice"),
         ("", "is not JSON (line 1"),
-        ("\xff", "is no text in UTF-8"),
+        ("\xff", "is not UTF-8 text"),
     ],
 )
 def test_invalid_load_file_raises(text, expected, tmp_path):
@@ -173,7 +173,7 @@ def identified():
 
 
 def test_huge_file_is_not_read_completely(monkeypatch, tmp_path):
-    monkeypatch.setattr("drake_teleop.common.texts._MOST_VALUES", 100)
+    monkeypatch.setattr("drake_teleop.common.texts._MAX_VALUES", 100)
     path = tmp_path / "x.yaml"
     expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")

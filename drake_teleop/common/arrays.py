@@ -23,12 +23,12 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     Raises:
         DrakeTeleopError: if it is not numeric, has another shape, or is not finite.
     """
-    wanted = ", ".join(["..."] * leading + [str(n) for n in shape])
-    wanted = f"({wanted},)" if len(shape) == 1 and not leading else f"({wanted})"
-    array = numbers(name, value, f"give an array of shape {wanted}")
-    own = array.shape[array.ndim - len(shape) :] if leading else array.shape
-    if own != shape:
-        raise DrakeTeleopError(f"has shape {array.shape} instead of {wanted}", where=name)
+    expected = ", ".join(["..."] * leading + [str(n) for n in shape])
+    expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
+    array = numbers(name, value, f"give an array of shape {expected}")
+    actual = array.shape[array.ndim - len(shape) :] if leading else array.shape
+    if actual != shape:
+        raise DrakeTeleopError(f"has shape {array.shape} instead of {expected}", where=name)
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])

@@ -31,7 +31,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-_PLAIN = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
+_PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
 
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
@@ -65,11 +65,11 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            address, given = values
-            pairs = zip(cgutils.unpack_tuple(builder, given), signature.args[1], strict=True)
+            address, packed = values
+            pairs = zip(cgutils.unpack_tuple(builder, packed), signature.args[1], strict=True)
             cast = [
-                context.cast(builder, value, kind, wanted)
-                for (value, kind), wanted in zip(pairs, arguments, strict=True)
+                context.cast(builder, value, kind, expected)
+                for (value, kind), expected in zip(pairs, arguments, strict=True)
             ]
             kind = context.call_conv.get_function_type(types.void, arguments).as_pointer()
             function = builder.inttoptr(address, kind)
@@ -95,10 +95,10 @@ def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
 class _Cache(FunctionCache):
     def __init__(self, function: FunctionType, dispatcher: Dispatcher) -> None:
         super().__init__(function)
-        self._cache_file = _Files(Path(self.cache_path), dispatcher)
+        self._cache_file = _CacheFiles(Path(self.cache_path), dispatcher)
 
 
-class _Files:
+class _CacheFiles:
     """Files of one function, one for each signature and processor."""
 
     def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
@@ -106,7 +106,7 @@ class _Files:
         versions = f"{sys.implementation.cache_tag}.numba-{numba.__version__}"
         self._folder = folder
         self._dispatcher = dispatcher
-        self._name = (
+        self._prefix = (
             f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}.{versions}-"
         )
 
@@ -115,82 +115,83 @@ class _Files:
             suppress(OSError, EOFError, pickle.UnpicklingError),
             self._path(key).open("rb") as file,
         ):
-            if not _is_ours(os.fstat(file.fileno())):
+            if not _is_trusted(os.fstat(file.fileno())):
                 return None
             stored_key, code = pickle.loads(file.read())
             return code if stored_key == key else None
 
     def save(self, key: Any, code: Any) -> None:
         path = self._path(key)
-        unfinished = path.with_suffix(f".{uuid4().hex}")
+        temporary = path.with_suffix(f".{uuid4().hex}")
         try:
-            unfinished.touch(mode=0o644)  # not writable by others, with any umask
-            unfinished.write_bytes(dumps((key, code)))
-            os.replace(unfinished, path)
-            self._discard(keep=self._name + fingerprint(self._dispatcher))
+            temporary.touch(mode=0o644)  # not writable by others, with any umask
+            temporary.write_bytes(dumps((key, code)))
+            os.replace(temporary, path)
+            self._discard(keep=self._prefix + fingerprint(self._dispatcher))
         except OSError:  # full disk: compile again next time
             with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
 
     def flush(self) -> None:
         self._discard()
 
     def _path(self, key: Any) -> Path:
         this = sha256(str(key).encode()).hexdigest()[:16]
-        return self._folder / f"{self._name}{fingerprint(self._dispatcher)}-{this}.nbc"
+        return self._folder / f"{self._prefix}{fingerprint(self._dispatcher)}-{this}.nbc"
 
     def _discard(self, keep: str | None = None) -> None:
-        for path in self._folder.glob(f"{self._name}*.nbc"):
+        for path in self._folder.glob(f"{self._prefix}*.nbc"):
             if keep is None or not path.name.startswith(keep):
                 path.unlink(missing_ok=True)
 
 
-def _is_ours(file: os.stat_result) -> bool:
+def _is_trusted(file: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
     return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
 
 
 def fingerprint(dispatcher: Dispatcher) -> str:
     """Return a hash of the code of a function and its callees."""
-    reached: set[Any] = {dispatcher}
-    to_do: list[Any] = [dispatcher]
-    while to_do:
-        called = _what_it_is(to_do.pop())[1] - reached
-        reached |= called
-        to_do.extend(called)
-    texts = sorted(_what_it_is(each)[0] for each in reached)
+    found: set[Any] = {dispatcher}
+    pending: list[Any] = [dispatcher]
+    while pending:
+        called = _code_and_callees(pending.pop())[1] - found
+        found |= called
+        pending.extend(called)
+    texts = sorted(_code_and_callees(each)[0] for each in found)
     return sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
-def _what_it_is(compiled: Any) -> tuple[str, frozenset[Any]]:
+def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
     """Return the function's code with its constants, and its callees."""
     function = getattr(compiled, "py_func", compiled)
-    read = dict(_read(function))
+    constants = dict(_referenced_values(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
-        _name(compiled),
-        _text(function.__code__),
-        _text(function.__defaults__),
+        _qualified_name(compiled),
+        _constant_text(function.__code__),
+        _constant_text(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _text(value)) for name, value in read.items()),
+        sorted((name, _constant_text(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
-    return repr(text), frozenset(value for value in read.values() if _is_compiled(value, package))
+    callees = (value for value in constants.values() if _is_callee(value, package))
+    return repr(text), frozenset(callees)
 
 
-def _is_compiled(value: Any, package: str) -> bool:
+def _is_callee(value: Any, package: str) -> bool:
     """Return whether it is compiled into its caller (also plain `register_jitable` functions)."""
     plain = isinstance(value, FunctionType) and value.__module__.partition(".")[0] == package
     return plain or isinstance(value, Dispatcher)
 
 
-def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
+def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
     """Yield name and value of globals and closure variables that the code reads."""
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents
-    names = set(_names(function.__code__))
+    names = set(_referenced_names(function.__code__))
     package = function.__module__.partition(".")[0]
     scopes = [function.__globals__]
     for scope in scopes:
@@ -203,32 +204,32 @@ def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
                 scopes.append(vars(value))
 
 
-def _names(code: CodeType) -> Iterator[str]:
+def _referenced_names(code: CodeType) -> Iterator[str]:
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _names(constant)
+            yield from _referenced_names(constant)
 
 
-def _text(value: Any) -> str:
+def _constant_text(value: Any) -> str:
     """Return a text of a constant, equal in all processes and without line numbers."""
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _text(value.co_consts)))
+        return repr((parts, _constant_text(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_constant_text(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
-        return _name(value)
-    if isinstance(value, _PLAIN):
+        return _qualified_name(value)
+    if isinstance(value, _PLAIN_TYPES):
         return repr(value)
     raise TypeError(f"a compiled function reads {value!r}; its cache cannot see when that changes")
 
 
-def _name(value: Any) -> str:
+def _qualified_name(value: Any) -> str:
     value = getattr(value, "py_func", value)
     named = getattr(value, "__qualname__", "") or value.__name__  # modules have no qualified name
     return f"{getattr(value, '__module__', '')}.{named}{getattr(value, '_fields', '')}"

@@ -12,7 +12,7 @@ from typing import Any
 
 from drake_teleop.common.silence import silent_stderr
 
-_POLARS_USED_IN: list[int] = []  # PID of the first process
+_POLARS_PROCESS: list[int] = []  # PID of the first process
 
 LONGEST_LINE = 1000
 """Maximum length of an error line of the command line."""
@@ -35,22 +35,22 @@ class DrakeTeleopError(ValueError):
         super().__init__(one_line(text, LONGEST_LINE - len("error: ")))
 
 
-def one_line(text: str, longest: int = LONGEST_LINE) -> str:
+def one_line(text: str, max_length: int = LONGEST_LINE) -> str:
     """Return the text as one printable line, shortened in its middle."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
-    if len(text) <= longest:
+    if len(text) <= max_length:
         return text
-    end = longest // 3
-    return f"{text[: longest - end - 5]} ... {text[-end:]}"
+    end = max_length // 3
+    return f"{text[: max_length - end - 5]} ... {text[-end:]}"
 
 
 def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
     """Raise DrakeTeleopError for argument `where` unless the value is of this kind."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        wanted = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
+        expected = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
         found = reprlib.repr(value)
-        raise DrakeTeleopError(f"expected {wanted}, found {found}", where=where, remedy=remedy)
+        raise DrakeTeleopError(f"expected {expected}, found {found}", where=where, remedy=remedy)
 
 
 @contextmanager
@@ -77,9 +77,9 @@ def refuse_fork() -> None:
 
     Call this before polars reads or writes.
     """
-    _POLARS_USED_IN.append(os.getpid())
-    del _POLARS_USED_IN[1:]
-    if [os.getpid()] != _POLARS_USED_IN:
+    _POLARS_PROCESS.append(os.getpid())
+    del _POLARS_PROCESS[1:]
+    if [os.getpid()] != _POLARS_PROCESS:
         raise DrakeTeleopError(
             "this process was forked after tables were read or written, and would hang",
             remedy='start processes by multiprocessing.get_context("spawn")',

@@ -54,22 +54,22 @@ class FieldInfo:
     @property
     def text(self) -> str:
         """Line of a help text."""
-        known = [self.range] if self.range else []
+        metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
-            known.append(f"default {_shown(self.default)}")
-        return f"{self.name}: {self.meaning}" + (f" ({'; '.join(known)})" if known else "")
+            metadata.append(f"default {_shown(self.default)}")
+        return f"{self.name}: {self.meaning}" + (f" ({'; '.join(metadata)})" if metadata else "")
 
 
 def settings(block: _Class) -> _Class:
     """Make a dataclass refuse unknown attributes and list its fields in its help."""
-    block.__setattr__ = _set_known  # type: ignore[assignment]
+    block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
-def _set_known(self: Any, name: str, value: Any) -> None:
+def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     if name not in self.__dataclass_fields__:
         check_name(type(self), name, f"{type(self).__name__}.{name}")
     object.__setattr__(self, name, value)
@@ -80,27 +80,27 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
     For an inner block call this with its `default`, which depends on the place.
     """
-    return [_info(entry, config) for entry in dataclasses.fields(config)]
+    return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 
-def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
+def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     hint: Any = entry.type
     lists, items, optional = kind_of(hint)
     blocks = tuple(item for item in items if item not in KINDS)
-    known = entry.metadata
+    metadata = entry.metadata
     return FieldInfo(
         name=entry.name,
         kind="block" if blocks else KINDS[items[0]].removeprefix("a "),
         lists=lists,
-        length=known.get("length"),
+        length=metadata.get("length"),
         optional=optional,
         default=_default(entry) if isinstance(config, type) else getattr(config, entry.name),
-        unit=known.get("unit", ""),
-        low=known.get("low"),
-        high=known.get("high"),
-        choices=known.get("choices", ()),
+        unit=metadata.get("unit", ""),
+        low=metadata.get("low"),
+        high=metadata.get("high"),
+        choices=metadata.get("choices", ()),
         blocks=blocks,
-        meaning=known.get("doc") or _first_line(blocks[0]),
+        meaning=metadata.get("doc") or _first_line(blocks[0]),
     )
 
 

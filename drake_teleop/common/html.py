@@ -19,8 +19,8 @@ def render(package: str, template: str, **values: Any) -> str:
     """
 
     def source(name: str) -> str:
-        home = "drake_teleop.common" if name == "page.html.j2" else package
-        return resources.files(home).joinpath(name).read_text(encoding="utf-8")
+        owner = "drake_teleop.common" if name == "page.html.j2" else package
+        return resources.files(owner).joinpath(name).read_text(encoding="utf-8")
 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(source),

@@ -31,29 +31,29 @@ def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Sta
         yield progress
     elif not progress:
         yield silent
-    elif not _somebody_looks():
-        yield _lines(after)
+    elif not _is_interactive():
+        yield _line_stages(after)
     else:
-        yield from _bars(after)
+        yield from _bar_stages(after)
 
 
-def _somebody_looks() -> bool:
+def _is_interactive() -> bool:
     from rich import get_console
 
     console = get_console()
     return console.is_terminal or console.is_jupyter
 
 
-def _lines(after: float) -> Stage:
+def _line_stages(after: float) -> Stage:
     opened = time.monotonic()
 
     def stage(name: str) -> Progress:
-        told = False
+        printed = False
 
         def update(fraction: float, words: str = "") -> None:
-            nonlocal told
-            if not told and time.monotonic() - opened >= after:
-                told = True
+            nonlocal printed
+            if not printed and time.monotonic() - opened >= after:
+                printed = True
                 print(f"{name} ...", file=sys.stderr, flush=True)
 
         update(0.0)
@@ -62,7 +62,7 @@ def _lines(after: float) -> Stage:
     return stage
 
 
-def _bars(after: float) -> Iterator[Stage]:
+def _bar_stages(after: float) -> Iterator[Stage]:
     from rich import progress as rich_progress
     from rich.errors import LiveError
 

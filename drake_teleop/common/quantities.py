@@ -69,11 +69,11 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
         raise DrakeTeleopError(
             f"expected a mapping of fields, found {in_short(data)}",
             where=where,
-            remedy=f"the fields are {', '.join(_names(schema))}",
+            remedy=f"the fields are {', '.join(_field_names(schema))}",
         )
     if "_tag" in data and not tagged:
-        raise DrakeTeleopError(f"the tag {data['_tag']} means nothing here", where=where)
-    kinds = _kinds(schema)
+        raise DrakeTeleopError(f"the tag {data['_tag']} is not allowed here", where=where)
+    kinds = _field_types(schema)
     for key, value in data.items():
         if key == "_tag":
             continue
@@ -84,7 +84,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 def check_name(schema: type, name: Any, where: str) -> None:
     """Raise DrakeTeleopError, with a similar name, unless the dataclass has this field."""
-    names = _names(schema)
+    names = _field_names(schema)
     if name not in names:
         remedy = meant(name, names, f"fields: {', '.join(names)}")
         raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
@@ -96,7 +96,7 @@ def check_ranges(config: Any, where: str) -> None:
     Raises:
         DrakeTeleopError: for another kind or length, or a value outside its range or choices.
     """
-    kinds = _kinds(config.__class__)
+    kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), inside(where, field.name)
         _check_kind(kinds[field.name], value, place, from_file=False)
@@ -132,11 +132,11 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
 
 
 @functools.cache
-def _kinds(schema: type) -> dict[str, Kind]:
+def _field_types(schema: type) -> dict[str, Kind]:
     return {name: kind_of(hint) for name, hint in typing.get_type_hints(schema).items()}
 
 
-def _names(schema: type) -> list[str]:
+def _field_names(schema: type) -> list[str]:
     return [field.name for field in dataclasses.fields(schema)]
 
 
@@ -168,22 +168,22 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
         return
     if kind.lists:
         if not isinstance(value, list):
-            raise _unexpected("a list", value, place, "write it in brackets: [...]")
+            raise _kind_error("a list", value, place, "write it in brackets: [...]")
         inner = Kind(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_kind(inner, item, f"{place}[{index}]", from_file=from_file)
     elif first in KINDS:
-        if not _is_of(first, value, from_file=from_file):
+        if not _has_kind(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _unexpected(KINDS[first], value, place, remedy if first is float else "")
+            raise _kind_error(KINDS[first], value, place, remedy if first is float else "")
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_block(kind.items, value, place), value, place, tagged=several)
+        check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
-        raise _unexpected(" or ".join(block.__name__ for block in kind.items), value, place)
+        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place)
 
 
-def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
+def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     """Return the dataclass that a tag selects, by default the first."""
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
@@ -194,17 +194,17 @@ def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     return blocks[names.index(tag) if tag else 0]
 
 
-def _is_of(kind: type, value: Any, *, from_file: bool) -> bool:
+def _has_kind(kind: type, value: Any, *, from_file: bool) -> bool:
     if kind in (bool, str):
         return isinstance(value, kind)
     if isinstance(value, bool):
         return False
     if kind is int:
         return isinstance(value, numbers.Integral)
-    return isinstance(value, numbers.Real) or (from_file and _can_be_read_as_number(value))
+    return isinstance(value, numbers.Real) or (from_file and _is_numeric_text(value))
 
 
-def _can_be_read_as_number(value: Any) -> bool:
+def _is_numeric_text(value: Any) -> bool:
     try:
         float(value)
     except (TypeError, ValueError, OverflowError):
@@ -212,6 +212,6 @@ def _can_be_read_as_number(value: Any) -> bool:
     return True
 
 
-def _unexpected(wanted: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _kind_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
-    return DrakeTeleopError(f"expected {wanted}, found {shown}", where=place, remedy=remedy)
+    return DrakeTeleopError(f"expected {expected}, found {shown}", where=place, remedy=remedy)

@@ -18,15 +18,15 @@ def silent_stderr() -> Iterator[None]:
     with _lock:
         try:
             sys.stderr.flush()
-            kept = os.dup(2)
+            saved = os.dup(2)
         except (AttributeError, OSError, ValueError):  # no stderr
             yield
             return
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 2)
+        os.close(null)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(saved, 2)
+            os.close(saved)

@@ -11,7 +11,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.figure import Figure
 
-_NAMED = 6  # maximum number of listed files
-_RUST = re.compile(r"([^:]+) \(os error \d+\)")
+_MAX_LISTED_FILES = 6  # maximum number of listed files
+_RUST_ERROR = re.compile(r"([^:]+) \(os error \d+\)")
 
 _PART_NAME = "row_{:010d}.parquet"
 PARTS_OF_LOG = _PART_NAME.format(0).replace("0", "?")
@@ -46,13 +46,14 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
         CannotWrite: the file is then unchanged.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
-    unfinished = place.with_name(f"{place.name}.{ending}")
+    temporary = place.with_name(f"{place.name}.{ending}")
     try:
         with naming(path):
-            yield unfinished
-            unfinished.replace(path)
+            yield temporary
+            temporary.replace(path)
     except BaseException:
-        _try_to_remove(unfinished)
+        with suppress(OSError):  # the first error is reported
+            temporary.unlink(missing_ok=True)
         raise
 
 
@@ -67,8 +68,8 @@ def naming(path: Path) -> Iterator[None]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text in UTF-8."""
-    with whole_file(path) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -78,8 +79,8 @@ def write_json(path: Path, data: Any) -> None:
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
     """Write a figure in the format of the file's ending."""
-    with whole_file(path) as unfinished:
-        figure.savefig(unfinished, format=path.suffix.removeprefix("."), **options)
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, format=path.suffix.removeprefix("."), **options)
 
 
 def write_table(
@@ -90,9 +91,9 @@ def write_table(
 
     refuse_fork()
     write = table.write_csv if path.suffix == ".csv" else table.write_parquet
-    with whole_file(path, aside=aside) as unfinished:
+    with whole_file(path, aside=aside) as temporary:
         try:
-            write(unfinished, **options)
+            write(temporary, **options)
         except pl.exceptions.ComputeError as error:  # raised by polars for a full disk
             raise OSError(str(error)) from error
 
@@ -113,13 +114,13 @@ def output_folder(
     make_folder(out)
     with naming(out / last):
         (out / last).unlink(missing_ok=True)
-    before = _states(out)
+    before = _file_states(out)
     try:
         yield
     except CannotWrite as error:
-        after = _states(out)
-        there = [name for name in after if name in kept or before.get(name) != after[name]]
-        raise CannotWrite(str(error), remedy=f"{out} keeps {_listed(there)}") from error
+        after = _file_states(out)
+        existing = [name for name in after if name in kept or before.get(name) != after[name]]
+        raise CannotWrite(str(error), remedy=f"{out} keeps {_listed(existing)}") from error
 
 
 def make_folder(folder: Path) -> None:
@@ -143,14 +144,14 @@ def set_aside(*paths: Path) -> Path | None:
     Raises:
         CannotWrite: if they cannot be moved.
     """
-    there = [path for path in paths if path.exists()]
-    if not there:
+    existing = [path for path in paths if path.exists()]
+    if not existing:
         return None
-    folders = (there[0].with_name(f"earlier-{k}") for k in itertools.count(1))
-    with naming(there[0]):
+    folders = (existing[0].with_name(f"earlier-{k}") for k in itertools.count(1))
+    with naming(existing[0]):
         folder = next(folder for folder in folders if not folder.exists())
         folder.mkdir()
-        for path in there:
+        for path in existing:
             path.rename(folder / path.name)
     return folder
 
@@ -178,7 +179,7 @@ def remove_log(path: Path) -> None:
 
 def _reason(error: OSError) -> str:
     """Return the system's message without numbers and names, from C or Rust."""
-    if found := _RUST.search(str(error)):
+    if found := _RUST_ERROR.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
 
@@ -191,14 +192,7 @@ def _finite(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-def _try_to_remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:  # the first error is reported
-        return
-
-
-def _states(folder: Path) -> dict[str, tuple[int, int]]:
+def _file_states(folder: Path) -> dict[str, tuple[int, int]]:
     """Return time and inode of each file and non-empty folder."""
     found = {}
     for path in sorted(folder.iterdir()):
@@ -211,5 +205,5 @@ def _states(folder: Path) -> dict[str, tuple[int, int]]:
 def _listed(names: Sequence[str]) -> str:
     if not names:
         return "nothing"
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
+    more = f" and {len(names) - _MAX_LISTED_FILES} more" if len(names) > _MAX_LISTED_FILES else ""
+    return ", ".join(names[:_MAX_LISTED_FILES]) + more
