@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
 import os
 import reprlib
 from collections.abc import Iterator, Sequence
@@ -95,6 +96,13 @@ def meant(name: object, names: Sequence[str], otherwise: str) -> str:
 def install_extra(name: str) -> str:
     """Return the remedy for a missing library."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
+
+
+def require_library(module: str, library: str, extra: str, where: str) -> None:
+    """Raise DrakeTeleopError unless the library of an extra is installed."""
+    if importlib.util.find_spec(module) is None:
+        what = f"needs the library {library}, which is not installed"
+        raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))
 
 
 def inside(where: str, name: Any) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.writing import make_folder, naming
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.lines import flag_names
@@ -32,12 +31,7 @@ _SCHEMA = {
 
 class _Channel:
     def __init__(self, where: str) -> None:
-        if importlib.util.find_spec("foxglove") is None:
-            raise DrakeTeleopError(
-                "needs the library foxglove-sdk, which is not installed",
-                where=where,
-                remedy=install_extra("robots"),
-            )
+        require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
         self.context = foxglove.Context()

@@ -17,7 +17,7 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import WRENCH, Flag, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Flag, Part
 
 PORT = 49152
 REQUEST = struct.Struct(">HHI")
@@ -103,7 +103,7 @@ class NetFtSource:
         """Return the wrench in a packet received at `now`, flagged if it is invalid."""
         record = unpack_record(packet)
         if record is None:
-            return Part(WRENCH, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))
+            return DAMAGED_WRENCH
         # rdt_sequence has 32 bits and wraps around.
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
         self._last_received = now

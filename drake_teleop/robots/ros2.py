@@ -6,9 +6,7 @@ attached. A liveliness token lists a node in the ROS graph.
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import math
 import queue
 import struct
 import time
@@ -18,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.arrays import Array
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.quaternions import multiply, rotate
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import IMU, JOINTS, POSE, WRENCH, Compensated, Flag, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Compensated, Part
 
 PORT = 7447
 WRENCH_STAMPED = "geometry_msgs/msg/WrenchStamped"
@@ -43,13 +41,8 @@ _NODE = "drake_teleop"
 
 def require_libraries(where: str) -> None:
     """Raise DrakeTeleopError if a library is missing."""
-    for module, library in (("zenoh", "eclipse-zenoh"), ("rosbags", "rosbags")):
-        if importlib.util.find_spec(module) is None:
-            raise DrakeTeleopError(
-                f"ROS 2 needs the library {library}, which is not installed",
-                where=where,
-                remedy=install_extra("ros"),
-            )
+    require_library("zenoh", "eclipse-zenoh", "ros", where)
+    require_library("rosbags", "rosbags", "ros", where)
 
 
 def message_types() -> Any:
@@ -165,7 +158,7 @@ class Messages:
         try:
             data = self._types.deserialize_cdr(message, KINDS[name])
         except self._damaged:
-            return [Part(stream, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))]
+            return [DAMAGED_WRENCH._replace(stream=stream)]
         if name == "tf":
             samples = self._transform_pose(data)
         else:

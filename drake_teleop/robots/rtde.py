@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import select
 import subprocess
@@ -12,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.quaternions import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
@@ -38,12 +37,7 @@ class RtdeSource:
         parsed = Address(address, PORT, allowed=("sign",))
         if parsed.port != PORT:
             raise DrakeTeleopError("RTDE always uses port 30004", where=address)
-        if importlib.util.find_spec("rtde_receive") is None:
-            raise DrakeTeleopError(
-                "UR robots need the library ur_rtde, which is not installed",
-                where=address,
-                remedy=install_extra("robots"),
-            )
+        require_library("rtde_receive", "ur_rtde", "robots", address)
         self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
         self._start()
         exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample

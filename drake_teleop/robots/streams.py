@@ -78,6 +78,8 @@ class Compensated(NamedTuple):
 
 DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(Flag.DAMAGED))
 """Reading for invalid packets."""
+DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))
+"""Part for invalid packets."""
 
 
 class Source(Protocol[_T]):

@@ -18,7 +18,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Part, Reading
+from drake_teleop.robots.streams import DAMAGED, DAMAGED_WRENCH, Compensated, Flag, Part, Reading
 
 THIS_MACHINE = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
@@ -54,7 +54,7 @@ def pack_parts(wrench: Part, pose: Part) -> bytes:
 def unpack_parts(packet: bytes) -> list[Part]:
     """Return wrench and pose in a packet, a damaged wrench if it is invalid."""
     if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
-        return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
+        return [DAMAGED_WRENCH]
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
     wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED)
