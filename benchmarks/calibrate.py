@@ -32,8 +32,7 @@ from scipy.signal import lfilter
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import Tolerance, read_tolerance, sizes_of, values_of
-from drake_teleop.robots.calibrate import calibrate
-from drake_teleop.robots.calibration import Look
+from drake_teleop.robots.calibration import Evaluation, calibrate
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Reading
 
@@ -142,7 +141,7 @@ def stream_of(
     return Stream(t, np.hstack([wrench, moved + MOTION_NOISE * rng.normal(size=moved.shape)]))
 
 
-def judged(at: Look, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
+def judged(at: Evaluation, tolerance: Tolerance, phi: Array) -> dict[str, Any]:
     """Errors over tolerances, and which intervals hold, at a look."""
     assert at.found is not None
     found = at.found.identification.phi

@@ -29,7 +29,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensate import run
 from drake_teleop.robots.compensator import Compensator
 from drake_teleop.robots.streams import Compensated, Reading
-from drake_teleop.robots.udp import READING, UdpSink, UdpSource, packed
+from drake_teleop.robots.udp import READING, UdpSink, UdpSource, pack_reading
 
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
 RATES = (1000.0, 8000.0)
@@ -42,7 +42,7 @@ def send(port: int, rate: float, seconds: float) -> None:
     alpha = np.column_stack([5 * np.cos(5 * t + k) for k in range(3)])
     motion = 3.0 * omega + [0.0, 0.0, 9.81], omega, alpha
     values = np.hstack([non_contact_wrench(*motion, PHI), *motion])
-    packets = [bytearray(packed(Reading(k, 0.0, row))) for k, row in enumerate(values)]
+    packets = [bytearray(pack_reading(Reading(k, 0.0, row))) for k, row in enumerate(values)]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         start = time.monotonic() + 0.1
         for packet, after in zip(packets, t, strict=True):

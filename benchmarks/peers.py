@@ -44,7 +44,7 @@ from drake_teleop.logs.read.alignment import low_pass, undelayed
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.calibration import look
+from drake_teleop.robots.calibration import evaluate_record
 
 Array = NDArray[np.float64]
 
@@ -151,7 +151,7 @@ def simulated(loads: int, folder: Path) -> dict[str, Any]:
             "static": static(*at_rest(rng, phi, tared=True), offsets=False),
             "vendor": Found(np.concatenate([phi[:4], np.zeros(6)])),
         }
-        at = look(path, ASKED, None, cutoff_hz=30.0, delay="auto")
+        at = evaluate_record(path, ASKED, None, cutoff_hz=30.0, delay="auto")
         for name, each in found.items():
             error = np.abs(values_of(ASKED, each.phi) - values_of(ASKED, phi))
             relative = error / sizes_of(ASKED, phi) * np.repeat([0.5, 0.5, 5.0], [1, 3, 6])

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.recording import PartRecorder
 from drake_teleop.robots.streams import POSE, WRENCH, Part
 

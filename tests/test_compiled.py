@@ -1,4 +1,4 @@
-"""Compiled code follows its sources, through calls from file to file, and is shared safely."""
+"""Compiled code follows its sources between files, and is shared safely."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def _write(folder: Path, changes: dict[str, tuple[str, str]] | None = None) -> N
 
 
 def _answers(monkeypatch) -> dict[str, tuple[float, int]]:
-    """What a new process would answer, and how often it would compile for that."""
+    """Return results in a new process, and the number of compilations."""
     for name in [name for name in sys.modules if name.split(".")[0] == "edited_package"]:
         del sys.modules[name]
     invalidate_caches()
@@ -93,9 +93,7 @@ def package(tmp_path, monkeypatch):
         ("outer", "cache=True", "cache=True, error_model='numpy'", 1.0),
     ],
 )
-def test_an_edit_compiles_what_depends_on_it_again_and_nothing_else(
-    package, monkeypatch, file, old, new, expected
-):
+def test_edit_recompiles_only_dependent_functions(package, monkeypatch, file, old, new, expected):
     _write(package, {"numbers": ("zeros(2)", "array([0.0, 0.0])")})
     assert _answers(monkeypatch) == {"outer": (1.0, 1), "other": (100.0, 1)}
     assert _answers(monkeypatch) == {"outer": (1.0, 0), "other": (100.0, 0)}
@@ -103,7 +101,7 @@ def test_an_edit_compiles_what_depends_on_it_again_and_nothing_else(
     assert _answers(monkeypatch) == {"outer": (expected, 1), "other": (100.0, 0)}
 
 
-def test_lines_that_are_not_compiled_do_not_matter(package, monkeypatch):
+def test_uncompiled_lines_do_not_affect_the_cache(package, monkeypatch):
     _answers(monkeypatch)
     comment = ("@njit", "# A comment, and a function of Python.\ndef f():\n    pass\n\n@njit")
     _write(package, {name: comment for name in ("far", "inner", "outer", "other")})
@@ -128,7 +126,7 @@ def test_code_of_old_sources_is_removed(package, monkeypatch, chosen):
     assert files().isdisjoint(before)
 
 
-def test_code_of_another_signature_under_the_same_name_is_not_taken(package, monkeypatch):
+def test_code_of_another_signature_is_not_loaded(package, monkeypatch):
     _answers(monkeypatch)
     (found,) = package.parent.rglob("other.other.*.nbc")
     function = import_module("edited_package.other").other
@@ -141,7 +139,7 @@ def test_code_of_another_signature_under_the_same_name_is_not_taken(package, mon
     assert sum(function.stats.cache_misses.values()) == 1
 
 
-def test_what_cannot_be_followed_is_refused(tmp_path, monkeypatch):
+def test_untraceable_references_raise(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "reads_a_list.py").write_text(
         HEAD + "LIST = [1]\n\n@njit(cache=True)\ndef f():\n    return LIST[0]\n"
@@ -170,7 +168,7 @@ def _calls(address, x):
     x[0] += 1.0
 
 
-def test_a_function_is_called_by_its_address_and_so_is_one_that_fails():
+def test_call_at_calls_functions_and_propagates_exceptions():
     doubles, refuses = (
         _compiled.address_of(function, (numba.float64[::1],)) for function in (_doubles, _refuses)
     )
@@ -183,11 +181,11 @@ def test_a_function_is_called_by_its_address_and_so_is_one_that_fails():
     assert len(_calls.signatures) == 1, "the caller was compiled for each of them"
 
 
-def test_for_other_arguments_the_caller_is_compiled_again():
-    assert _compiled._text(_call) != _compiled._text(_call_other)
+def test_other_argument_types_recompile_the_caller():
+    assert _compiled._constant_text(_call) != _compiled._constant_text(_call_other)
 
 
-def test_what_borrows_fills_arrays_and_what_it_calls_may_make_some():
+def test_borrowing_function_fills_arrays_and_its_callee_allocates():
     @_compiled.njit()
     def makes(x, out):
         new = np.full(out.shape[0], 2.0)
@@ -207,7 +205,7 @@ def test_what_borrows_fills_arrays_and_what_it_calls_may_make_some():
     assert (sys.getrefcount(x), sys.getrefcount(out)) == before
 
 
-def test_what_borrows_makes_no_array_itself():
+def test_borrowing_function_cannot_allocate():
     @_compiled.njit(borrows=True)
     def makes(x):
         x[:] = np.zeros(x.shape[0])
@@ -216,11 +214,11 @@ def test_what_borrows_makes_no_array_itself():
         makes(np.ones(3))
 
 
-def test_the_package_compiles_through_this_cache_only():
-    own = re.compile(r"^from drake_teleop\._compiled import .*\bnjit$", re.MULTILINE)
+def test_package_uses_only_this_njit():
+    own = re.compile(r"^from drake_teleop\.common\.compiled import .*\bnjit$", re.MULTILINE)
     for path in Path(drake_teleop.__file__).parent.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
-        if path.name != "_compiled.py" and "@njit" in text:
+        if path.name != "compiled.py" and "@njit" in text:
             assert own.search(text), path
 
 
@@ -262,7 +260,7 @@ Path(f"{me} has ended").touch()
 
 
 @pytest.mark.slow
-def test_two_first_runs_side_by_side_leave_the_right_code(tmp_path):
+def test_two_parallel_first_runs_store_the_right_code(tmp_path):
     """With numba's own cache, `double(1.5)` is 2 from then on."""
     (tmp_path / "shared.py").write_text(
         HEAD + "\n@njit(cache=True)\ndef double(x):\n    return x + x\n"
@@ -290,7 +288,7 @@ def test_two_first_runs_side_by_side_leave_the_right_code(tmp_path):
     assert later.communicate()[0] == "6 3.0 0\n"
 
 
-def test_where_no_folder_can_be_written_nothing_is_kept(monkeypatch):
+def test_no_cache_without_a_writable_folder(monkeypatch):
     def nowhere(*_):
         raise RuntimeError("cannot cache function: no locator available")
 
@@ -298,8 +296,8 @@ def test_where_no_folder_can_be_written_nothing_is_kept(monkeypatch):
     assert _compiled.njit(cache=True)(vectors.cross)._cache.cache_path is None
 
 
-def test_a_full_disk_costs_nothing_but_time(tmp_path):
-    files = _compiled._Files(tmp_path / "absent", _compiled.njit()(vectors.cross))
+def test_full_disk_raises_no_error(tmp_path):
+    files = _compiled._CacheFiles(tmp_path / "absent", _compiled.njit()(vectors.cross))
     files.save("key", "code")
     assert files.load("key") is None
 
@@ -309,9 +307,9 @@ def _kept(x):
     return x
 
 
-def test_a_file_that_others_may_have_written_is_not_read(tmp_path):
-    """It is a pickle: reading it is running it."""
-    files, planted = _compiled._Files(tmp_path, _kept), tmp_path / "planted"
+def test_untrusted_cache_file_is_not_loaded(tmp_path):
+    """Loading a pickle executes code."""
+    files, planted = _compiled._CacheFiles(tmp_path, _kept), tmp_path / "planted"
     files.save("key", 3)
     (path,) = tmp_path.glob("*.nbc")
     assert files.load("key") == 3
@@ -320,20 +318,20 @@ def test_a_file_that_others_may_have_written_is_not_read(tmp_path):
     assert files.load("key") is None and not planted.exists()
     owner = Path(_compiled.__file__).stat().st_uid
     for uid, ours in ((os.getuid(), True), (0, True), (owner, True), (owner + 12345, False)):
-        assert _compiled._is_ours(SimpleNamespace(st_uid=uid, st_mode=0o100664)) == ours
+        assert _compiled._is_trusted(SimpleNamespace(st_uid=uid, st_mode=0o100664)) == ours
 
 
-def test_what_is_kept_is_nobody_else_s_to_write(tmp_path):
+def test_cache_file_is_not_writable_by_others(tmp_path):
     earlier = os.umask(0)
     try:
-        _compiled._Files(tmp_path, _kept).save("key", 3)
+        _compiled._CacheFiles(tmp_path, _kept).save("key", 3)
     finally:
         os.umask(earlier)
     assert [path.stat().st_mode & 0o777 for path in tmp_path.iterdir()] == [0o644]
 
 
 class Planted:
-    """What makes a file as soon as it is unpickled."""
+    """Pickle that creates a folder when it is loaded."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""What help texts, references and schemas are made from: the list of a scenario's fields."""
+"""List of the fields of scenarios, the source of help texts, references and schemas."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, re
 
 
 def everything(block: type) -> Iterator[tuple[type, FieldInfo]]:
-    """The fields of a block and of all blocks that may stand in it."""
+    """Yield the fields of a block and of all blocks in it."""
     for entry in fields_of(block):
         yield block, entry
         for inner in entry.blocks:
@@ -36,7 +36,7 @@ def named(config: object, name: str) -> FieldInfo:
 
 
 @pytest.mark.parametrize("root", [Scenario, Study])
-def test_every_field_says_what_it_means(root: type) -> None:
+def test_every_field_has_a_meaning(root: type) -> None:
     silent = [f"{block.__name__}.{entry.name}" for block, entry in everything(root)
               if not entry.meaning]  # fmt: skip
     assert silent == []
@@ -50,7 +50,7 @@ def test_a_quantity_has_unit_and_range() -> None:
     assert named(Simulation, "integrator").range.startswith("runge_kutta3, ")
 
 
-def test_lists_blocks_and_what_may_be_null() -> None:
+def test_lists_blocks_and_optional_fields() -> None:
     intent, task = named(OperatorConfig, "intent"), named(OperatorConfig, "task")
     assert (intent.kind, intent.lists, intent.range) == ("block", 1, "MinimumJerk or Sine")
     assert (task.blocks, task.lists, task.optional, task.default) == (KINDS, 0, True, None)
@@ -59,14 +59,14 @@ def test_lists_blocks_and_what_may_be_null() -> None:
     assert named(ForceScalingConfig, "eta").optional
 
 
-def test_an_instance_tells_its_own_defaults() -> None:
-    """The same class stands at two places with other defaults."""
+def test_instance_gives_its_own_defaults() -> None:
+    """The same class is at two places with other defaults."""
     charged = named(PassivityConfig, "charged_tdpa").default
     plain = named(PassivityConfig, "tdpa").default
     assert named(plain, "drag").default == [0.0, 0.0] != named(charged, "drag").default
 
 
-def test_a_misspelt_field_is_refused_with_the_one_that_is_meant() -> None:
+def test_misspelt_field_raises_with_a_suggestion() -> None:
     scenario = Scenario()
     with pytest.raises(DrakeTeleopError, match=r"ForceScalingConfig\.sgima: .* mean 'sigma'"):
         scenario.force_scaling.sgima = 0.5
@@ -81,8 +81,7 @@ def test_a_misspelt_field_is_refused_with_the_one_that_is_meant() -> None:
     assert scenario == Scenario()
 
 
-def test_all_settings_refuse_them() -> None:
-    """A dataclass that can be changed is one of settings; a new one may not be forgotten."""
+def test_every_mutable_dataclass_is_a_settings_class() -> None:
     forgotten = []
     for path in Path(drake_teleop.__file__).parent.rglob("*.py"):
         classes = re.findall(r"((?:^@.*\n)+)class ([A-Z]\w*)", path.read_text("utf-8"), re.M)
@@ -90,7 +89,7 @@ def test_all_settings_refuse_them() -> None:
     assert forgotten == []
 
 
-def test_settings_are_copied_stored_and_changed_as_ever() -> None:
+def test_settings_can_be_copied_pickled_and_replaced() -> None:
     scenario = LoadScenario("contact_transition")
     for other in (copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario))):
         assert other == scenario
@@ -99,7 +98,7 @@ def test_settings_are_copied_stored_and_changed_as_ever() -> None:
         assert other == replace(scenario, force_scaling__sigma=0.25, simulation__seed=3)
 
 
-def test_help_tells_units_ranges_and_meanings() -> None:
+def test_help_contains_units_ranges_and_meanings() -> None:
     text = Simulation.__doc__ or ""
     assert text.startswith("How long, and with which integrator.")
     assert "    duration: logged time (0.001 to 36000 s; default 1)" in text.splitlines()

@@ -1,4 +1,4 @@
-"""Quaternions of rotation matrices, in each of the branches of Shepperd's method."""
+"""Quaternions of rotation matrices, in each branch of Shepperd's method."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from drake_teleop.common.quaternions import quaternion_of
 @pytest.mark.parametrize(
     "axis", [[0.3, 0.2, 0.1], [3.0, 0.2, 0.3], [0.3, 3.0, 0.2], [0.2, 0.3, 3.0]]
 )
-def test_a_turn_about_any_axis_is_found(axis):
-    """Small, and by nearly half a turn about each axis: another number is the largest each time."""
+def test_quaternion_of_a_rotation_about_any_axis(axis):
+    """A small rotation and nearly 180 deg about each axis cover all branches."""
     turn = Rotation.from_rotvec(axis)
     found = np.array(quaternion_of(turn.as_matrix()))
     wanted = np.roll(turn.as_quat(), 1)

@@ -1,4 +1,4 @@
-"""YAML and JSON from people: one line with file and field for what could be read in two ways."""
+"""Invalid and ambiguous YAML and JSON raise one line with file and field."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ ALIASES = "a: &a [1, 1]\n" + "\n".join(
     f"{to}: &{to} [{', '.join([f'*{of}'] * 20)}]" for of, to in zip("abcd", "bcde", strict=True)
 )
 ALL_READERS = {
-    "a field twice": ("channel: {}\nchannel: {}", ":channel: stands there twice (line 2)"),
-    "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: stands there twice"),
+    "a field twice": ("channel: {}\nchannel: {}", ":channel: is defined twice (line 2)"),
+    "an inner field twice": ("a: {b: {c: 1, c: 2}}", ":a.b.c: is defined twice"),
     "a number for a name": ("3: 1", "a field's name is a word, not '3'"),
     "a flag for a name": ("true: 1", "a field's name is a word, not 'true'"),
     "a list for a name": ("[1, 2]: 1", "a field's name is a word"),
@@ -39,11 +39,11 @@ ALL_READERS = {
     "aliases of aliases": (ALIASES, "there are more than 50000 values"),
     "the name of a tag": ("operator: {task: {_tag: 3}}", ":operator.task._tag: there is no such"),
     "code": ("a: !!python/object/apply:os.system [ls]", ":a: a list takes no tag"),
-    "bytes": ("a: !!binary aGk=", ":a: 'aGk=' with the tag 'binary' means nothing"),
-    "a word that is called a number": ("a: !!int x", ":a: 'x' with the tag 'int' means nothing"),
+    "bytes": ("a: !!binary aGk=", ":a: 'aGk=' does not match the tag 'binary'"),
+    "a word that is called a number": ("a: !!int x", ":a: 'x' does not match the tag 'int'"),
     "two documents": ("--- 1\n--- 2", "is not YAML (line 2"),
     "a character of control": ("a: \x00", "is not YAML"),
-    "another encoding": ("a: \xff", "is no text in UTF-8"),
+    "another encoding": ("a: \xff", "is not UTF-8 text"),
 }
 
 
@@ -61,7 +61,7 @@ def message(read, path, text: str) -> str:
     "read", [LoadScenario, LoadStudy, load_description, FourierTrajectory.load]
 )
 @pytest.mark.parametrize("name", ALL_READERS)
-def test_what_no_yaml_file_may_hold(read, name, tmp_path):
+def test_ambiguous_yaml_raises(read, name, tmp_path):
     text, expected = ALL_READERS[name]
     assert expected in message(read, tmp_path / "x.yaml", text)
 
@@ -69,7 +69,7 @@ def test_what_no_yaml_file_may_hold(read, name, tmp_path):
 @pytest.mark.parametrize(
     "read", [LoadScenario, LoadStudy, load_description, FourierTrajectory.load]
 )
-def test_an_empty_file(read, tmp_path):
+def test_empty_file_raises(read, tmp_path):
     message(read, tmp_path / "x.yaml", "")
 
 
@@ -93,7 +93,7 @@ def test_an_empty_file(read, tmp_path):
         (f"operator: {'x' * 5000}", ":operator: expected a mapping"),
     ],
 )
-def test_what_a_scenario_does_not_hold(text, expected, tmp_path):
+def test_invalid_scenario_raises(text, expected, tmp_path):
     assert expected in message(LoadScenario, tmp_path / "x.yaml", text)
 
 
@@ -111,12 +111,12 @@ STREAM = "wrench: {{file: w.csv, time: {}, force: {{columns: [a]}}, torque: {{co
         ("{rate: 100}", "gravity: true", ":gravity: "),
     ],
 )
-def test_what_a_description_does_not_hold(time, more, expected, tmp_path):
+def test_invalid_description_raises(time, more, expected, tmp_path):
     path = tmp_path / "x.yaml"
     assert expected in message(load_description, path, STREAM.format(time, more))
 
 
-def test_a_trajectory_has_no_other_fields(tmp_path):
+def test_trajectory_with_unknown_field_raises(tmp_path):
     path, joint = tmp_path / "x.yaml", "{q0: 0, rho: [1], delta: [1]%s}"
     path.write_text(f"frequency: 1\njoints: {{a: {joint % ''}}}")
     assert FourierTrajectory.load(path).period == 1.0
@@ -129,12 +129,12 @@ def test_a_trajectory_has_no_other_fields(tmp_path):
     [
         ("[" * 200_000, "nested too deeply"),
         ('{"phi": ' * 200_000, "nested too deeply"),
-        ('{"phi": 1, "phi": 2}', ":phi: stands there twice"),
+        ('{"phi": 1, "phi": 2}', ":phi: is defined twice"),
         ("", "is not JSON (line 1"),
-        ("\xff", "is no text in UTF-8"),
+        ("\xff", "is not UTF-8 text"),
     ],
 )
-def test_what_no_load_file_may_hold(text, expected, tmp_path):
+def test_invalid_load_file_raises(text, expected, tmp_path):
     assert expected in message(Identification.load, tmp_path / "x.json", text)
 
 
@@ -147,7 +147,7 @@ def test_what_no_load_file_may_hold(text, expected, tmp_path):
         ("delay_s", "0.0", "1e300"),
     ],
 )
-def test_what_is_no_number_in_a_load_file(name, old, value, tmp_path, identified):
+def test_nonnumeric_value_in_a_load_file_raises(name, old, value, tmp_path, identified):
     path = tmp_path / "x.json"
     identified.save(path)
     text = path.read_text()
@@ -172,14 +172,14 @@ def identified():
     )
 
 
-def test_a_huge_file_is_not_read_to_its_end(monkeypatch, tmp_path):
-    monkeypatch.setattr("drake_teleop.common.texts._MOST_VALUES", 100)
+def test_huge_file_is_not_read_completely(monkeypatch, tmp_path):
+    monkeypatch.setattr("drake_teleop.common.texts._MAX_VALUES", 100)
     path = tmp_path / "x.yaml"
     expected = "(line 201: there are more than 100 values)"  # and not: a bracket that is not closed
     assert expected in message(read_yaml, path, "- 1\n" * 250 + "[")
 
 
-def test_scalars_are_those_of_yaml_1_2(tmp_path):
+def test_scalars_follow_yaml_1_2(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text(
         "[0, -3, 1e-3, .5, 5., -.inf, ~, null, true, FALSE, no, 1:30, '010', 1_000, 0o7, '', 0.010]"
@@ -190,18 +190,18 @@ def test_scalars_are_those_of_yaml_1_2(tmp_path):
     assert [type(x) for x in read_yaml(path)] == [type(x) for x in expected]
 
 
-def test_text_may_begin_with_the_mark_of_utf8(tmp_path):
+def test_byte_order_mark_is_ignored(tmp_path):
     path = tmp_path / "x"
     path.write_bytes(b"\xef\xbb\xbf[1]")
     assert read_yaml(path) == read_json(path) == [1]
 
 
-def test_numbers_of_python_beyond_all_floats():
+def test_overlong_integers_raise():
     with pytest.raises(DrakeTeleopError, match=r"simulation\.duration: 9999.* is outside"):
         replace(Scenario(), simulation__duration=10**400 - 1).check()
 
 
-def test_a_line_keeps_its_beginning_and_its_end():
+def test_shortened_line_keeps_beginning_and_end():
     line = one_line("begin\n" + "x" * 1000 + " \x1b[31m end")
     assert len(line) == LONGEST_LINE
     assert line.startswith("begin x") and line.endswith("x ?[31m end")
@@ -216,7 +216,7 @@ def test_a_line_keeps_its_beginning_and_its_end():
         (LoadStudy, "scaling_tuch", "no study 'scaling_tuch'; did you mean 'scaling_touch'?"),
     ],
 )
-def test_a_misspelt_name_is_told_which_one_is_near(load, name, expected):
+def test_misspelt_name_gets_a_suggestion(load, name, expected):
     with pytest.raises(DrakeTeleopError) as error:
         load(name)
     assert expected in str(error.value)
@@ -240,14 +240,14 @@ DATA = st.recursive(
 
 
 @given(DATA)
-def test_all_data_are_read_as_they_were_written(data) -> None:
-    """By this package; and by YAML 1.1, which has other words for numbers and flags."""
+def test_written_yaml_is_read_back(data) -> None:
+    """By this package and by YAML 1.1, which has other words for numbers and flags."""
     text = yaml_text(data, head=["a\nb: 1"])
     assert yaml_data(text, "text") == data
     assert yaml.safe_load(text) == data
 
 
-def test_comments_stand_behind_their_fields_and_change_nothing() -> None:
+def test_comments_follow_their_fields() -> None:
     data = {"a": {"b": "x: #", "c": [1.5, 2]}, "b": [{"_tag": "!Wall", "b": "two\nlines"}]}
     text = yaml_text(data, head=["above"], comments={"a.b": "of a", "b": "of b"})
     lines = text.splitlines()
@@ -258,7 +258,7 @@ def test_comments_stand_behind_their_fields_and_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("word", ["1e-3", "010", "a\nb: 1", "x # y", "\x1b[31m", "!Touch {}"])
-def test_a_scenario_is_written_as_it_is(tmp_path, word) -> None:
+def test_written_scenario_is_read_back(tmp_path, word) -> None:
     path = tmp_path / "scenario.yaml"
     device = Master(model="haply_inverse3")
     scenario = replace(Scenario(), description=word, slave__sensor_frame=word, master=device)
@@ -267,7 +267,7 @@ def test_a_scenario_is_written_as_it_is(tmp_path, word) -> None:
     assert LoadScenario(path).slave.sensor_frame == word
 
 
-def test_no_column_s_name_gets_out_of_the_comment_of_a_draft(tmp_path) -> None:
+def test_column_names_stay_inside_comments_of_a_draft(tmp_path) -> None:
     path = tmp_path / "x.parquet"
     names = ["t", "fx", "fy", "fz", "a\nimu: {file: /etc/passwd}\n#"]
     pl.DataFrame({name: np.arange(5.0) for name in names}).write_parquet(path)

@@ -1,4 +1,4 @@
-"""The vectors' functions against numpy's, in Python, compiled, and with Drake's other scalars."""
+"""Vector functions against NumPy, in Python, compiled, and with Drake's other scalars."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ INERTIA = np.array([[0.05, 0.01, -0.02], [0.01, 0.06, 0.003], [-0.02, 0.003, 0.0
         (vectors.symmetric, (phi, 4), INERTIA.ravel()),
     ],
 )
-def test_it_is_what_numpy_says(function, arguments, expected, compiled):
+def test_vector_functions_equal_numpy(function, arguments, expected, compiled):
     if compiled:
         function = njit(function)
     np.testing.assert_allclose(function(*arguments), expected, rtol=1e-15, atol=1e-15)
 
 
-def test_adding_is_to_the_place_that_is_named():
+def test_add_into_changes_only_the_given_index():
     x = np.zeros(6)
     vectors.add_into(x, 2, a)
     vectors.add_into(x, 2, b)
@@ -55,7 +55,7 @@ def solved(M, b, n):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 3, 6])
-def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
+def test_cholesky_and_solve_equal_numpy_and_read_the_lower_half(n):
     random = np.random.default_rng(n)
     root, right = random.normal(size=(n, n)), random.normal(size=n)
     M = root @ root.T + np.eye(n)
@@ -67,13 +67,13 @@ def test_cholesky_and_solve_are_those_of_numpy_and_read_the_lower_half_only(n):
     np.testing.assert_allclose(right, x, rtol=1e-14)
 
 
-def test_the_matrix_of_a_cross_product_is_made_of_one_vector_and_of_many():
+def test_cross_matrix_of_one_and_many_vectors():
     np.testing.assert_allclose(vectors.cross_matrix(a) @ b, np.cross(a, b), rtol=1e-15)
     many = np.array([[a, c], [c, a]])
     np.testing.assert_allclose(vectors.cross_matrix(many) @ b, np.cross(many, b), atol=1e-14)
 
 
-def test_the_wrench_takes_automatic_derivatives_and_expressions():
+def test_wrench_accepts_autodiff_and_expressions():
     s, omega, alpha = a, b, c
     derived, wrench = InitializeAutoDiff(phi).ravel(), np.empty(6, dtype=object)
     non_contact_wrench_into.py_func(s, omega, alpha, derived, wrench)

@@ -1,4 +1,4 @@
-"""Files are complete or absent; what cannot be written is one line, wherever the disk is full."""
+"""Output files are complete or absent; a full disk at any file raises one line."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TABLE = pl.DataFrame({"x": np.random.default_rng(0).random(5000)})
 
 @contextmanager
 def small_disk(size: int = 100) -> Iterator[None]:
-    """While it lasts no file of this process grows beyond so many bytes: the kernel refuses."""
+    """Limit the size of files of this process, as a full disk does."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -50,7 +50,7 @@ def small_disk(size: int = 100) -> Iterator[None]:
 
 @contextmanager
 def full_at(write: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Path]]:
-    """The disk is full when the file with this number gets its name; gives those that had it."""
+    """Simulate a full disk at the file with this number; yield the names of earlier files."""
     replace, named = Path.replace, []
 
     def filling(path: Path, target: Path) -> Path:
@@ -75,7 +75,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.pictures
-def test_a_file_that_has_no_room_is_one_line_and_the_earlier_one_stays(tmp_path, name):
+def test_full_disk_raises_one_line_and_keeps_the_earlier_file(tmp_path, name):
     path = tmp_path / name
     path.write_text("earlier")
     with small_disk(), pytest.raises(CannotWrite) as error:
@@ -87,7 +87,7 @@ def test_a_file_that_has_no_room_is_one_line_and_the_earlier_one_stays(tmp_path,
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_an_interrupt_leaves_the_earlier_file_alone(tmp_path):
+def test_interrupt_keeps_the_earlier_file(tmp_path):
     path = tmp_path / "x"
     path.write_text("earlier")
     with pytest.raises(KeyboardInterrupt), whole_file(path) as unfinished:
@@ -96,13 +96,13 @@ def test_an_interrupt_leaves_the_earlier_file_alone(tmp_path):
     assert [p.read_text() for p in tmp_path.iterdir()] == ["earlier"]
 
 
-def test_what_is_not_finite_is_null(tmp_path):
+def test_nonfinite_numbers_become_null(tmp_path):
     path = tmp_path / "x.json"
     write_json(path, {"a": float("nan"), "b": (float("inf"), {"c": -float("inf")}), "d": 1.5})
     assert json.loads(path.read_text()) == {"a": None, "b": [None, {"c": None}], "d": 1.5}
 
 
-def test_a_folder_that_cannot_be_is_one_line(tmp_path, monkeypatch):
+def test_impossible_folder_raises_one_line(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for folder, reason in (("file", "File exists"), ("file/x", "Not a directory")):
         with pytest.raises(CannotWrite, match=f"cannot be made a folder .{reason}.; give another"):
@@ -112,8 +112,8 @@ def test_a_folder_that_cannot_be_is_one_line(tmp_path, monkeypatch):
         make_folder(tmp_path)
 
 
-def test_the_last_file_says_that_all_is_there(tmp_path):
-    """It goes first and comes last; the error names what of this time is there."""
+def test_last_file_marks_a_complete_folder(tmp_path):
+    """It is removed first and written last; the error lists the new files."""
     out = tmp_path / "Käse und Brot"
     for name in ("summary.json", "earlier", "a"):
         make_folder(out)
@@ -129,7 +129,7 @@ def test_the_last_file_says_that_all_is_there(tmp_path):
 
 
 def a_run(scenario, stage, log, *, fresh):
-    """What `run_scenario` gives, of a station that nobody has simulated."""
+    """Return a result of `run_scenario` without a simulation."""
     t = np.arange(3.0)
     sizes = {"measured_wrench_S": 6, "specific_force_S": 3, "angular_velocity_S": 3}
     sizes |= {"angular_acceleration_S": 3, "sample_time": 1}
@@ -166,7 +166,7 @@ COMMANDS: dict[str, tuple[Callable[[Path], None], int, str]] = {
 
 @pytest.fixture
 def little_work(monkeypatch):
-    """The commands write all of their files, and have little to do for it."""
+    """Replace the work of the commands, which still write all files."""
     monkeypatch.setattr(runs, "run_scenario", a_run)
     monkeypatch.setattr(runs, "summarise", lambda run: {"x": float("nan")})
     monkeypatch.setattr(runs, "overview", lambda result: Figure())
@@ -183,7 +183,7 @@ def little_work(monkeypatch):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_disk_that_is_full_at_any_file(tmp_path, monkeypatch, little_work, name):
+def test_full_disk_at_any_file(tmp_path, monkeypatch, little_work, name):
     command, files, third = COMMANDS[name]
     for write in itertools.count():
         out = tmp_path / str(write) / "out"
@@ -217,7 +217,7 @@ def whole(path: Path) -> None:
         assert path.stat().st_size
 
 
-def test_a_study_that_found_no_room_goes_on(tmp_path, monkeypatch, little_work):
+def test_study_continues_after_a_full_disk(tmp_path, monkeypatch, little_work):
     out = tmp_path / "out"
     with full_at(2, monkeypatch), pytest.raises(DrakeTeleopError):
         study(out)
@@ -229,7 +229,7 @@ def test_a_study_that_found_no_room_goes_on(tmp_path, monkeypatch, little_work):
     assert len(calls) == 1
 
 
-def test_a_run_that_fails_before_it_begins_leaves_nothing(tmp_path, monkeypatch):
+def test_run_that_fails_early_leaves_no_files(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise DrakeTeleopError("joint 1 leaves its range")
 
@@ -244,7 +244,7 @@ def test_a_run_that_fails_before_it_begins_leaves_nothing(tmp_path, monkeypatch)
     assert LoadScenario(mine).description == "mine"
 
 
-def test_what_an_earlier_run_left_is_not_taken_for_this_one_s(tmp_path, monkeypatch, little_work):
+def test_summary_of_an_earlier_run_is_removed(tmp_path, monkeypatch, little_work):
     run(tmp_path)
     (tmp_path / "identification.json").touch()
     with full_at(2, monkeypatch), pytest.raises(DrakeTeleopError):
@@ -252,7 +252,7 @@ def test_what_an_earlier_run_left_is_not_taken_for_this_one_s(tmp_path, monkeypa
     assert {path.name for path in tmp_path.iterdir()} == {"scenario.yaml", "log.parquet"}
 
 
-def test_a_film_cannot_be_written(tmp_path, monkeypatch):
+def test_replay_that_cannot_be_written_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(Film, "_recorded", lambda self, make_scene: "<body></body>")
     film = Film("x", np.arange(2.0), 1.0)
     with small_disk(), pytest.raises(CannotWrite, match=r"x\.html: cannot be written"):

@@ -34,9 +34,8 @@ from drake_teleop.load.tolerance import (
     sizes_of,
     values_of,
 )
-from drake_teleop.robots.calibrate import DEFAULT, calibrate
-from drake_teleop.robots.calibration import Look
-from drake_teleop.robots.sources_and_sinks import recorded
+from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
+from drake_teleop.robots.connections import open_recording
 
 _BAR, _DECADES = 24, 3.0  # cells of a bar, and decades of the half-width over the tolerance
 
@@ -45,7 +44,7 @@ def calibrate_command(
     source: str,
     out: Path,
     *,
-    until: str = DEFAULT,
+    until: str = DEFAULT_TOLERANCE,
     largest: tuple[float, float] | None = None,
     seconds: float = 120.0,
     cutoff_hz: float | None = 30.0,
@@ -53,7 +52,7 @@ def calibrate_command(
     quiet: bool = False,
     **stream_options: Any,
 ) -> dict[str, Any]:
-    """Run `calibrate` and return its summary; see `source_of` for the stream's options.
+    """Run `calibrate` and return its summary; see `open_source` for the stream's options.
 
     Args:
         until: see `read_tolerance`.
@@ -65,14 +64,14 @@ def calibrate_command(
     tolerance = read_tolerance(until)
     make_folder(out)
     limits = None if largest is None else np.repeat(largest, 3)
-    stream, recorder = recorded(source, limits, **stream_options)
+    stream, recorder = open_recording(source, limits, **stream_options)
     path = out / recorder.file
     console = Console(stderr=True, quiet=quiet)
     processing: dict[str, Any] = {"cutoff_hz": cutoff_hz, "delay": delay}
     try:
         with Live(console=console, auto_refresh=False) as live:
 
-            def show(at: Look) -> None:
+            def show(at: Evaluation) -> None:
                 live.update(shown(at, tolerance), refresh=True)
 
             looks = calibrate(
@@ -102,7 +101,7 @@ def calibrate_command(
     return summary
 
 
-def shown(at: Look, tolerance: Tolerance) -> Group:
+def shown(at: Evaluation, tolerance: Tolerance) -> Group:
     """Return the table of an intermediate result, and the advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
@@ -134,7 +133,7 @@ def _bar(half: float, known: bool) -> Text:
     return Text("█" * cells + "·" * (_BAR - cells), style="green" if known else "yellow")
 
 
-def _verdict(at: Look, k: int) -> str:
+def _verdict(at: Evaluation, k: int) -> str:
     if at.known[k]:
         return "known"
     if not np.isfinite(at.half[k]):
@@ -144,7 +143,7 @@ def _verdict(at: Look, k: int) -> str:
     return "almost" if at.half[k] <= 1.0 else "not known"
 
 
-def draw_settling(looks: list[Look], tolerance: Tolerance) -> Figure:
+def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
     """Draw half-widths of the 95 % intervals over the tolerances, with the advice."""
     with house_style():
         figure = Picture(figsize=(9, 5.5))

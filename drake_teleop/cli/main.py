@@ -390,9 +390,11 @@ def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None,
     Converts the load of an identification.json into the format, units and frame of a robot, a
     compensation or a model. Values that are dropped or not identified are listed on stderr.
     """
-    from drake_teleop.robots.export import export_command
+    from drake_teleop.load.identification import Identification
+    from drake_teleop.robots.export import export as export_load
 
-    text, notes = export_command(identification, to, sensor_pose, int(sign))
+    found = Identification.load(identification)
+    text, notes = export_load(found, to, sensor_pose=sensor_pose, sign=int(sign))
     for note in notes:
         click.echo(f"warning: {note}", err=True)
     click.echo(text, nl=False)

@@ -1,4 +1,4 @@
-"""Checks of the arrays that come into the load core from outside."""
+"""Checks of input arrays."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ Array: TypeAlias = NDArray[np.float64]
 
 
 def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> Array:
-    """`value` as a finite float64 array of the given shape.
+    """Return `value` as a finite float64 array.
 
     Args:
-        name: what the array is called in the error message.
-        shape: the shape demanded.
-        leading: allow any further dimensions in front of `shape`.
+        name: for the error message.
+        leading: allow further dimensions in front of `shape`.
 
     Raises:
-        DrakeTeleopError: if it holds no numbers, has another shape, or is not finite.
+        DrakeTeleopError: if it is not numeric, has another shape, or is not finite.
     """
-    wanted = ", ".join(["..."] * leading + [str(n) for n in shape])
-    wanted = f"({wanted},)" if len(shape) == 1 and not leading else f"({wanted})"
-    array = numbers(name, value, f"give an array of shape {wanted}")
-    own = array.shape[array.ndim - len(shape) :] if leading else array.shape
-    if own != shape:
-        raise DrakeTeleopError(f"has shape {array.shape} instead of {wanted}", where=name)
+    expected = ", ".join(["..."] * leading + [str(n) for n in shape])
+    expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
+    array = numbers(name, value, f"give an array of shape {expected}")
+    actual = array.shape[array.ndim - len(shape) :] if leading else array.shape
+    if actual != shape:
+        raise DrakeTeleopError(f"has shape {array.shape} instead of {expected}", where=name)
     finite = np.isfinite(array)
     if not finite.all():
         first = tuple(int(i) for i in np.argwhere(~finite)[0])
@@ -38,11 +37,7 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
 
 
 def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
-    """`value` as a float64 array of any shape, without loss.
-
-    Raises:
-        DrakeTeleopError: if it holds no numbers, complex ones, or some that are masked.
-    """
+    """Return a float64 array; raise DrakeTeleopError for complex, masked or other data."""
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
@@ -53,16 +48,13 @@ def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
 
 
 def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list[Array]]:
-    """Arrays of vectors, each (..., n), as contiguous tables of N rows.
+    """Return the common leading shape, and each array as a contiguous table (N, n).
 
     Args:
-        arrays: name -> (value, n); the leading dimensions are broadcast against each other.
-
-    Returns:
-        The common leading shape, and for each array an (N, n) table.
+        arrays: name -> (value (..., n), n).
 
     Raises:
-        DrakeTeleopError: as `checked`, or if the leading dimensions do not fit together.
+        DrakeTeleopError: see `checked`, or if the leading shapes do not match.
     """
     tables = {name: checked(name, value, n, leading=True) for name, (value, n) in arrays.items()}
     try:
@@ -76,13 +68,13 @@ def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list
 
 
 def _rows(table: Array, shape: tuple[int, ...]) -> Array:
-    # What numpy broadcasts cannot be written to, another type, for which all is compiled again.
+    # numpy broadcasts to read-only arrays, another type, which would be compiled again.
     same = table if table.shape == shape else np.array(np.broadcast_to(table, shape))
     return np.ascontiguousarray(same).reshape(-1, shape[-1])
 
 
 def number(name: str, value: Any) -> float:
-    """`value` as a float, which may be NaN; raises DrakeTeleopError unless it is one."""
+    """Return `value` as a float, possibly NaN; raise DrakeTeleopError if not numeric."""
     try:
         return float(numbers(name, value) if isinstance(value, (np.generic, np.ndarray)) else value)
     except (TypeError, ValueError, OverflowError):
@@ -92,11 +84,7 @@ def number(name: str, value: Any) -> float:
 
 
 def learnt(name: str, phi: Array) -> Array:
-    """`phi` (10,), unless it is zero throughout: the load of an estimator that never learnt.
-
-    Raises:
-        DrakeTeleopError: then; every wrench would be taken for contact.
-    """
+    """Return `phi` (10,); raise DrakeTeleopError if it is zero, as without data."""
     if not phi.any():
         raise DrakeTeleopError(
             "is zero throughout, so this load was never learnt",
@@ -107,7 +95,7 @@ def learnt(name: str, phi: Array) -> Array:
 
 
 def positive(name: str, value: ArrayLike, *shape: int) -> Array:
-    """`value` as a `checked` array of positive numbers."""
+    """Return a `checked` array of positive numbers."""
     array = checked(name, value, *shape)
     if not (array > 0.0).all():
         raise DrakeTeleopError("is not positive throughout", where=name)

@@ -1,18 +1,11 @@
-"""`njit` with a cache that follows calls from file to file and that processes can share.
+"""`njit` with a cache that follows calls between files and that processes can share.
 
-numba's own cache takes a function for unchanged as long as the function's own file is, so it goes
-on with the old code of what that function calls. It numbers the types that a function was compiled
-for without a lock, so two processes that compile one function at once, for different types, can
-leave the code of one under the number of the other.
+numba's own cache ignores changes of callees in other files. It numbers signatures without a lock,
+so that two processes can exchange their code. Here each signature has its own file, named by a
+hash of the bytecode of the function and its callees and of their constants.
 
-Here each type of a function has a file of its own, named by a hash of all that went into it: the
-bytecode of the function and of all that it calls, and the constants that they read. What is found
-under a name is right, whenever it was written; times of files do not matter. numba still chooses
-the folder: `NUMBA_CACHE_DIR` if that is set, else `__pycache__`, else the user's cache folder.
-
-The files are pickles with machine code, as numba's own are, and as little to be trusted as a `.pyc`
-file from elsewhere. So only those are read that belong to the user, to root or to the owner of this
-package, who could all change what it does anyway, and that not everybody may write to.
+The files are pickles with machine code. A file is loaded only if it belongs to the user, to root or
+to the owner of this package, and is not world-writable.
 """
 
 from __future__ import annotations
@@ -38,27 +31,24 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
-_PLAIN = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
+_PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), np.dtype, np.generic)
 
 
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
-    """As `numba.njit`; with `cache=True` the compiled code is kept as described above.
+    """Compile as `numba.njit`; with `cache=True` store the code.
 
     Args:
-        borrows: for what Python calls often, and which makes no array and gets none from what it
-            calls. Who calls it holds its arrays meanwhile, so that neither it nor what it calls
-            counts who does: else a view of an array costs an atomic operation when it begins and
-            one when it ends, and a sample of the wrist sensor has 200 views.
-        options: of `numba.njit`.
+        borrows: omit reference counting, which costs two atomic operations per view. The function
+            creates no arrays and receives none from callees; its caller holds the arguments.
     """
-    # Said in either case: what is not said is passed on to what a function calls.
+    # Set in either case, because callees inherit unset options.
     options["_nrt"] = not borrows
 
     def compiled(function: FunctionType) -> Any:
-        # Nothing is called from C: without the wrappers for that, 4 % less to compile.
+        # No function is called from C; omitting the wrappers saves 4 % of the compile time.
         dispatcher = numba.njit(**options | {"cache": False, "no_cfunc_wrapper": True})(function)
         if options.get("cache") and isinstance(dispatcher, Dispatcher):
-            with suppress(RuntimeError):  # no folder can be written: each process compiles anew
+            with suppress(RuntimeError):  # no writable folder: each process compiles again
                 dispatcher._cache = _Cache(function, dispatcher)
         return dispatcher
 
@@ -66,27 +56,20 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
 
 
 def call_at(arguments: tuple[types.Type, ...]) -> Any:
-    """For compiled code: calls a function without result by its `address_of`, then its arguments.
+    """Return a compiled function (address, arguments) that calls a function without result.
 
-    numba makes what is called by name a part of the caller, and optimises it there once more, at
-    every level of a tree of calls. What is called like this is compiled once, by itself. What it
-    raises comes to the caller.
-
-    Args:
-        arguments: their types; what is given is cast to them.
-
-    Returns:
-        a function of the address, an integer, and the arguments.
+    numba inlines a function called by name at every level of the call tree; one called by its
+    `address_of` is compiled once. Exceptions propagate.
     """
 
     @intrinsic
     def call(_typing_context: Any, _address: Any, *_arguments: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            address, given = values
-            pairs = zip(cgutils.unpack_tuple(builder, given), signature.args[1], strict=True)
+            address, packed = values
+            pairs = zip(cgutils.unpack_tuple(builder, packed), signature.args[1], strict=True)
             cast = [
-                context.cast(builder, value, kind, wanted)
-                for (value, kind), wanted in zip(pairs, arguments, strict=True)
+                context.cast(builder, value, kind, expected)
+                for (value, kind), expected in zip(pairs, arguments, strict=True)
             ]
             kind = context.call_conv.get_function_type(types.void, arguments).as_pointer()
             function = builder.inttoptr(address, kind)
@@ -99,163 +82,154 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
 
         return types.void(types.int64, types.StarArgTuple(_arguments)), code
 
-    call.__qualname__ = f"call_at{arguments}"  # as the caller's fingerprint has it
+    call.__qualname__ = f"call_at{arguments}"  # part of the caller's fingerprint
     return call
 
 
 def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
-    """Where the code of a compiled function begins; it stays there as long as the function.
-
-    Args:
-        function: without result; it is compiled here, if it is not yet.
-        arguments: the types for which.
-    """
+    """Return the address of a function without result, valid as long as the function."""
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
 
 class _Cache(FunctionCache):
-    """numba's cache of one function, but for its files."""
-
     def __init__(self, function: FunctionType, dispatcher: Dispatcher) -> None:
         super().__init__(function)
-        self._cache_file = _Files(Path(self.cache_path), dispatcher)
+        self._cache_file = _CacheFiles(Path(self.cache_path), dispatcher)
 
 
-class _Files:
-    """The files of one function, one for each signature and processor that it was compiled for."""
+class _CacheFiles:
+    """Files of one function, one for each signature and processor."""
 
     def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
         function = dispatcher.py_func
         versions = f"{sys.implementation.cache_tag}.numba-{numba.__version__}"
         self._folder = folder
         self._dispatcher = dispatcher
-        self._name = (
+        self._prefix = (
             f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}.{versions}-"
         )
 
     def load(self, key: Any) -> Any:
-        """The compiled code, or None if there is none yet."""
         with (
             suppress(OSError, EOFError, pickle.UnpicklingError),
             self._path(key).open("rb") as file,
         ):
-            if not _is_ours(os.fstat(file.fileno())):
+            if not _is_trusted(os.fstat(file.fileno())):
                 return None
             stored_key, code = pickle.loads(file.read())
             return code if stored_key == key else None
 
     def save(self, key: Any, code: Any) -> None:
         path = self._path(key)
-        unfinished = path.with_suffix(f".{uuid4().hex}")
+        temporary = path.with_suffix(f".{uuid4().hex}")
         try:
-            unfinished.touch(mode=0o644)  # with any umask nobody else may write to it
-            unfinished.write_bytes(dumps((key, code)))
-            os.replace(unfinished, path)
-            self._discard(keep=self._name + fingerprint(self._dispatcher))
-        except OSError:  # a full disk: it is compiled again next time
+            temporary.touch(mode=0o644)  # not writable by others, with any umask
+            temporary.write_bytes(dumps((key, code)))
+            os.replace(temporary, path)
+            self._discard(keep=self._prefix + fingerprint(self._dispatcher))
+        except OSError:  # full disk: compile again next time
             with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
+                temporary.unlink(missing_ok=True)
 
     def flush(self) -> None:
         self._discard()
 
     def _path(self, key: Any) -> Path:
         this = sha256(str(key).encode()).hexdigest()[:16]
-        return self._folder / f"{self._name}{fingerprint(self._dispatcher)}-{this}.nbc"
+        return self._folder / f"{self._prefix}{fingerprint(self._dispatcher)}-{this}.nbc"
 
     def _discard(self, keep: str | None = None) -> None:
-        """Removes what was compiled from other sources."""
-        for path in self._folder.glob(f"{self._name}*.nbc"):
+        for path in self._folder.glob(f"{self._prefix}*.nbc"):
             if keep is None or not path.name.startswith(keep):
                 path.unlink(missing_ok=True)
 
 
-def _is_ours(file: os.stat_result) -> bool:
-    """Whether nobody else can have written a file, see the top of this module."""
+def _is_trusted(file: os.stat_result) -> bool:
     owners = {os.getuid(), 0, Path(__file__).stat().st_uid}
     return file.st_uid in owners and not file.st_mode & stat.S_IWOTH
 
 
 def fingerprint(dispatcher: Dispatcher) -> str:
-    """A hash of all that the function is compiled from: its own code and that of its callees."""
-    reached: set[Any] = {dispatcher}
-    to_do: list[Any] = [dispatcher]
-    while to_do:
-        called = _what_it_is(to_do.pop())[1] - reached
-        reached |= called
-        to_do.extend(called)
-    texts = sorted(_what_it_is(each)[0] for each in reached)
+    """Return a hash of the code of a function and its callees."""
+    found: set[Any] = {dispatcher}
+    pending: list[Any] = [dispatcher]
+    while pending:
+        called = _code_and_callees(pending.pop())[1] - found
+        found |= called
+        pending.extend(called)
+    texts = sorted(_code_and_callees(each)[0] for each in found)
     return sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 @cache
-def _what_it_is(compiled: Any) -> tuple[str, frozenset[Any]]:
-    """The function's own code with the constants that it reads, and the functions that it calls."""
+def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
+    """Return the function's code with its constants, and its callees."""
     function = getattr(compiled, "py_func", compiled)
-    read = dict(_read(function))
+    constants = dict(_referenced_values(function))
     options = getattr(compiled, "targetoptions", {})
     text = (
-        _name(compiled),
-        _text(function.__code__),
-        _text(function.__defaults__),
+        _qualified_name(compiled),
+        _constant_text(function.__code__),
+        _constant_text(function.__defaults__),
         sorted((name, str(option)) for name, option in options.items()),
-        sorted((name, _text(value)) for name, value in read.items()),
+        sorted((name, _constant_text(value)) for name, value in constants.items()),
     )
     package = function.__module__.partition(".")[0]
-    return repr(text), frozenset(value for value in read.values() if _is_compiled(value, package))
+    callees = (value for value in constants.values() if _is_callee(value, package))
+    return repr(text), frozenset(callees)
 
 
-def _is_compiled(value: Any, package: str) -> bool:
-    """Whether it becomes part of what calls it: that of `register_jitable` is a plain function."""
+def _is_callee(value: Any, package: str) -> bool:
+    """Return whether it is compiled into its caller (also plain `register_jitable` functions)."""
     plain = isinstance(value, FunctionType) and value.__module__.partition(".")[0] == package
     return plain or isinstance(value, Dispatcher)
 
 
-def _read(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Name and value of everything outside a function that its code reads."""
+def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of globals and closure variables that the code reads."""
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents
-    names = set(_names(function.__code__))
+    names = set(_referenced_names(function.__code__))
     package = function.__module__.partition(".")[0]
     scopes = [function.__globals__]
     for scope in scopes:
         for name in names & scope.keys():
             value = scope[name]
             yield f"{scope['__name__']}.{name}", value
-            # `module.function`; other packages change with their version only.
+            # `module.function`; other packages change only with their version.
             ours = isinstance(value, ModuleType) and value.__name__.partition(".")[0] == package
             if ours and all(known is not vars(value) for known in scopes):
                 scopes.append(vars(value))
 
 
-def _names(code: CodeType) -> Iterator[str]:
+def _referenced_names(code: CodeType) -> Iterator[str]:
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _names(constant)
+            yield from _referenced_names(constant)
 
 
-def _text(value: Any) -> str:
-    """Says what a constant is; the same in each process, and without line numbers."""
+def _constant_text(value: Any) -> str:
+    """Return a text of a constant, equal in all processes and without line numbers."""
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
-        # Where an exception is caught is no longer in the code itself since Python 3.11.
+        # Since Python 3.11 exception handlers are in a separate table.
         parts += [value.co_freevars, getattr(value, "co_exceptiontable", b"")]
-        return repr((parts, _text(value.co_consts)))
+        return repr((parts, _constant_text(value.co_consts)))
     if isinstance(value, tuple):
-        return f"{type(value).__name__}{[_text(each) for each in value]}"
+        return f"{type(value).__name__}{[_constant_text(each) for each in value]}"
     if isinstance(value, np.ndarray):
         return repr((value.dtype, value.shape, value.tobytes()))
     if isinstance(value, (Dispatcher, ModuleType)) or callable(value):
-        return _name(value)
-    if isinstance(value, _PLAIN):
+        return _qualified_name(value)
+    if isinstance(value, _PLAIN_TYPES):
         return repr(value)
     raise TypeError(f"a compiled function reads {value!r}; its cache cannot see when that changes")
 
 
-def _name(value: Any) -> str:
+def _qualified_name(value: Any) -> str:
     value = getattr(value, "py_func", value)
-    named = getattr(value, "__qualname__", "") or value.__name__  # a module has no qualified name
+    named = getattr(value, "__qualname__", "") or value.__name__  # modules have no qualified name
     return f"{getattr(value, '__module__', '')}.{named}{getattr(value, '_fields', '')}"

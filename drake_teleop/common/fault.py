@@ -1,7 +1,6 @@
-"""What may be wrong with the numbers in the loop: the signals `fault` and `fault_at_hand`.
+"""Invalid numbers in the control loop: the signals `fault` and `fault_at_hand`.
 
-A fault is a number that cannot be: not finite, larger than anything here, or of long ago. Nothing
-is displayed that was made of one (`passivity.safe_state`, docs/station.md).
+Forces computed from invalid, too large or too old numbers are not displayed (docs/station.md).
 """
 
 from __future__ import annotations
@@ -10,12 +9,12 @@ from enum import IntEnum
 
 from drake_teleop.common.compiled import njit
 
-#: What is larger is no force, torque, length, angle or speed of this station, in SI units.
+#: Maximum magnitude of any force, torque, length, angle or speed of a station, in SI units.
 LARGEST = 1e6
 
 
 class Fault(IntEnum):
-    """Causes, in the order in which they are asked for."""
+    """Causes, by priority."""
 
     NONE = 0
     STALE = 1
@@ -36,12 +35,12 @@ MEANINGS = {
     Fault.HAND: "the hand's joint angles are no numbers",
     Fault.RESUMING: "the force at the hand comes back after a fault",
 }
-"""In words, for warnings."""
+"""Texts for warnings."""
 
 
 @njit(cache=True)
 def sound(numbers):
-    """Whether each of them is finite and no larger than `LARGEST`."""
+    """Return whether all magnitudes are finite and at most `LARGEST`."""
     good = True
     for x in numbers:
         good = good and abs(x) <= LARGEST

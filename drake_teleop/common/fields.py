@@ -1,7 +1,4 @@
-"""The fields of scenarios and studies as a list: what each is called, takes and means.
-
-Help texts, references and schemas are made from it, so that each says what the checks do.
-"""
+"""Fields of scenarios and studies, for help texts, references and schemas."""
 
 from __future__ import annotations
 
@@ -18,21 +15,17 @@ _Class = TypeVar("_Class", bound=type)
 
 @dataclass(frozen=True)
 class FieldInfo:
-    """What is known of a field.
+    """Description of a field.
 
     Attributes:
-        name: as it stands in a file.
         kind: "number", "whole number", "true or false", "word" or "block", of the innermost items.
-        lists: how many lists lie around it: 0 for one value, 1 for a list of them.
-        length: of the list; None if it may be any, or is none.
+        lists: number of enclosing lists, 0 for one value.
+        length: of the list; None if any.
         optional: whether it may be null.
-        default: what it is if nothing is said; of an instance, what it is there.
-        unit: "1" for none; empty if it is no quantity.
+        unit: "1" for a dimensionless quantity; empty if it is no quantity.
         low, high: the closed range of a quantity.
-        choices: the words that may stand there; none: any.
-        blocks: for a block the dataclasses that may stand there; a tag such as !Touch tells which
-            of several is meant.
-        meaning: one line or more for people.
+        choices: the allowed words; empty: any.
+        blocks: the allowed dataclasses of a block, selected by a tag such as !Touch.
     """
 
     name: str
@@ -50,7 +43,7 @@ class FieldInfo:
 
     @property
     def range(self) -> str:
-        """The range with the unit, or the choices, or the kinds of block, for people."""
+        """Range with unit, or choices, or kinds of block."""
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
             return f"{self.low:.7g} to {self.high:.7g}{unit}"
@@ -60,61 +53,54 @@ class FieldInfo:
 
     @property
     def text(self) -> str:
-        """Its line of a help text."""
-        known = [self.range] if self.range else []
+        """Line of a help text."""
+        metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
-            known.append(f"default {_shown(self.default)}")
-        return f"{self.name}: {self.meaning}" + (f" ({'; '.join(known)})" if known else "")
+            metadata.append(f"default {_shown(self.default)}")
+        return f"{self.name}: {self.meaning}" + (f" ({'; '.join(metadata)})" if metadata else "")
 
 
 def settings(block: _Class) -> _Class:
-    """Makes a dataclass of settings refuse what is no field of it, and its help tell the fields.
-
-    Written above `@dataclass`. Reading a field costs what it did.
-    """
-    block.__setattr__ = _set_known  # type: ignore[assignment]
+    """Make a dataclass refuse unknown attributes and list its fields in its help."""
+    block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
     block.__doc__ = "\n".join([cleandoc(block.__doc__ or ""), "", "Attributes:", *lines, ""])
     return block
 
 
-def _set_known(self: Any, name: str, value: Any) -> None:
+def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
     if name not in self.__dataclass_fields__:
         check_name(type(self), name, f"{type(self).__name__}.{name}")
     object.__setattr__(self, name, value)
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """The fields of a block of a scenario or a study, in their order.
+    """Return the fields of a settings dataclass or of an instance.
 
-    For what stands inside a block, ask again with its `default`: the same block may have other
-    defaults at another place.
-
-    Args:
-        config: a dataclass of `quantity`, `choice`, `plain` and blocks, or an instance of one.
+    For an inner block call this with its `default`, which depends on the place.
     """
-    return [_info(entry, config) for entry in dataclasses.fields(config)]
+    return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 
 
-def _info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
+def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     hint: Any = entry.type
     lists, items, optional = kind_of(hint)
     blocks = tuple(item for item in items if item not in KINDS)
-    known = entry.metadata
+    metadata = entry.metadata
     return FieldInfo(
         name=entry.name,
         kind="block" if blocks else KINDS[items[0]].removeprefix("a "),
         lists=lists,
-        length=known.get("length"),
+        length=metadata.get("length"),
         optional=optional,
         default=_default(entry) if isinstance(config, type) else getattr(config, entry.name),
-        unit=known.get("unit", ""),
-        low=known.get("low"),
-        high=known.get("high"),
-        choices=known.get("choices", ()),
+        unit=metadata.get("unit", ""),
+        low=metadata.get("low"),
+        high=metadata.get("high"),
+        choices=metadata.get("choices", ()),
         blocks=blocks,
-        meaning=known.get("doc") or _first_line(blocks[0]),
+        meaning=metadata.get("doc") or _first_line(blocks[0]),
     )
 
 

@@ -1,4 +1,4 @@
-"""Reports: self-contained HTML pages of one look, with their pictures inside."""
+"""Self-contained HTML pages with a common style."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ import jinja2
 
 
 def render(package: str, template: str, **values: Any) -> str:
-    """The page that a template makes of values.
+    """Return the page of a template, which may extend page.html.j2.
 
     Args:
-        package: where the template is, such as "drake_teleop.logs".
-        template: its file name; it may extend page.html.j2, which has the house's style.
-        values: what the template asks for; anything missing is an error, and text is escaped.
+        package: of the template, such as "drake_teleop.logs".
+        values: variables, escaped; a missing one is an error.
     """
 
     def source(name: str) -> str:
-        home = "drake_teleop.common" if name == "page.html.j2" else package
-        return resources.files(home).joinpath(name).read_text(encoding="utf-8")
+        owner = "drake_teleop.common" if name == "page.html.j2" else package
+        return resources.files(owner).joinpath(name).read_text(encoding="utf-8")
 
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(source),
@@ -34,5 +33,5 @@ def render(package: str, template: str, **values: Any) -> str:
 
 
 def embedded(path: Path) -> str:
-    """A PNG file in a data: URL."""
+    """Return a PNG file as a data: URL."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()

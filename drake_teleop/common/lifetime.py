@@ -1,9 +1,7 @@
-"""What lets a station's memory go when nobody holds the station any more.
+"""Release of the memory of unreferenced stations.
 
-Two things keep a `LeafSystem` written in Python, and with it its whole Diagram, for ever: a bound
-method that C++ calls (a circle that Python's collector cannot see; events, and later versions of
-Drake, hold theirs weakly), and, in Python 3.11, a second `__dict__`, which a subclass of a bound
-class has unless its `__slots__` name nothing. Each station would leave 2.5 MB behind.
+A Python `LeafSystem` and its Diagram (2.5 MB) are never freed if C++ holds a bound method, or, in
+Python 3.11, if a subclass has no empty `__slots__`.
 """
 
 from __future__ import annotations
@@ -13,15 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 ONE_DICT: tuple[str, ...] = ()
-"""The `__slots__` of a system: attributes live in the bound class's `__dict__`."""
+"""`__slots__` of a system; its attributes are in the `__dict__` of the bound class."""
 
 
 def weak_callback(method: Any) -> Callable[..., None]:
-    """A bound method for C++ to call that does not keep its system alive.
-
-    Args:
-        method: bound to a system; C++ calls it while the system lives, and not later.
-    """
+    """Return a callback for C++ that does not keep its system alive."""
     system, function = weakref.ref(method.__self__), method.__func__
 
     def call(context: Any, output: Any) -> None:

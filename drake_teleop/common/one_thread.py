@@ -1,4 +1,4 @@
-"""One thread for BLAS: over several, sums differ in their last digits; optimisers find others."""
+"""Single-threaded BLAS."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ from contextlib import AbstractContextManager
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """While this lasts the results do not depend on how many cores there are.
-
-    Matrices as small as ours gain nothing from more threads either.
-    """
+    """Limit BLAS to one thread; several change the last digits of sums."""
     import scipy.linalg  # noqa: F401, what comes in later would have its threads
     from threadpoolctl import threadpool_limits
 

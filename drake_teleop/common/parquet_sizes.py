@@ -1,12 +1,12 @@
-"""Check the sizes that a Parquet file states, before polars reads it.
+"""Check of the sizes in a Parquet file before polars reads it.
 
-polars reserves memory for as many values as a page says it has. A damaged number, such as -57, asks
-for 2^61 bytes, and Rust then aborts the process: there is no exception to catch. `check_parquet`
-compares all such numbers: those of the footer with each other and with the length of the file, and
-those of each page with the footer. Call it before each function of polars that reads Parquet.
+polars reserves memory for the number of values in a page header. A damaged number, such as -57,
+requests 2^61 bytes, and Rust aborts the process without an exception. `check_parquet` compares
+the numbers of the footer with each other and with the length of the file, and those of each page
+with the footer. Call it before each function of polars that reads Parquet.
 
-The format is that of https://github.com/apache/parquet-format; its metadata are structs in Thrift's
-compact protocol, whose fields have the numbers of `parquet.thrift`.
+Format: https://github.com/apache/parquet-format; metadata are structs in Thrift's compact protocol
+with the field numbers of `parquet.thrift`.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from pathlib import Path
 from typing import Any
 
 _MAGIC = b"PAR1"
-_FOOTER_END = 8  # bytes: the footer's length, and the magic again
+_FOOTER_END = 8  # bytes: length of the footer, and magic
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _REPEATED = 2
 # Types of Thrift.
 _TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _STRUCT = 1, 2, 3, 7, 8, 12
 _INTEGERS, _LISTS = (4, 5, 6), (9, 10)
-_DEEPEST = 32
-_LONGEST_NUMBER = 10  # bytes
+_MAX_DEPTH = 32
+_MAX_NUMBER_BYTES = 10
 
 _Struct = dict[int, Any]
 
 
 def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file that is damaged in a way that would abort the process.
+    """Refuse a Parquet file whose sizes would abort the process.
 
     Args:
         path: one file, not a folder.
 
     Raises:
-        ValueError: with the column and the number that is wrong.
+        ValueError: with the column and the wrong number.
         OSError: if the file cannot be opened.
     """
     with path.open("rb") as file:
@@ -47,11 +47,7 @@ def check_parquet(path: Path) -> None:
 
 
 def check_parquet_content(content: bytes | mmap.mmap) -> None:
-    """Refuse the content of such a file.
-
-    Raises:
-        ValueError: with the column and the number that is wrong.
-    """
+    """Refuse the content of such a file; raise ValueError."""
     try:
         _check(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
@@ -76,8 +72,8 @@ def _check(content: bytes | mmap.mmap) -> None:
 
 
 def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
-    """Yield the name of each column, and whether it has one value in each row (no lists)."""
-    above = [(len(schema), True)]  # of each group around: children that are still to come, is flat
+    """Yield the name of each column, and whether it has one value per row (no lists)."""
+    above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
             above.pop()
@@ -93,7 +89,7 @@ def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
 def _check_column(
     content: bytes | mmap.mmap, end: int, column: _Struct, name: str, rows: int | None
 ) -> None:
-    """Compare the pages of a column in a row group with the footer, which begins at `end`."""
+    """Compare the pages of a column in a row group with the footer, which starts at `end`."""
     values = _size(column, 5, f"values in {name}")
     _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
     largest, length = _size(column, 6, f"bytes in {name}"), _size(column, 7, f"bytes in {name}")
@@ -113,7 +109,7 @@ def _check_column(
 
 
 def _values(page: _Struct, length: int, where: str) -> int:
-    """Return how many values a page adds to its column; check its other numbers."""
+    """Check the numbers of a page; return the number of values that it adds to its column."""
     kind, what = page[1], f"values in {where}"
     if kind == _DATA_PAGE:
         return _size(page[5], 1, what)
@@ -131,7 +127,7 @@ def _values(page: _Struct, length: int, where: str) -> int:
 
 
 def _size(struct: _Struct, number: int, what: str, default: int | None = None) -> int:
-    """Return a field of a struct that must be an integer and not negative."""
+    """Return a nonnegative integer field of a struct."""
     size = struct[number] if default is None else struct.get(number, default)
     _require(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
@@ -143,19 +139,13 @@ def _require(condition: bool, otherwise: str) -> None:
 
 
 class _CompactReader:
-    """Read Thrift's compact protocol: a struct becomes a dictionary by the numbers of its fields.
-
-    Args:
-        content: the bytes; to read beyond them is an IndexError.
-        at: where to begin.
-    """
+    """Reader of Thrift's compact protocol; a struct becomes a dictionary by field number."""
 
     def __init__(self, content: bytes | mmap.mmap, at: int = 0) -> None:
         self._content, self.at = content, at
 
     def struct(self, depth: int = 0) -> _Struct:
-        """Read a struct."""
-        _require(depth < _DEEPEST, "its metadata is nested too deeply")
+        _require(depth < _MAX_DEPTH, "its metadata is nested too deeply")
         fields: _Struct = {}
         number = 0
         while head := self._byte():
@@ -173,13 +163,13 @@ class _CompactReader:
             return self.struct(depth)
         if kind in _LISTS:
             return self._list(depth)
-        if kind <= _BYTE:  # a truth in a list has a byte of its own
+        if kind <= _BYTE:  # a boolean in a list has its own byte
             return self._byte()
         _require(kind == _DOUBLE, "its metadata has an unknown type")
         return self._bytes(8)
 
     def _list(self, depth: int) -> list[Any]:
-        _require(depth < _DEEPEST, "its metadata is nested too deeply")
+        _require(depth < _MAX_DEPTH, "its metadata is nested too deeply")
         head = self._byte()
         size = head >> 4 if head >> 4 < 15 else self._varint()
         return [self._value(head & 15, depth + 1) for _ in range(size)]
@@ -201,7 +191,7 @@ class _CompactReader:
         if (byte := self._byte()) < 128:
             return byte
         number = byte & 127
-        for place in range(1, _LONGEST_NUMBER):
+        for place in range(1, _MAX_NUMBER_BYTES):
             byte = self._byte()
             number |= (byte & 127) << 7 * place
             if byte < 128:

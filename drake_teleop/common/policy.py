@@ -1,4 +1,4 @@
-"""Content-Security-Policy of pages: only their own scripts run, and nothing is loaded."""
+"""Content-Security-Policy of pages: they run only their own scripts, and load nothing."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ _SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def policy(page: str, host: str = "") -> str:
-    """Return the policy of an HTML page.
-
-    Args:
-        page: with its scripts.
-        host: "address:port" of its server, for its files and its WebSocket; "" if it is a file.
-    """
+    """Return the policy of a page; `host` is its server's "address:port", "" for a file."""
     scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

@@ -1,4 +1,4 @@
-"""Progress of each named stage: a bar on a terminal, elsewhere one line on stderr."""
+"""Progress bars on a terminal, elsewhere lines on stderr."""
 
 from __future__ import annotations
 
@@ -9,53 +9,51 @@ from contextlib import contextmanager
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[..., None]
-"""Called with the fraction done, 0 to 1, and perhaps with words on how it stands."""
+"""Called with the completed fraction, 0 to 1, and an optional status text."""
 Stage: TypeAlias = Callable[[str], Progress]
-"""Opens a stage by its name."""
+"""Starts a stage with a name."""
 
 
 def silent(name: str) -> Progress:
-    """A stage that shows nothing."""
+    """Return a stage that shows nothing."""
     return lambda fraction, words="": None
 
 
 @contextmanager
 def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
-    """Bars on the terminal or in the notebook for as long as the context lasts.
-
-    If the output goes elsewhere, each stage is one line on stderr when it begins.
+    """Show progress within the context.
 
     Args:
-        progress: whether to show them; or what a caller has from here, and goes on showing.
-        after: how long something takes before it has a bar [s].
+        progress: whether to show it, or the `Stage` of the caller.
+        after: duration before a bar appears [s].
     """
     if callable(progress):
         yield progress
     elif not progress:
         yield silent
-    elif not _somebody_looks():
-        yield _lines(after)
+    elif not _is_interactive():
+        yield _line_stages(after)
     else:
-        yield from _bars(after)
+        yield from _bar_stages(after)
 
 
-def _somebody_looks() -> bool:
+def _is_interactive() -> bool:
     from rich import get_console
 
     console = get_console()
     return console.is_terminal or console.is_jupyter
 
 
-def _lines(after: float) -> Stage:
+def _line_stages(after: float) -> Stage:
     opened = time.monotonic()
 
     def stage(name: str) -> Progress:
-        told = False
+        printed = False
 
         def update(fraction: float, words: str = "") -> None:
-            nonlocal told
-            if not told and time.monotonic() - opened >= after:
-                told = True
+            nonlocal printed
+            if not printed and time.monotonic() - opened >= after:
+                printed = True
                 print(f"{name} ...", file=sys.stderr, flush=True)
 
         update(0.0)
@@ -64,7 +62,7 @@ def _lines(after: float) -> Stage:
     return stage
 
 
-def _bars(after: float) -> Iterator[Stage]:
+def _bar_stages(after: float) -> Iterator[Stage]:
     from rich import progress as rich_progress
     from rich.errors import LiveError
 
@@ -82,7 +80,7 @@ def _bars(after: float) -> Iterator[Stage]:
             shown = True
             try:
                 bars.start()
-            except LiveError:  # older rich: bars of somebody else are being shown, and go on
+            except LiveError:  # older rich: other bars are active
                 bars.disable = True
 
     def stage(name: str) -> Progress:

@@ -1,8 +1,4 @@
-"""Dataclass fields that know their unit and their plausible range, and the check that uses them.
-
-A scenario's blocks declare their parameters with `quantity`, so that one line says default, unit,
-range and meaning, and a value that cannot be right is refused where it stands.
-"""
+"""Dataclass fields with unit, plausible range and meaning."""
 
 from __future__ import annotations
 
@@ -18,17 +14,16 @@ from typing import Any, NamedTuple
 from drake_teleop.common.errors import DrakeTeleopError, inside, meant
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
-"""What a field that is no block may hold, in words."""
+"""Types of values, in words."""
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
-    """A dataclass field holding a number or a list of numbers.
+    """Return a dataclass field for a number or, with a list as default, a vector.
 
     Args:
-        default: the default value, in `unit`; a list makes a vector of that length.
-        unit: SI unit, "1" if it has none.
-        low, high: the closed range in which a value is plausible.
-        doc: what it is, with frame and source.
+        unit: SI unit, "1" if dimensionless.
+        low, high: the closed plausible range.
+        doc: meaning, with frame and source.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
     if isinstance(default, list):
@@ -38,36 +33,34 @@ def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
 
 
 def choice(default: str, choices: Sequence[str], doc: str) -> Any:
-    """A dataclass field holding one of a few words."""
+    """Return a dataclass field for one of several words."""
     return dataclasses.field(default=default, metadata={"choices": tuple(choices), "doc": doc})
 
 
 def plain(default: Any, doc: str) -> Any:
-    """A dataclass field holding a flag, a word, a whole number, or a list of these or of blocks."""
+    """Return a dataclass field for a flag, word, integer, or a list."""
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata={"doc": doc})
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
 def in_short(value: Any) -> str:
-    """A value for a message: six digits of a float, of the rest what is short."""
+    """Return a short text for a message."""
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         return reprlib.repr(value)
-    # Of a seed all digits, of a longer integer the first and the last.
+    # All digits of a seed; a longer integer is shortened in the middle.
     return reprlib.repr(int(value)) if isinstance(value, numbers.Integral) else f"{value:g}"
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Checks parsed YAML against a dataclass before it is loaded.
+    """Check parsed YAML against a dataclass before it is loaded.
 
     Args:
-        schema: the dataclass.
-        data: what the YAML parser made of the file (mappings, sequences, scalars; the tag of a
-            variant under the key "_tag").
-        where: the place for the message, as `file` or `file:field`.
-        tagged: whether it is one of several kinds, so that a tag may say which.
+        data: mappings, sequences, scalars; the tag of a variant has the key "_tag".
+        where: `file` or `file:field`.
+        tagged: whether a tag may select one of several kinds.
 
     Raises:
         DrakeTeleopError: for an unknown field, or a value of the wrong kind.
@@ -76,11 +69,11 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
         raise DrakeTeleopError(
             f"expected a mapping of fields, found {in_short(data)}",
             where=where,
-            remedy=f"the fields are {', '.join(_names(schema))}",
+            remedy=f"the fields are {', '.join(_field_names(schema))}",
         )
     if "_tag" in data and not tagged:
-        raise DrakeTeleopError(f"the tag {data['_tag']} means nothing here", where=where)
-    kinds = _kinds(schema)
+        raise DrakeTeleopError(f"the tag {data['_tag']} is not allowed here", where=where)
+    kinds = _field_types(schema)
     for key, value in data.items():
         if key == "_tag":
             continue
@@ -90,21 +83,20 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
-    """Raises DrakeTeleopError, with the field that may be meant, unless the dataclass has it."""
-    names = _names(schema)
+    """Raise DrakeTeleopError, with a similar name, unless the dataclass has this field."""
+    names = _field_names(schema)
     if name not in names:
         remedy = meant(name, names, f"fields: {', '.join(names)}")
         raise DrakeTeleopError("there is no such field", where=where, remedy=remedy)
 
 
 def check_ranges(config: Any, where: str) -> None:
-    """Checks every field of a dataclass (and of the dataclasses inside it): kind and range.
+    """Check all values of a dataclass, recursively.
 
     Raises:
-        DrakeTeleopError: naming the field, its unit and the range, for a value that is of another
-            kind, outside, not finite, of the wrong length or not among the choices.
+        DrakeTeleopError: for another kind or length, or a value outside its range or choices.
     """
-    kinds = _kinds(config.__class__)
+    kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
         value, place = getattr(config, field.name), inside(where, field.name)
         _check_kind(kinds[field.name], value, place, from_file=False)
@@ -131,7 +123,7 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
     low, high = metadata["low"], metadata["high"]
     unit = "" if metadata["unit"] == "1" else f" {metadata['unit']}"
     for number in values:
-        if not low <= number <= high:  # nor if it is no number
+        if not low <= number <= high:  # also false for NaN
             raise DrakeTeleopError(
                 f"{in_short(number)}{unit} is outside {in_short(low)} to {in_short(high)}{unit}",
                 where=place,
@@ -140,16 +132,16 @@ def _check_range(metadata: Any, value: Any, place: str) -> None:
 
 
 @functools.cache
-def _kinds(schema: type) -> dict[str, Kind]:
+def _field_types(schema: type) -> dict[str, Kind]:
     return {name: kind_of(hint) for name, hint in typing.get_type_hints(schema).items()}
 
 
-def _names(schema: type) -> list[str]:
+def _field_names(schema: type) -> list[str]:
     return [field.name for field in dataclasses.fields(schema)]
 
 
 class Kind(NamedTuple):
-    """What the type of a field says: `list[A | B] | None` is (1, (A, B), True)."""
+    """Structure of a type: `list[A | B] | None` is (1, (A, B), True)."""
 
     lists: int
     items: tuple[Any, ...]
@@ -158,7 +150,7 @@ class Kind(NamedTuple):
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """The type of a field, taken apart."""
+    """Return the structure of a type."""
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
@@ -170,37 +162,29 @@ def kind_of(hint: Any) -> Kind:
 
 
 def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
-    """Descends into lists; refuses words where numbers are wanted, and the like.
-
-    Args:
-        kind: of the field.
-        value: what stands there.
-        place: for the message.
-        from_file: whether it is what a YAML parser made of a file. Then blocks are mappings, which
-            are descended into, and a number may be a word still, such as 1e-3.
-    """
+    """Check a value; blocks from a file are mappings, and numbers may be words such as 1e-3."""
     first = kind.items[0]
     if value is None and kind.optional:
         return
     if kind.lists:
         if not isinstance(value, list):
-            raise _unexpected("a list", value, place, "write it in brackets: [...]")
+            raise _kind_error("a list", value, place, "write it in brackets: [...]")
         inner = Kind(kind.lists - 1, kind.items, False)
         for index, item in enumerate(value):
             _check_kind(inner, item, f"{place}[{index}]", from_file=from_file)
     elif first in KINDS:
-        if not _is_of(first, value, from_file=from_file):
+        if not _has_kind(first, value, from_file=from_file):
             remedy = "write the number alone; its unit is in the field's name or documentation"
-            raise _unexpected(KINDS[first], value, place, remedy if first is float else "")
+            raise _kind_error(KINDS[first], value, place, remedy if first is float else "")
     elif from_file:
         several = len(kind.items) > 1
-        check_structure(_block(kind.items, value, place), value, place, tagged=several)
+        check_structure(_selected_block(kind.items, value, place), value, place, tagged=several)
     elif not isinstance(value, kind.items):
-        raise _unexpected(" or ".join(block.__name__ for block in kind.items), value, place)
+        raise _kind_error(" or ".join(block.__name__ for block in kind.items), value, place)
 
 
-def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
-    """The one that the tag of a mapping tells; the first if it has none."""
+def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
+    """Return the dataclass that a tag selects, by default the first."""
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -210,17 +194,17 @@ def _block(blocks: tuple[type, ...], value: Any, place: str) -> type:
     return blocks[names.index(tag) if tag else 0]
 
 
-def _is_of(kind: type, value: Any, *, from_file: bool) -> bool:
+def _has_kind(kind: type, value: Any, *, from_file: bool) -> bool:
     if kind in (bool, str):
         return isinstance(value, kind)
     if isinstance(value, bool):
         return False
     if kind is int:
         return isinstance(value, numbers.Integral)
-    return isinstance(value, numbers.Real) or (from_file and _can_be_read_as_number(value))
+    return isinstance(value, numbers.Real) or (from_file and _is_numeric_text(value))
 
 
-def _can_be_read_as_number(value: Any) -> bool:
+def _is_numeric_text(value: Any) -> bool:
     try:
         float(value)
     except (TypeError, ValueError, OverflowError):
@@ -228,6 +212,6 @@ def _can_be_read_as_number(value: Any) -> bool:
     return True
 
 
-def _unexpected(wanted: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _kind_error(expected: str, found: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     shown = f"'{found}'" if isinstance(found, str) else reprlib.repr(found)
-    return DrakeTeleopError(f"expected {wanted}, found {shown}", where=place, remedy=remedy)
+    return DrakeTeleopError(f"expected {expected}, found {shown}", where=place, remedy=remedy)

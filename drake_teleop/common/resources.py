@@ -1,7 +1,4 @@
-"""Where the files that are not Python live: models and shipped scenarios.
-
-In the repository `models/` stands at the top; the wheel carries it inside the package.
-"""
+"""Folders of models and shipped scenarios."""
 
 from __future__ import annotations
 
@@ -11,16 +8,16 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    """The folder with `package.xml` and the SDF models (Drake package name `drake_teleop`)."""
+    """Return the folder of the models; the wheel contains it inside the package."""
     packaged = _PACKAGE / "models"
     return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
 
 
 def scenarios_dir() -> Path:
-    """The folder of the scenarios that are shipped by name."""
+    """Return the folder of the shipped scenarios."""
     return _PACKAGE / "station" / "scenarios"
 
 
 def studies_dir() -> Path:
-    """The folder of the studies that are shipped by name."""
+    """Return the folder of the shipped studies."""
     return _PACKAGE / "lab" / "studies"

@@ -1,4 +1,4 @@
-"""What libraries in C++ and Rust say of damaged files does not reach the terminal."""
+"""Suppression of messages of C++ and Rust libraries."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import RLock
 
-# stderr is the whole process's: of two threads one would give back what the other has shut.
+# stderr is global: two threads would restore it in the wrong order.
 _lock = RLock()
 
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Nothing that is written to stderr, from whatever language, reaches the terminal."""
+    """Redirect the file descriptor of stderr to nowhere."""
     with _lock:
         try:
             sys.stderr.flush()
-            kept = os.dup(2)
-        except (AttributeError, OSError, ValueError):  # there is none
+            saved = os.dup(2)
+        except (AttributeError, OSError, ValueError):  # no stderr
             yield
             return
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, 2)
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 2)
+        os.close(null)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(saved, 2)
+            os.close(saved)

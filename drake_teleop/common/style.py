@@ -1,4 +1,4 @@
-"""The look of every figure, in one place."""
+"""Common style of all figures."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-# Okabe and Ito (2008): told apart with every common colour deficiency, and in grey.
+# Okabe and Ito (2008): distinguishable with common colour deficiencies, and in grey.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#1A1A1A", "#6B7280"
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 
-#: Pixels an inch of a picture that a page shows: it is larger there than alone.
+#: Resolution of pictures in pages.
 PAGE_DPI = 160
 
 _STYLE: dict[Any, Any] = {
@@ -48,12 +48,12 @@ _STYLE: dict[Any, Any] = {
 
 
 def house_style() -> AbstractContextManager[None]:
-    """A context in which figures get the house's fonts, colours and grid."""
+    """Return a context with the common fonts, colours and grid."""
     return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 
 
 class Picture(Figure):
-    """A figure that notebooks show wherever it is the value of a cell, pyplot or not."""
+    """Figure that notebooks show as the value of a cell, without pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = BytesIO()
@@ -62,19 +62,13 @@ class Picture(Figure):
 
 
 def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
-    """Shades the spans of time in which there is contact.
-
-    Args:
-        axes: where to draw.
-        t: (N,) times, in the axis' unit.
-        contact: (N,) booleans.
-    """
+    """Shade the spans of the times t (N,) in which `contact` (N,) is true."""
     for start, stop in contact_spans(t, contact):
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
 
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
-    """The spans (start, stop) of time, in the unit of `t`, in which (N,) `contact` is true."""
+    """Return the spans (start, stop) of `t` in which `contact` (N,) is true."""
     times = np.asarray(t, float)
     edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1

@@ -1,9 +1,8 @@
-"""YAML and JSON files as plain data: what may be read in two ways, or be dropped, is an error.
+"""YAML and JSON files as plain data, without ambiguity.
 
-YAML is read by the core schema of version 1.2, as editors do: a number is decimal, `1:30` and `yes`
-are words, `1e-3` is a number. Refused are keys that stand there twice or are no words, integers
-that begin with 0 (octal in YAML 1.1), integers beyond 64 bits, and more than a file for people
-holds. Nothing in a file is ever executed, whatever its tags say.
+YAML has the core schema of version 1.2: `1:30` and `yes` are words, `1e-3` is a number. Repeated or
+non-string keys, integers with leading 0 (octal in YAML 1.1) or beyond 64 bits, and huge files are
+rejected. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ import yaml
 
 from drake_teleop.common.errors import DrakeTeleopError, inside, one_line
 
-_MOST_VALUES = 50_000  # with what aliases repeat
-_DEEPEST = 50  # brackets inside each other
-_LONGEST_INTEGER = 18  # digits: so many are always in 64 bits
+_MAX_VALUES = 50_000  # including repetitions by aliases
+_MAX_DEPTH = 50  # nested brackets
+_MAX_INTEGER_DIGITS = 18  # digits, always within 64 bits
 
-_TAG = "tag:yaml.org,2002:"
-_CORE = (
+_TAG_PREFIX = "tag:yaml.org,2002:"
+_CORE_SCHEMA = (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     ("int", r"[-+]?[0-9]+", list("-+0123456789")),
@@ -38,64 +37,63 @@ _CORE = (
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's parser with the scalars of YAML 1.2; it makes nodes here, and no objects."""
+    """PyYAML's parser with the scalars of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
-        if self.flow_level >= _DEEPEST:  # of which it would look at thousands before it made nodes
+        if self.flow_level >= _MAX_DEPTH:  # PyYAML scans thousands before it creates nodes
             raise yaml.scanner.ScannerError(None, None, "nested too deeply", self.get_mark())
         super().fetch_flow_collection_start(TokenClass)
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        # Counted here too, so that a huge file is not read to its end.
+        # Counted here too, to stop reading a huge file early.
         self.nodes = getattr(self, "nodes", 0) + 1
-        if self.nodes > 2 * _MOST_VALUES:  # names are nodes as well
-            what = f"there are more than {_MOST_VALUES} values"
+        if self.nodes > 2 * _MAX_VALUES:  # names are nodes too
+            what = f"there are more than {_MAX_VALUES} values"
             raise yaml.composer.ComposerError(None, None, what, self.get_mark())
         return super().compose_node(parent, index)
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's emitter that quotes what is no word in YAML 1.1 or in 1.2."""
+    """PyYAML's emitter; it quotes texts that are not words in YAML 1.1 and 1.2."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
     def represent_text(self, text: str) -> Any:
-        return self.represent_scalar(f"{_TAG}str", text, None if text.isprintable() else '"')
+        return self.represent_scalar(f"{_TAG_PREFIX}str", text, None if text.isprintable() else '"')
 
     def represent_fields(self, data: dict[str, Any]) -> Any:
-        tag = data.get("_tag", f"{_TAG}map")
+        tag = data.get("_tag", f"{_TAG_PREFIX}map")
         return self.represent_mapping(tag, [item for item in data.items() if item[0] != "_tag"])
 
 
 _Dumper.add_representer(str, _Dumper.represent_text)
 _Dumper.add_representer(dict, _Dumper.represent_fields)
-_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE}
-for _kind, _, _first in _CORE:
+_PATTERNS = {kind: re.compile(rf"(?:{pattern})\Z") for kind, pattern, _ in _CORE_SCHEMA}
+for _kind, _, _first in _CORE_SCHEMA:
     for _side in (_Loader, _Dumper):
-        _side.add_implicit_resolver(_TAG + _kind, _PATTERNS[_kind], _first)
+        _side.add_implicit_resolver(_TAG_PREFIX + _kind, _PATTERNS[_kind], _first)
 
 
 def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
-    """What a YAML file holds: dicts, lists, words, numbers, flags and None.
+    """Return the data of a YAML file.
 
     Args:
-        path: the file.
-        tagged: whether a mapping may have a tag, such as `!Touch`; it is then found under "_tag".
+        tagged: allow tags of mappings, such as `!Touch`, returned under "_tag".
 
     Raises:
-        DrakeTeleopError: naming file and field (and line), see the top of this module.
+        DrakeTeleopError: with file, field and line.
     """
     return yaml_data(read_text(path), str(path), tagged=tagged)
 
 
 def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
-    """As `read_yaml`, of a text; `where` is its place for messages."""
+    """Return the data of a YAML text; `where` is its place for messages."""
     try:
         node = yaml.compose(text, _Loader)
-        return None if node is None else _Reading(tagged).data(node, where)
+        return None if node is None else _NodeConverter(tagged).data(node, where)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}: " if mark else ""
@@ -110,15 +108,11 @@ def yaml_data(text: str, where: str, *, tagged: bool = False) -> Any:
 def yaml_text(
     data: Any, *, head: Sequence[str] = (), comments: Mapping[str, str] | None = None
 ) -> str:
-    """Return YAML that `read_yaml` reads as the same data.
+    """Return YAML that `read_yaml` reads as the same data; raise DrakeTeleopError if impossible.
 
     Args:
-        data: as `read_yaml` gives it, with the tag of a mapping under "_tag".
-        head: comments above it, a line each.
-        comments: comments behind fields, by the place of the field, "block.field".
-
-    Raises:
-        DrakeTeleopError: if it would be read as something else.
+        head: comment lines at the top.
+        comments: comments behind fields, by place, "block.field".
     """
     lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
@@ -133,7 +127,7 @@ def yaml_text(
 
 
 def yaml_scalar(value: Any, flow: bool | None = True) -> str:
-    """Return a value as YAML in one line; with `flow` None, blocks are lines of their own."""
+    """Return YAML in one line; with `flow` None, blocks have their own lines."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,
@@ -146,26 +140,22 @@ def yaml_scalar(value: Any, flow: bool | None = True) -> str:
 
 
 def read_json(path: str | Path) -> Any:
-    """What a JSON file holds; an integer that is too long for one is a float.
-
-    Raises:
-        DrakeTeleopError: naming the file, if it cannot be read, is no JSON, or holds a field twice.
-    """
+    """Return the data of a JSON file; raise DrakeTeleopError if invalid or ambiguous."""
     where, text = str(path), read_text(path)
 
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
-                raise DrakeTeleopError("stands there twice", where=inside(where, name))
+                raise DrakeTeleopError("is defined twice", where=inside(where, name))
             found[name] = value
         return found
 
-    def whole(digits: str) -> float:
-        return int(digits) if len(digits) <= _LONGEST_INTEGER else float(digits)
+    def integer(digits: str) -> float:
+        return int(digits) if len(digits) <= _MAX_INTEGER_DIGITS else float(digits)
 
     try:
-        return json.loads(text, object_pairs_hook=once, parse_int=whole)
+        return json.loads(text, object_pairs_hook=unique_fields, parse_int=integer)
     except json.JSONDecodeError as error:
         what = f"is not JSON (line {error.lineno}: {error.msg})"
         raise DrakeTeleopError(what, where=where) from None
@@ -174,22 +164,18 @@ def read_json(path: str | Path) -> Any:
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a file.
-
-    Raises:
-        DrakeTeleopError: naming the file, if it cannot be read or is not in UTF-8.
-    """
+    """Return the text of a file; raise DrakeTeleopError if unreadable or not UTF-8."""
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        what = f"is no text in UTF-8 (byte {error.start})"
+        what = f"is not UTF-8 text (byte {error.start})"
         raise DrakeTeleopError(what, where=str(path)) from None
     except OSError as error:
         raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
 
-class _Reading:
-    """From nodes to data; counts the values, since aliases of aliases would have no end."""
+class _NodeConverter:
+    """Conversion of nodes to data, with a limited number of values."""
 
     def __init__(self, tagged: bool) -> None:
         self._tagged = tagged
@@ -197,40 +183,40 @@ class _Reading:
 
     def data(self, node: Any, place: str) -> Any:
         self._values += 1
-        if self._values > _MOST_VALUES:
-            raise _wrong(f"there are more than {_MOST_VALUES} values", node, place)
+        if self._values > _MAX_VALUES:
+            raise _error(f"there are more than {_MAX_VALUES} values", node, place)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, place)
         if isinstance(node, yaml.SequenceNode):
-            if node.tag != f"{_TAG}seq":
-                raise _wrong(f"a list takes no tag {_shown(node.tag)}", node, place)
+            if node.tag != f"{_TAG_PREFIX}seq":
+                raise _error(f"a list takes no tag {_shown(node.tag)}", node, place)
             return [self.data(item, f"{place}[{i}]") for i, item in enumerate(node.value)]
         return _scalar(node, place)
 
     def _mapping(self, node: Any, place: str) -> dict[str, Any]:
         found: dict[str, Any] = {}
         for key, value in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG}str":
-                raise _wrong(f"a field's name is a word, not {_shown(key.value)}", key, place)
+            if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
+                raise _error(f"a field's name is a word, not {_shown(key.value)}", key, place)
             field = inside(place, key.value)
             if key.value in found:
-                raise _wrong("stands there twice", key, field)
+                raise _error("is defined twice", key, field)
             if key.value == "_tag":
-                raise _wrong("there is no such field", key, field, "a kind is a tag: !Kind {...}")
+                raise _error("there is no such field", key, field, "a kind is a tag: !Kind {...}")
             found[key.value] = self.data(value, field)
-        if node.tag not in (f"{_TAG}map", "!"):  # YAML's own sign for no kind in particular
+        if node.tag not in (f"{_TAG_PREFIX}map", "!"):  # ! is YAML's non-specific tag
             if not self._tagged:
-                raise _wrong(f"the tag {_shown(node.tag)} means nothing here", node, place)
+                raise _error(f"the tag {_shown(node.tag)} is not allowed here", node, place)
             found["_tag"] = node.tag
         return found
 
 
 def _scalar(node: Any, place: str) -> Any:
-    kind, text = node.tag.removeprefix(_TAG), node.value
+    kind, text = node.tag.removeprefix(_TAG_PREFIX), node.value
     if kind == "str":
         return text
     if kind not in _PATTERNS or not _PATTERNS[kind].match(text):
-        raise _wrong(f"{_shown(text)} with the tag {_shown(node.tag)} means nothing", node, place)
+        raise _error(f"{_shown(text)} does not match the tag {_shown(node.tag)}", node, place)
     if kind == "null":
         return None
     if kind == "bool":
@@ -240,16 +226,16 @@ def _scalar(node: Any, place: str) -> Any:
     digits = text.lstrip("+-")
     if digits.startswith("0") and digits != "0":
         remedy = f"write {digits.lstrip('0') or 0}, or '{text}' in quotes for a word"
-        raise _wrong(f"{_shown(text)} may be octal", node, place, remedy)
-    if len(digits) > _LONGEST_INTEGER:
-        raise _wrong(f"an integer of {len(digits)} digits is too long", node, place)
+        raise _error(f"{_shown(text)} may be octal", node, place, remedy)
+    if len(digits) > _MAX_INTEGER_DIGITS:
+        raise _error(f"an integer of {len(digits)} digits is too long", node, place)
     return int(text)
 
 
-def _wrong(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopError:
+def _error(what: str, node: Any, place: str, remedy: str = "") -> DrakeTeleopError:
     line = node.start_mark.line + 1
     return DrakeTeleopError(f"{what} (line {line})", where=place, remedy=remedy)
 
 
 def _shown(text: Any) -> str:
-    return reprlib.repr(text.removeprefix(_TAG) if isinstance(text, str) else "a list")
+    return reprlib.repr(text.removeprefix(_TAG_PREFIX) if isinstance(text, str) else "a list")

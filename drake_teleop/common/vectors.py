@@ -1,9 +1,6 @@
-"""Vectors of three numbers and rotations of nine, for compiled code: nothing allocated.
+"""Vectors of 3 and rotations of 9 numbers (by rows) for compiled code, without allocation.
 
-Arguments are whatever takes an index, results are tuples; a rotation is given by rows. Compiled
-code takes these functions into itself and is as fast as with the numbers spelled out; to Python
-they are plain functions, of any scalar that Drake has. Sums are taken term by term from the left:
-that order is kept, so that the last digit is.
+In Python the functions accept any scalar of Drake. Sums are evaluated from left to right.
 """
 
 from __future__ import annotations
@@ -17,31 +14,31 @@ from numpy.typing import NDArray
 
 @register_jitable
 def three(x, i):
-    """The vector that begins at place i of x."""
+    """Return the vector at index i of x."""
     return x[i], x[i + 1], x[i + 2]
 
 
 @register_jitable
 def nine(x, i):
-    """The rotation that begins at place i of x."""
+    """Return the rotation at index i of x."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]
 
 
 @register_jitable
 def rows(R):
-    """The rotation that a (3, 3) array is."""
+    """Return the rotation of a (3, 3) array."""
     return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
 
 
 @register_jitable
 def transposed(R):
-    """R^T."""
+    """Return R^T."""
     return R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]
 
 
 @register_jitable
 def add_into(x, i, a):
-    """Adds a to the vector that begins at place i of x."""
+    """Add a to the vector at index i of x."""
     x[i] += a[0]
     x[i + 1] += a[1]
     x[i + 2] += a[2]
@@ -49,9 +46,9 @@ def add_into(x, i, a):
 
 @register_jitable
 def put(x, i, a, j, n):
-    """Copies n numbers from place j of a to place i of x.
+    """Copy n numbers from index j of a to index i of x.
 
-    For so few the check of shapes that a slice's assignment brings costs more than the copy.
+    A slice assignment is slower for few numbers.
     """
     for k in range(n):
         x[i + k] = a[j + k]
@@ -59,37 +56,37 @@ def put(x, i, a, j, n):
 
 @register_jitable
 def plus(a, b):
-    """a + b."""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @register_jitable
 def minus(a, b):
-    """a - b."""
+    """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @register_jitable
 def times(k, a):
-    """k a, of a number and a vector."""
+    """Return k a, of a number and a vector."""
     return k * a[0], k * a[1], k * a[2]
 
 
 @register_jitable
 def dot(a, b):
-    """a . b."""
+    """Return a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @register_jitable
 def cross(a, b):
-    """a x b."""
+    """Return a x b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @register_jitable
 def plus_cross(c, a, b):
-    """c + a x b, in this order."""
+    """Return c + a x b."""
     return (
         c[0] + a[1] * b[2] - a[2] * b[1],
         c[1] + a[2] * b[0] - a[0] * b[2],
@@ -99,7 +96,7 @@ def plus_cross(c, a, b):
 
 @register_jitable
 def apply(R, a):
-    """R a, also for any other matrix of nine numbers."""
+    """Return R a, also for any other 3 x 3 matrix."""
     return (
         R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
         R[3] * a[0] + R[4] * a[1] + R[5] * a[2],
@@ -109,17 +106,16 @@ def apply(R, a):
 
 @register_jitable
 def symmetric(x, i):
-    """The matrix of xx, xy, xz, yy, yz, zz, which begin at place i of x, as inertias do in phi."""
+    """Return the matrix of xx, xy, xz, yy, yz, zz at index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
 @register_jitable(inline="always")
 def cholesky(M, n):
-    """Turns the lower half of M (n, n), symmetric and positive definite, into L of M = L L^T.
+    """Replace the lower half of M (n, n), symmetric and positive definite, by L of M = L L^T.
 
-    So small that LAPACK's calls would cost more. With n a number in the caller's code, the compiler
-    unrolls the loops.
+    The compiler unrolls the loops if n is a constant.
     """
     for i in range(n):
         for j in range(i + 1):
@@ -131,7 +127,7 @@ def cholesky(M, n):
 
 @register_jitable(inline="always")
 def solve(M, b, n):
-    """b := M^-1 b (n,), M as for `cholesky`, of which it becomes the result."""
+    """Replace b (n,) by M^-1 b, and M as in `cholesky`."""
     cholesky(M, n)
     for i in range(n):
         for k in range(i):
@@ -144,7 +140,7 @@ def solve(M, b, n):
 
 
 def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 3, 3) [a x] of vectors (..., 3): [a x] b = a x b."""
+    """Return [a x] (..., 3, 3) of vectors (..., 3)."""
     matrix = np.zeros((*a.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[..., k, j], matrix[..., j, k] = a[..., i], -a[..., i]

@@ -1,3 +1,3 @@
-"""The version: the build reads it from here."""
+"""Version, read by the build."""
 
 __version__ = "0.1.0"

@@ -192,8 +192,8 @@ def _stream(
         findings.append(
             Finding(
                 "nan",
-                f"{at}: {figures['nan_rows']} rows contain no finite number, the first is row {first},"
-                f" the longest block {figures['nan_longest']} rows; cut or repair them",
+                f"{at}: {figures['nan_rows']} rows contain no finite number, the first is row"
+                f" {first}, the longest block {figures['nan_longest']} rows; cut or repair them",
             )
         )
     same = np.zeros(len(values), bool)

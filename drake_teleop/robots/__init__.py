@@ -1,1 +1,1 @@
-"""Robots that stand in a lab: what was identified, in their own words."""
+"""Live streams of a real robot, and export of an identified load."""

@@ -9,51 +9,37 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """The parts of an address.
-
-    Args:
-        text: the address.
-        port: if it says none.
-        known: the names that it may have.
-        host: if it says none.
-
-    Raises:
-        DrakeTeleopError: without a host, or with another name or port.
-    """
+    """Parsed address; raise DrakeTeleopError if host, port or a parameter name is invalid."""
 
     def __init__(
-        self, text: str, port: int | None, known: tuple[str, ...], *, host: str = ""
+        self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
     ) -> None:
         self.text = text
         try:
             parts = urlsplit(text)
-            said = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=False))
+            parameters = dict(parse_qsl(parts.query, keep_blank_values=True, strict_parsing=False))
             self.host, self.port = parts.hostname or host, parts.port or port
         except ValueError as error:
             raise DrakeTeleopError(str(error), where=text) from error
         if not self.host:
             raise DrakeTeleopError("has no host", where=text, remedy=f"{parts.scheme}://HOST")
         self.path = parts.path.strip("/")
-        self._said = said
-        for name in said:
-            if name not in known:
+        self._parameters = parameters
+        for name in parameters:
+            if name not in allowed:
                 raise DrakeTeleopError(
-                    f"has {name!r}, which it cannot have",
+                    f"unknown parameter {name!r}",
                     where=text,
-                    remedy=f"it may have {', '.join(known)}",
+                    remedy=f"use {', '.join(allowed)}",
                 )
 
-    def text_of(self, name: str) -> str | None:
-        """What it says under that name."""
-        return self._said.get(name)
+    def parameter(self, name: str) -> str | None:
+        """Return a query parameter, None if it is absent."""
+        return self._parameters.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
-        """Positive numbers with commas between them.
-
-        Raises:
-            DrakeTeleopError: if they are others.
-        """
-        text = self._said.get(name)
+        """Return `count` positive numbers, None if absent; raise DrakeTeleopError otherwise."""
+        text = self._parameters.get(name)
         if text is None:
             return None
         try:
@@ -67,12 +53,8 @@ class Address:
         return values
 
     def choice(self, name: str, among: tuple[str, ...]) -> str:
-        """One of some words, the first if it says none.
-
-        Raises:
-            DrakeTeleopError: if it is another.
-        """
-        text = self._said.get(name, among[0])
+        """Return one of the words `among`, by default the first; else raise DrakeTeleopError."""
+        text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
                 f"{name}={text!r} is neither {' nor '.join(among)}", where=self.text
@@ -80,12 +62,8 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """+1 for what the sensor exerts on the load, Eq. (1); -1, the default, for the opposite.
-
-        Raises:
-            DrakeTeleopError: for anything else.
-        """
-        text = self._said.get("sign", "-1")
-        if text not in ("-1", "1", "+1", " 1"):  # a plus in a query is a blank
+        """Return 1 for the wrench of sensor on load, Eq. (1); -1 (default) for the opposite."""
+        text = self._parameters.get("sign", "-1")
+        if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(f"sign={text!r} is neither 1 nor -1", where=self.text)
         return -1.0 if text == "-1" else 1.0

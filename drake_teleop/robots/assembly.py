@@ -1,54 +1,135 @@
-"""Readings from parts: the wrench of one stream, the motion at that instant of another.
+"""Readings that combine the wrench of one stream with the motion of another.
 
-The motion follows from poses as in a log: around each a polynomial of degree 5 is fitted to a
-window of 1.8 / cut-off, and its derivatives in the middle are taken (`logs.read.alignment`). So a
-motion is known half a window after it was, and the wrench waits for it, 30 ms at 30 Hz; both are
-of the same instant then. Poses that come at uneven times are put onto a grid first, on straight
-lines; without one for `STALE_S` the window begins anew.
-
-Specific force and angular velocity of an IMU in S go the same way, if nobody tells poses.
-
-**Clocks.** Streams of one source have one clock. Those of two are related by what each took least
-time for, as in `compensator`: what the motion takes longer on its way than the wrench cannot be
-seen in that. It is the delay that `identify` finds, and that `delay_following` follows from there.
+Motions are derivatives of poses (docs/robot.md, "Methods").
 """
 
 from __future__ import annotations
 
 import math
+import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
 from drake_teleop.logs.read.alignment import SMOOTHER_WINDOW, smoother
 from drake_teleop.logs.read.rotations import quaternions, rotation_matrices
-from drake_teleop.robots.compensator import DRIFT, JUMP_S, STALE_S
-from drake_teleop.robots.delay_following import DelayFollower
-from drake_teleop.robots.export import turn
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.streams import IMU, VALUES, WRENCH, Flag, Part, Reading
+from drake_teleop.robots.compensator import CLOCK_DRIFT, JUMP_S, STALE_S
+from drake_teleop.robots.delay_tracking import DelayTracker
+from drake_teleop.robots.export import rotation_rpy
+from drake_teleop.robots.streams import (
+    IMU,
+    JOINTS,
+    POSE,
+    VALUES,
+    WRENCH,
+    Flag,
+    Part,
+    PartSource,
+    Reading,
+)
 
 _GRAVITY = np.array([0.0, 0.0, -9.81])
-NOWHERE = np.array([1.0, 0, 0, 0, 0, 0, 0])
-"""Pose of a sensor that is where the posed frame is."""
-_KEPT_S = 0.5  # of motions and wrenches
-_LEAST_DT, _LATEST, _LARGEST = 1e-4, 1e11, 1e5  # [s], [s], of any unit
-_SPACINGS = 20  # that tell the rate of the motion
+IDENTITY_POSE = np.array([1.0, 0, 0, 0, 0, 0, 0])
+"""Identity: the sensor's frame is the posed frame."""
+_BUFFER_S = 0.5  # buffer of motions and wrenches
+_MIN_DT_S, _MAX_TIME_S, _MAX_VALUE = 1e-4, 1e11, 1e5  # [s], [s], any unit
+_PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
-class Window:
-    """Motions of S from samples as they come, late by half a window.
+class Parts:
+    """One or two sources as one; raise DrakeTeleopError if there is no motion.
 
-    The grid's spacing is the median of the first ones.
+    Attributes:
+        motion_stream: stream of the motion: poses if available, else an IMU.
+        two_clocks: wrench and motion have different clocks.
+    """
+
+    live = True
+
+    def __init__(self, wrench: PartSource, motion: PartSource | None = None) -> None:
+        self._wrench, self._motion = wrench, motion
+        self.dt, self.two_clocks = wrench.dt, motion is not None
+        streams = (wrench if motion is None else motion).streams
+        self.motion_stream = next((stream for stream in (POSE, IMU) if stream in streams), "")
+        if not self.motion_stream:
+            raise DrakeTeleopError(
+                "delivers no motion",
+                where="the source",
+                remedy="give --motion, such as rtde://HOST",
+            )
+
+    def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
+        """Return parts with their times of arrival."""
+        found: list[tuple[Part, float]] = []
+        if self._motion is not None:
+            motions, now = self._motion.read(0.0) or (), time.monotonic()
+            found += [(part, now) for part in motions if part.stream != WRENCH]
+        parts = self._wrench.read(timeout_s)
+        if parts is None:
+            return None
+        now = time.monotonic()
+        alone = self._motion is None
+        return found + [(part, now) for part in parts if alone or part.stream == WRENCH]
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._wrench.close()
+        if self._motion is not None:
+            self._motion.close()
+
+
+class SensorPoseOfJoints(Protocol):
+    """Kinematics of an arm, such as `station.slave.joint_poses.Arm`."""
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names from the base outwards."""
+
+    def pose(self, q: Array) -> Array:
+        """Return the pose X_WS (7,) at q (n,), as [w x y z, position]."""
+
+
+class PosedByJoints:
+    """Source that converts joint positions to poses of S."""
+
+    def __init__(self, source: PartSource, arm: SensorPoseOfJoints) -> None:
+        self._source, self._arm, self.dt = source, arm, source.dt
+        others = (stream for stream in source.streams if stream not in (JOINTS, POSE))
+        self.streams: tuple[str, ...] = (*others, POSE)
+
+    def read(self, timeout_s: float) -> list[Part] | None:
+        """See `PartSource`."""
+        parts = self._source.read(timeout_s)
+        if parts is None:
+            return None
+        return [self._converted(part) for part in parts if part.stream != POSE]
+
+    def _converted(self, part: Part) -> Part:
+        if part.stream != JOINTS:
+            return part
+        values = np.full(7, np.nan)  # an invalid pose, rejected later
+        if part.values.shape == (len(self._arm.joint_names),):
+            values = self._arm.pose(part.values)
+        return part._replace(stream=POSE, values=values)
+
+    def close(self) -> None:
+        """See `PartSource`."""
+        self._source.close()
+
+
+class MotionWindow:
+    """Motions of S from poses of a frame F, or from IMU samples, on a uniform grid.
 
     Args:
-        cutoff_hz: see the module; None for the shortest window.
-        X_FS: (7,) pose of the sensor in the frame whose poses come.
+        cutoff_hz: None for the shortest window.
+        X_FS: (7,) pose of the sensor in F.
         gravity_W: (3,) [m/s^2].
     """
 
@@ -57,52 +138,52 @@ class Window:
         self._weights, self._size = np.zeros((3, 1)), 1
         self._R_FS, self._p_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0], X_FS[4:]
         self._steps: list[float] = []
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Begins anew."""
+    def reset(self) -> None:
+        """Discard all samples."""
         self._last: tuple[float, Array] | None = None
-        self._next, self._rows = 0.0, deque[Array](maxlen=self._size)
-        self._came = -math.inf
+        self._next_t, self._rows = 0.0, deque[Array](maxlen=self._size)
+        self._arrival = -math.inf
 
-    def _measure(self, step: float) -> None:
+    def _measure_period(self, step: float) -> None:
         self._steps.append(step)
-        if len(self._steps) == _SPACINGS:
+        if len(self._steps) == _PERIOD_SAMPLES:
             self._dt = float(np.median(self._steps))
             self._weights = smoother(10**9, self._dt, self._cutoff_hz)[:3]
             self._size = self._weights.shape[1]
-            self.forget()
+            self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Times and motions (9,) that are known by a sample now."""
+        """Return times and motions (9,) that are complete with a sample received at `now`."""
         row = self._row(part)
         if row is None:
             return []
         last = self._last
         step = math.inf if last is None else part.t - last[0]
-        if step <= 0.0 and now - self._came <= STALE_S:
-            return []  # out of order, or the same
-        if not self._dt and _LEAST_DT <= step <= STALE_S:
-            self._measure(step)
+        if step <= 0.0 and now - self._arrival <= STALE_S:
+            return []  # out of order or repeated
+        if not self._dt and _MIN_DT_S <= step <= STALE_S:
+            self._measure_period(step)
         if self._last is None or not 0.0 < step <= STALE_S:
-            self.forget()
-            self._next, last = part.t, (part.t, row)
-        self._last, self._came = (part.t, row), now
+            self.reset()
+            self._next_t, last = part.t, (part.t, row)
+        self._last, self._arrival = (part.t, row), now
         found: list[tuple[float, Array]] = []
         if not self._dt or last is None:
             return found
-        while self._next <= part.t:
-            share = (self._next - last[0]) / max(part.t - last[0], 1e-9)
+        while self._next_t <= part.t:
+            share = (self._next_t - last[0]) / max(part.t - last[0], 1e-9)
             self._rows.append(last[1] + share * (row - last[1]))
             if len(self._rows) == self._size:
-                found.append((self._next - self._size // 2 * self._dt, self._middle()))
-            self._next += self._dt
+                found.append((self._next_t - self._size // 2 * self._dt, self._motion()))
+            self._next_t += self._dt
         return found
 
     def _row(self, part: Part) -> Array | None:
-        """(12,) R_WS and p_WS, or (6,) as they come; None of what is no motion."""
+        """Return R_WS and p_WS (12,), or IMU values (6,); None if invalid."""
         values = part.values
-        if part.flags or not (abs(part.t) < _LATEST and (np.abs(values) < _LARGEST).all()):
+        if part.flags or not (abs(part.t) < _MAX_TIME_S and (np.abs(values) < _MAX_VALUE).all()):
             return None
         if part.stream == IMU:
             return values
@@ -112,8 +193,8 @@ class Window:
         R_WF = rotation_matrices(values[None, :4] / size, "quaternion_wxyz")[0]
         return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
-    def _middle(self) -> Array:
-        """(9,) specific force, angular velocity and acceleration in the middle of the window."""
+    def _motion(self) -> Array:
+        """Return s, omega, alpha (9,) in the middle of the window."""
         rows = np.array(self._rows)
         smooth, first, second = self._weights @ rows
         if rows.shape[1] == 6:
@@ -125,47 +206,37 @@ class Window:
 
 
 def _axis(A: Array) -> Array:
-    """The vector of a matrix's skew part."""
     return 0.5 * np.array([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]])
 
 
-def pose_of(numbers: Sequence[float]) -> Array:
-    """(7,) quaternion and position of x, y, z [m], roll, pitch, yaw [deg], as in a URDF."""
-    roll, pitch, yaw = np.radians(numbers[3:])
-    R = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
-    return np.concatenate([quaternions(R[None])[0], numbers[:3]])
+def pose_from_rpy(numbers: Sequence[float]) -> Array:
+    """Return quaternion and position (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
+    return np.concatenate([quaternions(rotation_rpy(numbers[3:])[None])[0], numbers[:3]])
 
 
-class _Offset:
-    """Our clock less another, by what took least time."""
-
+class _ClockOffset:
     def __init__(self) -> None:
-        self.now_less_t, self._now = math.inf, 0.0
+        self.offset, self._now = math.inf, 0.0
 
-    def follow(self, t: float, now: float) -> None:
+    def update(self, t: float, now: float) -> None:
         if math.isfinite(t):
-            ahead, faded = now - t, self.now_less_t + DRIFT * (now - self._now)
-            known = abs(ahead - self.now_less_t) <= JUMP_S
-            self.now_less_t, self._now = min(ahead, faded) if known else ahead, now
+            ahead, faded = now - t, self.offset + CLOCK_DRIFT * (now - self._now)
+            known = abs(ahead - self.offset) <= JUMP_S
+            self.offset, self._now = min(ahead, faded) if known else ahead, now
 
 
 class Assembly:
-    """A source of readings made of parts.
+    """Source of readings with the motion of another stream.
 
     Args:
-        parts: wrench and motion.
-        cutoff_hz: see the module.
-        delay_s: by how much the motion's stamps come behind the wrench's [s].
-        follow: a load whose wrench tells how that delay changes; None: it stays.
-        X_FS: (7,) [w, x, y, z] and position [m] of the sensor in the frame that is posed.
-        weight_removed: the robot has removed the weight from the wrench. The readings then have the
-            acceleration in the place of the specific force.
-
-    Raises:
-        DrakeTeleopError: if the weight is removed and the motion is an IMU's.
+        delay_s: delay of the motion's stamps behind the wrench's [s].
+        follow: load for tracking this delay; None for a constant delay.
+        X_FS: (7,) [w x y z, position] of the sensor in the posed frame.
+        weight_removed: the robot has removed the weight from the wrench. Readings contain the
+            acceleration instead of the specific force; an IMU raises DrakeTeleopError.
 
     Attributes:
-        lag_s: by how much readings come late, if poses come often enough for the window [s].
+        lag_s: delay of the readings [s].
     """
 
     live = True
@@ -176,67 +247,67 @@ class Assembly:
         *,
         cutoff_hz: float | None = 30.0,
         delay_s: float = 0.0,
-        follow: Identification | None = None,
-        X_FS: Array = NOWHERE,
+        track: Identification | None = None,
+        X_FS: Array = IDENTITY_POSE,
         weight_removed: bool = False,
     ) -> None:
-        if weight_removed and parts.told == IMU:
+        if weight_removed and parts.motion_stream == IMU:
             raise without_orientation("the source")
         self._parts, self._delay, self.dt = parts, delay_s, parts.dt
-        self._follower = None
-        if follow is not None:
-            self._follower = DelayFollower(follow, self.dt, cutoff_hz, delay_s)
-        self._window = Window(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY)
+        self._tracker = None
+        if track is not None:
+            self._tracker = DelayTracker(track, self.dt, cutoff_hz, delay_s)
+        self._window = MotionWindow(cutoff_hz, X_FS, np.zeros(3) if weight_removed else _GRAVITY)
         self.lag_s = max(0.0, delay_s)
         if cutoff_hz is not None:
             self.lag_s = max(0.0, 0.5 * SMOOTHER_WINDOW / cutoff_hz + delay_s)
-        self._clocks = _Offset(), _Offset()
+        self._clocks = _ClockOffset(), _ClockOffset()
         self._motions: deque[tuple[float, Array]] = deque()
-        self._waiting: deque[Part] = deque(maxlen=round(_KEPT_S / self.dt))
+        self._pending: deque[Part] = deque(maxlen=round(_BUFFER_S / self.dt))
 
     @property
     def delay_s(self) -> float:
-        """The present delay [s]."""
-        return self._delay if self._follower is None else self._follower.delay_s
+        """Present delay of the motion [s]."""
+        return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        came = self._parts.read(timeout_s)
-        if came is None:
+        arrived = self._parts.read(timeout_s)
+        if arrived is None:
             return None
-        return [reading for part, now in came for reading in self.take(part, now)]
+        return [reading for part, now in arrived for reading in self.take(part, now)]
 
     def take(self, part: Part, now: float) -> list[Reading]:
-        """The readings that are whole by a part that came at `now`. It never raises."""
+        """Return the readings that are complete with a part received at `now`."""
         if part.stream == WRENCH:
-            self._clocks[0].follow(part.t, now)
-            self._waiting.append(part)
-        elif part.stream == self._parts.told:
-            self._clocks[1].follow(part.t, now)
+            self._clocks[0].update(part.t, now)
+            self._pending.append(part)
+        elif part.stream == self._parts.motion_stream:
+            self._clocks[1].update(part.t, now)
             shift = -self.delay_s
             if self._parts.two_clocks:
-                shift += self._clocks[1].now_less_t - self._clocks[0].now_less_t
+                shift += self._clocks[1].offset - self._clocks[0].offset
             for t, motion in self._window.take(part, now):
-                self._keep(t + shift, motion)
+                self._add_motion(t + shift, motion)
         found = []
-        while self._waiting and (reading := self._whole(self._waiting[0])) is not None:
-            self._waiting.popleft()
+        while self._pending and (reading := self._complete(self._pending[0])) is not None:
+            self._pending.popleft()
             found.append(reading)
         return found
 
-    def _keep(self, t: float, motion: Array) -> None:
+    def _add_motion(self, t: float, motion: Array) -> None:
         motions = self._motions
-        if motions and not motions[-1][0] - STALE_S < t < motions[-1][0] + _KEPT_S:
-            motions.clear()  # another clock: what waits for a motion by the old one waits for ever
-            waiting = [each for each in self._waiting if not abs(each.t - t) > _KEPT_S]
-            self._waiting = deque(waiting, self._waiting.maxlen)
+        if motions and not motions[-1][0] - STALE_S < t < motions[-1][0] + _BUFFER_S:
+            motions.clear()  # another clock: wrenches on the old one would wait forever
+            waiting = [each for each in self._pending if not abs(each.t - t) > _BUFFER_S]
+            self._pending = deque(waiting, self._pending.maxlen)
         if math.isfinite(t) and (not motions or t > motions[-1][0]):
             motions.append((t, motion))
-            while t - motions[0][0] > _KEPT_S:
+            while t - motions[0][0] > _BUFFER_S:
                 motions.popleft()
 
-    def _whole(self, part: Part) -> Reading | None:
-        """With the motion of its instant, or stale without; None while it has to wait for it."""
+    def _complete(self, part: Part) -> Reading | None:
+        """Return the reading, stale if without motion; None while its motion is pending."""
         values, flags, motions = np.zeros(VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):
@@ -249,8 +320,8 @@ class Assembly:
             return Reading(part.number, part.t, values, flags | Flag.STALE)
         share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
         values[6:] = before[1] + share * (after[1] - before[1])
-        if self._follower is not None and not flags and np.isfinite(part.values).all():
-            self._follower.take((part.t, values[6:]), part.values, before, after)
+        if self._tracker is not None and not flags and np.isfinite(part.values).all():
+            self._tracker.take((part.t, values[6:]), part.values, before, after)
         return Reading(part.number, part.t, values, flags)
 
     def close(self) -> None:

@@ -1,24 +1,13 @@
-"""Whether a load is known well enough yet, and which motion would tell more.
-
-What has been recorded is identified as `identify` does, again and again, each time the record has
-grown by `GROWS`. A number is known when the half-width of its interval of `SURE` is within its
-tolerance, two looks in a row; the 95 % interval that is shown is then half of it or about. To look
-often and to stop at the first good news makes intervals too narrow; therefore the level is far
-above 95 %, two looks have to agree, and the variance be known itself (`FEWEST_DEGREES`). Nothing is
-known while something speaks against the record: suspected errors, another load or another zero from
-some time on, poses at rest. Contacts are left out of the record and cast no doubt on it.
-
-**What is missing.** The information of the recorded motion, G = sum of [E V]^T W [E V] over the
-samples that are independent behind the low-pass, and that of each of six motions from the present
-orientation, G_k: to tilt slowly and to swing briskly about x, y and z of S. The one is advised that
-leaves least of what is asked: the least sum of log max(1, deviation / tolerance).
-"""
+"""Identification from a stream until the requested parameters are known (docs/robot.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +15,7 @@ from scipy.special import stdtrit
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.writing import set_aside
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of
@@ -33,44 +23,45 @@ from drake_teleop.logs.causes.cause import CHANGES
 from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.alignment import low_passed
 from drake_teleop.logs.read.reading import read_log
+from drake_teleop.robots.recording import Records
+from drake_teleop.robots.streams import Source
 
-SURE = 0.9998
-"""Level of the interval that has to be within the tolerance."""
-GROWS = 1.12
-"""By how much longer the record is at the next look."""
-FIRST_S = 1.0
-"""Length of the record at the first look [s]."""
-FEWEST_DEGREES = 20.0
-"""Of freedom of the variance of a number that is known."""
-_ANEW = "start again: the record has another zero or another load from t = {t:.2f} s on"
+CONFIDENCE = 0.9998
+"""Level of the interval that must be within the tolerance."""
+RECORD_GROWTH = 1.12
+"""Growth factor of the record from one result to the next."""
+FIRST_RECORD_S = 1.0
+"""Length of the record at the first result [s]."""
+MIN_DEGREES_OF_FREEDOM = 20.0
+"""Minimum degrees of freedom of the variance of a known number."""
+_START_AGAIN = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY = 9.81
-# A load and a sensor [N, N m] to give advice with before anything is known.
-_GUESS = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
-_NOISE = np.repeat([0.25, 0.012], 3)
-_NOTHING = 1e-12  # information that keeps matrices regular, of natural columns
-# Motions: words, angle [rad], rate [Hz]; seconds and samples of each.
+# Load and noise [N, N m] for the advice before the first identification.
+_INITIAL_PHI = np.array([1.0, 0.0, 0.0, 0.05, 0.004, 0.0, 0.0, 0.004, 0.0, 0.004])
+_INITIAL_NOISE = np.repeat([0.25, 0.012], 3)
+_REGULARIZATION = 1e-12  # relative information that keeps matrices regular
+# Motions: words, angle [rad], rate [Hz]; duration [s] and samples of each.
 _MOTIONS = (
     ("turn the wrist about {axis}, slowly, by 60 deg and back", np.radians(60.0), 0.25),
-    ("swing the wrist about {axis}, briskly, by 20 deg to and fro", np.radians(20.0), 1.5),
+    ("swing the wrist about {axis}, briskly, by 20 deg back and forth", np.radians(20.0), 1.5),
 )
-_LASTS, _SAMPLES = 4.0, 80
-# Numbers per second and hertz of the low-pass that are independent.
-_INDEPENDENT = 2.2
+_MOTION_S, _MOTION_SAMPLES = 4.0, 80
+# Independent samples per second and hertz of the low-pass.
+_INDEPENDENT_PER_S_HZ = 2.2
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What is known at one time.
+class Evaluation:
+    """Intermediate result of a calibration.
 
     Attributes:
         t: length of the record [s].
-        found: what was identified; None if nothing could be.
-        why: nothing could be; else "".
-        half: (k,) half-widths of the 95 % intervals of the asked numbers over their tolerances.
-        sure: (k,) whether the wider interval of each is within its tolerance.
-        known: (k,) whether that is so in the look before, too.
-        doubts: what speaks against the record; nothing is known then.
-        advice: the motion that tells most of what is not known, or to start again; "" if all is.
+        found: the identification; None if it failed for the reason `why`.
+        half: (k,) half-widths of the 95 % intervals over the tolerances.
+        sure: (k,) whether the interval of level `CONFIDENCE` is within the tolerance.
+        known: (k,) whether the previous one also was.
+        doubts: problems of the record; no parameter is known then.
+        advice: the next motion; "" if all parameters are known.
     """
 
     t: float
@@ -83,22 +74,15 @@ class Look:
     advice: str
 
 
-def look(
+def evaluate_record(
     path: Path,
     tolerance: Tolerance,
-    before: Look | None,
+    previous: Evaluation | None,
     *,
     cutoff_hz: float | None,
     delay: str | float,
-) -> Look:
-    """Identifies the record so far, as `identify` would.
-
-    Args:
-        path: the record, a canonical log.
-        tolerance: what is asked.
-        before: the look before this one.
-        cutoff_hz, delay: as of `identify_log`.
-    """
+) -> Evaluation:
+    """Identify the present record; `previous` is the previous result."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -106,78 +90,75 @@ def look(
         why = str(error)
     half, sure = np.full(count, np.inf), np.zeros(count, bool)
     doubts: tuple[str, ...] = ()
-    phi, noise, log = _GUESS, _NOISE, None
+    phi, noise, log = _INITIAL_PHI, _INITIAL_NOISE, None
     if found is not None:
         load, log = found.identification, found.log
         half, wider, degrees = half_widths(found, tolerance)
-        doubts = doubts_of(found)
-        sure = (wider <= 1.0) & (degrees >= FEWEST_DEGREES) & (not doubts)
+        doubts = record_problems(found)
+        sure = (wider <= 1.0) & (degrees >= MIN_DEGREES_OF_FREEDOM) & (not doubts)
         if load.mass > 0.0:
-            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _NOISE)
-    known = sure & (before is not None and before.sure)
+            phi, noise = load.phi, np.maximum(load.residual_rms, 1e-3 * _INITIAL_NOISE)
+    known = sure & (previous is not None and previous.sure)
     if log is not None and sure.all():
-        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, "")
+        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, "")
     changes = [x.start_s or 0.0 for x in found.causes if x.name in CHANGES] if found else []
     if log is not None and changes:
-        advice = _ANEW.format(t=min(changes))
-        return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
+        advice = _START_AGAIN.format(t=min(changes))
+        return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
     try:
         log = log or low_passed(read_log(path, bandwidth_hz=cutoff_hz), cutoff_hz)
-    except DrakeTeleopError:  # hardly anything yet
-        return Look(0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x"))
-    advice = missing_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
-    return Look(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
+    except DrakeTeleopError:  # too few samples
+        return Evaluation(
+            0.0, found, why, half, sure, known, doubts, _MOTIONS[0][0].format(axis="x")
+        )
+    advice = best_motion(log.motion, log.dt, cutoff_hz, errors_of(tolerance, phi), noise)
+    return Evaluation(float(log.t[-1]), found, why, half, sure, known, doubts, advice)
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Half-widths of the intervals of 95 % and of `SURE` over the tolerances, and their degrees.
-
-    The degrees of freedom of a number are the least of the parameters that it depends on.
-    """
+    """Return half-widths at 95 % and `CONFIDENCE` over the tolerances, and degrees of freedom."""
     load = found.identification
     errors = errors_of(tolerance, load.phi)
     deviations = deviations_of(errors, load.covariance)
     depends = np.where(errors != 0.0, load.degrees_of_freedom, np.inf)
     degrees = np.minimum(depends.min(axis=1), 1e6)
-    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, SURE))
+    half, sure = (stdtrit(degrees, 0.5 + 0.5 * level) * deviations for level in (0.95, CONFIDENCE))
     return half, sure, degrees
 
 
-def doubts_of(found: IdentifiedLog) -> tuple[str, ...]:
-    """Why the numbers of a record are not to be trusted, whatever their intervals."""
+def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
+    """Return problems that invalidate all intervals."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
-        doubts.append("there are only poses at rest")
+        doubts.append("all poses are at rest")
     if found.identification.mass <= 0.0:
-        doubts.append("the mass is negative: the wrench has the other sign")
+        doubts.append("the mass is negative: the wrench has the opposite sign")
     return tuple(doubts)
 
 
-def missing_motion(
+def best_motion(
     motion: tuple[Array, Array, Array],
     dt: float,
     cutoff_hz: float | None,
     errors: Array,
     noise: Array,
 ) -> str:
-    """The advice, in words (module docstring).
+    """Return the most informative motion, in words.
 
     Args:
-        motion: s, omega, alpha, (N, 3) each, of the record.
-        dt: of the record [s].
-        cutoff_hz: of the low-pass it has passed.
+        motion: s, omega, alpha, (N, 3) each.
         errors: (k, 16) from `errors_of`.
         noise: (6,) of a sample's wrench [N, N m].
     """
-    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT * cutoff_hz)
+    rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)
     equations = NormalEquations(noise)
     equations.add(np.zeros((len(motion[0]), 6)), *motion)
     gram = rate * dt * equations.normal_equations()[0]
     size = np.sqrt(np.diag(gram).max()) + 1.0
-    gram = gram + _NOTHING * size**2 * np.eye(16)
+    gram = gram + _REGULARIZATION * size**2 * np.eye(16)
     last = motion[0][-max(1, round(0.2 / dt)) :].mean(axis=0)
     best, least = "", np.inf
-    for words, of_motion in _primitives(last, noise, rate):
+    for words, of_motion in _candidate_motions(last, noise, rate):
         left = deviations_of(errors, np.linalg.inv(gram + of_motion))
         cost = float(np.log(np.maximum(left, 1.0)).sum()) + 1e-6 * float(left.sum())
         if cost < least:
@@ -185,24 +166,102 @@ def missing_motion(
     return best
 
 
-def _primitives(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
-    """Words, and (16, 16) information, of each motion from where the specific force is `up`."""
+def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
+    """Yield words and information (16, 16) of motions that start at the specific force `up`."""
     s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
-    t = np.arange(_SAMPLES) * (_LASTS / _SAMPLES)
+    t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
     for words, size, hertz in _MOTIONS:
         w = 2.0 * np.pi * hertz
         angle, speed = 0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t)
         change = 0.5 * size * w * w * np.cos(w * t)
         for k, axis in enumerate("xyz"):
             e = np.eye(3)[k]
-            # What is fixed in W turns about -e in S (Rodrigues).
+            # Vectors fixed in W rotate about -e in S (Rodrigues).
             s = (
                 np.outer(np.cos(angle), s0)
                 - np.outer(np.sin(angle), np.cross(e, s0))
                 + np.outer(1.0 - np.cos(angle), e * (e @ s0))
             )
             V = regressor(s, np.outer(speed, e), np.outer(change, e))
-            rows = np.concatenate([np.tile(np.eye(6), (_SAMPLES, 1, 1)), V], axis=2)
+            rows = np.concatenate([np.tile(np.eye(6), (_MOTION_SAMPLES, 1, 1)), V], axis=2)
             rows = (rows / noise[:, np.newaxis]).reshape(-1, 16)
-            share = rate * _LASTS / _SAMPLES
+            share = rate * _MOTION_S / _MOTION_SAMPLES
             yield words.format(axis=axis), share * (rows.T @ rows)
+
+
+DEFAULT_TOLERANCE = "mass 0.5 %, com 0.5 mm, inertia 5 %"
+"""Default tolerances."""
+_IDLE_S = 0.05
+_T = TypeVar("_T")
+
+
+def calibrate(
+    source: Source[_T],
+    recorder: Records[_T],
+    path: Path,
+    tolerance: Tolerance,
+    *,
+    cutoff_hz: float | None = 30.0,
+    delay: str | float = "auto",
+    seconds: float = 120.0,
+    show: Callable[[Evaluation], None] = lambda _: None,
+) -> list[Evaluation]:
+    """Record a stream until the tolerance is met, the source ends or the time is over.
+
+    Args:
+        path: file of the record; the last result refers to it.
+        cutoff_hz, delay: see `identify_log`.
+        seconds: maximum length of the record.
+        show: callback for each result.
+
+    Returns:
+        All results.
+
+    Raises:
+        DrakeTeleopError: if too few samples came, or the record cannot be written.
+    """
+    results: list[Evaluation] = []
+    next_length_s = FIRST_RECORD_S
+    earlier = [path.with_name(name) for name in recorder.files] if source.live else []
+    pending: Future[Evaluation] | None = None
+
+    def evaluate() -> Evaluation:
+        previous = results[-1] if results else None
+        return evaluate_record(path, tolerance, previous, cutoff_hz=cutoff_hz, delay=delay)
+
+    def finish(result: Evaluation) -> bool:
+        results.append(result)
+        show(result)
+        return bool(result.known.all())
+
+    def write_record() -> None:
+        if recorder.seconds:
+            set_aside(*earlier)
+            earlier.clear()
+        recorder.write(path)
+
+    done = False
+    try:
+        with ThreadPoolExecutor(1) as executor, suppress(KeyboardInterrupt):
+            while not done and (samples := source.read(_IDLE_S)) is not None:
+                for sample in samples:
+                    recorder.take(sample)
+                    if pending is None and recorder.seconds >= next_length_s:
+                        next_length_s = max(FIRST_RECORD_S, RECORD_GROWTH * recorder.seconds)
+                        write_record()
+                        pending = executor.submit(evaluate)
+                    if pending is not None and (not source.live or pending.done()):
+                        done, pending = finish(pending.result()), None
+                        if done:
+                            break
+                done = done or recorder.seconds >= seconds
+    except Exception:
+        if recorder.seconds:
+            write_record()
+        raise
+    if pending is not None:
+        finish(pending.result())
+    if not results or not results[-1].known.all():
+        write_record()
+        finish(evaluate())
+    return results

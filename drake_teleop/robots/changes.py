@@ -1,13 +1,7 @@
-"""A tare or a grasp in a stream, found beside the loop by the test that `identify` uses.
+"""Detection of a tare or a grasp in a stream, by the test of `identify`.
 
-The flags of `Watch` show that the known load does not explain the wrench. When they have lasted for
-`SETTLED_S`, the last `SPAN_S` seconds are explained as a record is: another zero from t on, another
-load from t on, or something else. At rest a push looks like either of them. A change is therefore
-reported only once the tool has turned by a few degrees after it, and if the other kind explains the
-record decisively worse. A push that turns with the tool remains indistinguishable from a tare.
-
-The explanation takes a second or so. A live stream has it made by another process of low priority,
-so that the loop waits for nothing: threads of one interpreter would share its lock.
+For a live stream it runs in another process of low priority, because threads would share the
+interpreter lock with the loop.
 """
 
 from __future__ import annotations
@@ -30,70 +24,66 @@ from drake_teleop.logs.causes.instants import S, instants
 from drake_teleop.logs.causes.model import Step
 from drake_teleop.logs.causes.state import State
 from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.streams import ONLY_SAID, VALUES, Flag, Reading
+from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Flag, Reading
 
 SPAN_S = 20.0
 """Length of the record that is explained [s]."""
 SETTLED_S = 2.0
-"""How long the flags have to last [s]."""
-_FLAGGED, _WRONG = int(Flag.IN_CONTACT | Flag.OTHER_LOAD), ~int(ONLY_SAID)
-# Seconds: between attempts at most, unflagged until a change is over, between two changes.
-_PATIENCE, _OVER, _SAME = 10.0, 1.0, 1.0
-_LEAST_S, _DECISIVE = 4.0, 40.0
-_MOVED = 0.5  # m/s^2, deviation of the specific force after a change
-_NICE, _TIMEOUT_S = 10, 60.0
+"""Minimum duration of the flags [s]."""
+_WATCH_FLAGS, _INVALID_FLAGS = int(Flag.IN_CONTACT | Flag.OTHER_LOAD), ~int(NONZERO_FLAGS)
+# [s]: maximum time between attempts, flag-free time after a change, time between two changes.
+_MAX_RETRY_S, _END_S, _SAME_CHANGE_S = 10.0, 1.0, 1.0
+_MIN_RECORD_S, _MIN_LIKELIHOOD_RATIO = 4.0, 40.0
+_MIN_FORCE_STD = 0.5  # m/s^2, minimum standard deviation of the specific force after a change
+_NICENESS, _TIMEOUT_S = 10, 60.0
 
 Report = tuple[float, str]
 """Time of a change [s], and the change in words."""
 
 
 class Changes:
-    """Reports each change of zero or load once (module docstring).
+    """Report of each change of zero or load, once, by the callback `report`."""
 
-    Args:
-        dt: between readings [s].
-        live: whether the stream goes on while the record is explained.
-        say: takes the report.
-    """
-
-    def __init__(self, dt: float, *, live: bool, say: Callable[[str], None]) -> None:
-        self._dt, self._live, self._say = dt, live, say
+    def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
+        self._dt, self._live, self._report = dt, live, report
         self._rows = np.zeros((round(SPAN_S / dt), 1 + VALUES))
         self._count, self._last = 0, -math.inf
-        self._since, self._flagged, self._next = math.inf, -math.inf, math.inf
-        self._beside = ThreadPoolExecutor(1, "changes of a stream")
+        self._flagged_since, self._last_flagged, self._next_attempt = math.inf, -math.inf, math.inf
+        self._executor = ThreadPoolExecutor(1, "changes of a stream")
         self._pending: Future[list[Report]] | None = None
         self._reported: list[float] = []
 
     def take(self, reading: Reading, flags: int) -> None:
         """Take a reading and the flags of its compensated wrench."""
-        if flags & _WRONG:
+        if flags & _INVALID_FLAGS:
             return
         if not 0.0 < reading.t - self._last < JUMP_S:
-            self._count, self._since = 0, math.inf
+            self._count, self._flagged_since = 0, math.inf
         t = self._last = reading.t
         row = self._rows[self._count % len(self._rows)]
         row[0], row[1:] = t, reading.values
         self._count += 1
-        if flags & _FLAGGED:
-            self._flagged = t
-            if self._since > t:
-                self._since, self._next = t, t + SETTLED_S
-        elif t - self._flagged > _OVER:
-            self._since = math.inf
-        if self._pending is None and t >= self._next and self._since <= t:
-            self._next = t + min(max(SETTLED_S, 0.5 * (t - self._since)), _PATIENCE)
-            find = _reports_beside if self._live else reports
-            self._pending = self._beside.submit(find, self._record(), self._dt)
+        if flags & _WATCH_FLAGS:
+            self._last_flagged = t
+            if self._flagged_since > t:
+                self._flagged_since, self._next_attempt = t, t + SETTLED_S
+        elif t - self._last_flagged > _END_S:
+            self._flagged_since = math.inf
+        if self._pending is None and t >= self._next_attempt and self._flagged_since <= t:
+            self._next_attempt = t + min(
+                max(SETTLED_S, 0.5 * (t - self._flagged_since)), _MAX_RETRY_S
+            )
+            find = _find_changes_in_process if self._live else find_changes
+            self._pending = self._executor.submit(find, self._record(), self._dt)
         if self._pending is not None and (self._pending.done() or not self._live):
-            self._report(self._pending)
+            self._report_changes(self._pending)
             self._pending = None
 
     def close(self) -> None:
         """Wait for the last record and report its changes."""
         if self._pending is not None:
-            self._report(self._pending)
-        self._beside.shutdown()
+            self._report_changes(self._pending)
+        self._executor.shutdown()
 
     def _record(self) -> Array:
         first = self._count % len(self._rows)
@@ -101,67 +91,64 @@ class Changes:
             return self._rows[: self._count].copy()
         return np.concatenate([self._rows[first:], self._rows[:first]])
 
-    def _report(self, found: Future[list[Report]]) -> None:
+    def _report_changes(self, found: Future[list[Report]]) -> None:
         error = found.exception()
-        if error is not None:  # the loop goes on
-            self._say(f"a tare or another load could not be looked for ({error})")
+        if error is not None:  # the loop continues
+            self._report(f"the test for a tare or another load failed ({error})")
             return
         for time, words in found.result():
-            if all(abs(time - t) > _SAME for t in self._reported):
+            if all(abs(time - t) > _SAME_CHANGE_S for t in self._reported):
                 self._reported.append(time)
-                self._next = self._last + _PATIENCE
-                self._say(words)
+                self._next_attempt = self._last + _MAX_RETRY_S
+                self._report(words)
 
 
-def _reports_beside(rows: Array, dt: float) -> list[Report]:
-    """`reports`, by another process."""
+def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
+    """Return `find_changes`, computed by another process."""
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
         stdout=subprocess.PIPE,
         timeout=_TIMEOUT_S,
         check=True,
-        start_new_session=True,  # Ctrl-C is for the loop
+        start_new_session=True,  # Ctrl-C stops the loop only
     )
     return [(time, words) for time, words in json.loads(done.stdout)]
 
 
-def reports(rows: Array, dt: float) -> list[Report]:
-    """Find the changes of zero and load in a part of a stream.
-
-    Args:
-        rows: (N, 16) time [s] and values of readings.
-        dt: between readings [s].
-    """
+def find_changes(rows: Array, dt: float) -> list[Report]:
+    """Return the changes of zero and load in rows (N, 16) of time [s] and values."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
-    if len(t) * dt < _LEAST_S:
+    if len(t) * dt < _MIN_RECORD_S:
         return []
     wrench, *motion = np.split(rows[at, 1:], [6, 9, 12], axis=1)
     lost = np.abs(rows[at, 0] - t) > dt
     state = explain(instants(t, wrench, tuple(motion), None, lost)).state
     return [
-        (cause.start_s, _in_words(cause))
+        (cause.start_s, _change_text(cause))
         for cause in causes_of(state)
         if cause.name in CHANGES and cause.start_s is not None and _decisive(state, cause.start_s)
     ]
 
 
 def _decisive(state: State, time: float) -> bool:
-    """Whether S has moved since, and the other kind of change explains the record much worse."""
+    """Return whether S has moved since, and the other kind explains the record much worse."""
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
-    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MOVED:
+    if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:
         return False
     own = next(step for step in steps if step.time == time)
     other = Step("offsets" if own.kind == "load" else "load", own.time)
     model = replace(state.model, steps=(*(step for step in steps if step != own), other))
     start = np.zeros(model.size)
     start[:17] = state.x[:17]
-    return 2.0 * (state.likelihood - state.extended(model, start).likelihood) > _DECISIVE
+    return (
+        2.0 * (state.likelihood - state.extended(model, start).likelihood) > _MIN_LIKELIHOOD_RATIO
+    )
 
 
-def _in_words(cause: Cause) -> str:
+def _change_text(cause: Cause) -> str:
     if cause.name == "zero change":
         change = " ".join(f"{x:+.3g}" for x in np.array(cause.values["change"]))
         return (
@@ -177,9 +164,9 @@ def _in_words(cause: Cause) -> str:
 def main() -> None:
     """Explain the rows on stdin; write the reports to stdout."""
     if hasattr(os, "nice"):
-        os.nice(_NICE)
+        os.nice(_NICENESS)
     rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + VALUES)
-    json.dump(reports(rows, float(sys.argv[1])), sys.stdout)
+    json.dump(find_changes(rows, float(sys.argv[1])), sys.stdout)
 
 
 if __name__ == "__main__":

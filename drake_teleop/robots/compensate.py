@@ -1,4 +1,4 @@
-"""`drake-teleop compensate`: from a source through the compensator to a sink, in one loop."""
+"""Loop of `drake-teleop compensate`, from a source to a sink."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.writing import set_aside
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes
 from drake_teleop.robots.compensator import STALE_S, TARE_S, Compensator
-from drake_teleop.robots.detector import Detector
-from drake_teleop.robots.joints import SensorPoseOfJoints
-from drake_teleop.robots.lines import names_of
-from drake_teleop.robots.sources_and_sinks import is_file, sink_of, source_of
-from drake_teleop.robots.streams import Compensated, Sink, Source
+from drake_teleop.robots.connections import is_file, open_sink, open_source
+from drake_teleop.robots.lines import flag_names
+from drake_teleop.robots.streams import Compensated, Reading, Sink, Source
 from drake_teleop.robots.udp import THIS_MACHINE, listening
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import Detector, Watch
 
-_IDLE_S = 0.01  # between wrenches of zero while nothing comes
+_IDLE_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class Control:
-    """A UDP port of this machine that takes the word `tare`, and answers."""
+    """UDP port of this machine that accepts the word `tare`."""
 
     def __init__(self, port: int) -> None:
         self._socket = listening(THIS_MACHINE, port)
@@ -37,67 +35,71 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answers what has been asked."""
+        """Answer a waiting request."""
         try:
-            words, asker = self._socket.recvfrom(64)
-            known = words.strip() == b"tare"
-            self._socket.sendto((tare() if known else "unknown: say tare").encode(), asker)
-        except OSError:  # nothing was asked, or nobody waits for the answer
+            request, sender = self._socket.recvfrom(64)
+            valid = request.strip() == b"tare"
+            self._socket.sendto(
+                (tare() if valid else "unknown request: send tare").encode(), sender
+            )
+        except OSError:  # no request, or the sender is gone
             pass
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the port."""
         self._socket.close()
 
 
 def run(
-    source: Source,
+    source: Source[Reading],
     compensator: Compensator,
     sink: Sink,
     *,
     control: Control | None = None,
     tare: bool = False,
     changes: Changes | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensates until the source ends, or Ctrl-C.
+    """Compensate until the source ends, or Ctrl-C.
 
     Args:
-        control: answers requests to tare.
-        tare: also once, as soon as there is `TARE_S` of good readings, whatever comes of it.
-        changes: reports a tare or another load in the stream.
-        say: takes what is to be known: a tare, and each kind of fault when it first comes.
+        tare: tare once, after `TARE_S` of good readings.
+        say: callback for a tare, and the first fault of each kind.
 
     Returns:
-        how many wrenches there were, under "wrenches", and how many with each flag.
+        The number of wrenches, under "wrenches", and the number with each flag.
     """
     counts: Counter[str] = Counter(wrenches=0)
-    tare_at = np.inf if not tare else round(TARE_S / source.dt)
+    tare_count = np.inf if not tare else round(TARE_S / source.dt)
 
-    def put(out: Compensated) -> None:
+    def write(out: Compensated) -> None:
         sink.write(out)
         counts["wrenches"] += 1
-        for name in names_of(out.flags) if out.flags else ():
+        for name in flag_names(out.flags) if out.flags else ():
             if counts[name] == 0:
-                say(f"t = {out.t:.3f} s: {name}")
+                report(f"t = {out.t:.3f} s: {name}")
             counts[name] += 1
 
-    def waited() -> float:
-        left = compensator.left(time.monotonic())
+    def timeout_s() -> float:
+        left = compensator.time_to_stale(time.monotonic())
         return min(left, _IDLE_S) if left > 0.0 else _IDLE_S
 
     with suppress(KeyboardInterrupt):
-        while (readings := source.read(waited())) is not None:
-            if source.live and (stale := compensator.idle(time.monotonic())) and not readings:
-                put(stale)
+        while (readings := source.read(timeout_s())) is not None:
+            if (
+                source.live
+                and (stale := compensator.stale_output(time.monotonic()))
+                and not readings
+            ):
+                write(stale)
             for reading in readings:
                 out = compensator.step(reading, time.monotonic() if source.live else reading.t)
-                put(out)
+                write(out)
                 if changes is not None:
                     changes.take(reading, out.flags)
-                if compensator.rested >= tare_at:
-                    tare_at = np.inf
-                    say(f"tare {compensator.tare()}")
+                if compensator.good_count >= tare_count:
+                    tare_count = np.inf
+                    report(f"tare {compensator.tare()}")
             if control is not None:
                 control.answer(compensator.tare)
     return counts
@@ -110,50 +112,29 @@ def compensate_command(
     *,
     sigma: float = 0.0,
     gamma: float = 1.0,
-    rate_hz: float | None = None,
+    cutoff_hz: float | None = 30.0,
     largest: tuple[float, float] | None = None,
     predicted: bool = False,
     tare: bool = False,
     watch: bool = False,
     free: Path | None = None,
     control: int | None = None,
-    real_time: bool = False,
-    cutoff_hz: float | None = 30.0,
-    delay: str | float = "auto",
-    motion: str | None = None,
-    sensor_pose: tuple[float, ...] | None = None,
-    arm: SensorPoseOfJoints | None = None,
+    **stream: Any,
 ) -> None:
-    """The command `compensate`; what there is to know goes to stderr.
+    """Run the command `compensate`; messages go to stderr.
 
     Args:
-        source, sink, rate_hz, real_time, delay, motion, sensor_pose: see `source_of` and `sink_of`.
-        load: identification.json.
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
-        largest: the sensor's range [N], [N m].
-        tare: at the start.
-        watch: for contact and another load, see `drake_teleop.robots.watch`; a tare or a grasp is
-            reported with its time, see `drake_teleop.robots.changes`.
-        free: log of free motion, whose noise floor contact is told by, see `Detector`.
+        largest: range of the sensor [N], [N m].
+        free: log of free motion, see `Detector`.
         control: port of `Control`.
-        arm: kinematics, if the source delivers joint positions instead of poses.
+        stream: see `open_source`.
 
     Raises:
-        DrakeTeleopError: if one of them cannot be used.
+        DrakeTeleopError: if an argument cannot be used.
     """
     found = Identification.load(load)
-    readings = source_of(
-        source,
-        found,
-        rate_hz=rate_hz,
-        cutoff_hz=cutoff_hz,
-        delay=delay,
-        real_time=real_time,
-        motion=motion,
-        sensor_pose=sensor_pose,
-        arm=arm,
-    )
-    limits: Array | None = None if largest is None else np.repeat(largest, 3)
+    readings = open_source(source, found, cutoff_hz=cutoff_hz, **stream)
     compensator = Compensator(
         found,
         readings.dt,
@@ -162,34 +143,40 @@ def compensate_command(
         cutoff_hz=cutoff_hz,
         wait=getattr(readings, "wait", 0),
         predicted=predicted,
-        largest=limits,
+        largest=None if largest is None else np.repeat(largest, 3),
         watch=Watch(found, readings.dt, cutoff_hz) if watch else None,
         detector=None if free is None else Detector(found, free, readings.dt, cutoff_hz),
     )
 
-    def say(text: str) -> None:
+    def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
     file = [Path(sink)] if readings.live and is_file(sink) else []
     if earlier := set_aside(*file):
-        say(f"{sink} exists; it is kept in {earlier}")
-    wrenches = sink_of(sink)
-    asked = None if control is None else Control(control)
-    changes = Changes(readings.dt, live=readings.live, say=say) if watch else None
+        report(f"{sink} exists; it is moved to {earlier}")
+    wrenches = open_sink(sink)
+    control_port = None if control is None else Control(control)
+    changes = Changes(readings.dt, live=readings.live, report=report) if watch else None
     late = getattr(readings, "lag_s", 0.0) + (0.0 if predicted else compensator.lag_s)
-    say(f"late by {1e3 * late:.1f} ms")
-    say(f"stale after {1e3 * STALE_S:.0f} ms; what cannot be trusted is zero")
+    report(f"late by {1e3 * late:.1f} ms")
+    report(f"readings are stale after {1e3 * STALE_S:.0f} ms; invalid wrenches are zero")
     if largest is None:
-        say("no --range: nothing says how large a wrench can be, and what is saturated is not seen")
+        report("no --range: saturation of the sensor is not detected")
     try:
         counts = run(
-            readings, compensator, wrenches, control=asked, tare=tare, changes=changes, say=say
+            readings,
+            compensator,
+            wrenches,
+            control=control_port,
+            tare=tare,
+            changes=changes,
+            report=report,
         )
-        say(", ".join(f"{name} {count}" for name, count in counts.items()))
+        report(", ".join(f"{name} {count}" for name, count in counts.items()))
         if isinstance(readings, Assembly):
-            say(f"the motion came {1e3 * readings.delay_s:.1f} ms behind the wrench at the end")
+            report(f"delay of the motion at the end: {1e3 * readings.delay_s:.1f} ms")
     finally:
-        with ExitStack() as last:
-            for each in (wrenches, readings, asked, changes):
+        with ExitStack() as stack:
+            for each in (wrenches, readings, control_port, changes):
                 if each is not None:
-                    last.callback(each.close)
+                    stack.callback(each.close)

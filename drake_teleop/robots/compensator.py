@@ -1,17 +1,10 @@
-"""The wrench without the tool, sample by sample, and nothing where it cannot be trusted.
+"""Contact wrench of each reading; a flagged zero for each invalid reading.
 
-A good reading goes through the kernels of `eliminate --causal`, in their order: elimination, low-
-pass, the wait for a motion that comes later; the result is the same to the last bit. Whatever is
-wrong with a reading makes the wrench zero, with a flag that says what; never the last value. The
-next good one is compensated again. After a fault that lasted `STALE_S`, a restart or a clock that
-was set, the low-pass starts anew, settled, as at the very first.
+Good readings pass the kernels of `eliminate --causal`, with bit-equal results. After a fault of
+`STALE_S` the low-pass restarts in its steady state.
 
-**Clocks.** The source's time t and ours are related by the least now - t so far, which fades by
-`DRIFT`, so that it follows clocks that drift apart. What a reading is later than that is its age;
-what is late for `JUMP_S` is a clock that was set.
-
-**Tare.** The offsets are set to what the last `TARE_S` seconds say, if S rests, the wrench does not
-waver and the offsets are not further off than sensors drift (`tare_limit`): a push is no offset.
+The source's time t is related to our clock by the least (now - t), which rises by `CLOCK_DRIFT`.
+The excess of (now - t) is the age of a reading; if it lasts for `JUMP_S`, the clock was set.
 """
 
 from __future__ import annotations
@@ -25,62 +18,84 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
-from drake_teleop.robots.detector import Detector
-from drake_teleop.robots.live_step import (
+from drake_teleop.robots.compensation_step import (
     AT_RANGE,
     NOT_FINITE,
     TOO_LARGE,
-    clipped,
-    doubts,
-    eliminated_into,
+    clip,
+    eliminate_into,
+    value_problem,
 )
-from drake_teleop.robots.streams import ONLY_SAID, VALUES, Compensated, Flag, Reading
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Flag, Reading
+from drake_teleop.robots.watch import Detector, Watch
 
 STALE_S = 0.05
-"""Age above which there is no wrench [s]."""
+"""Age above which the wrench is zero [s]."""
 JUMP_S = 1.0
-"""Steps of a clock, against the other, that are no lateness [s]."""
-DRIFT = 1e-3
-"""How fast clocks may drift apart [s/s]."""
-RATE_OFF = 0.05
-"""Share by which the rate may be another, over `_RATE_OF` readings, and `_RATE_S`."""
+"""Larger steps between two clocks indicate a clock that was set [s]."""
+CLOCK_DRIFT = 1e-3
+"""Maximum relative drift of two clocks [s/s]."""
+RATE_TOLERANCE = 0.05
+"""Tolerated relative error of the rate, over `_RATE_READINGS` readings and `_RATE_S`."""
 TARE_S = 0.5
-"""How long it has to rest before a tare [s]."""
-_RATE_OF, _RATE_S = 200, 0.4  # readings, [s]: a burst is no rate
-_LATEST = 1e12  # [s]
-_LARGEST = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
-# Whole numbers: what is done with a `Flag` in Python takes a microsecond each time.
+"""Time at rest before a tare [s]."""
+MAX_OFFSET_DRIFT = np.repeat([5.0, 0.25], 3)
+"""Maximum drift of the offsets [N, N m]."""
+_RATE_READINGS, _RATE_S = 200, 0.4  # readings, [s]: longer than a burst
+_MAX_TIME_S = 1e12  # [s]
+_MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
+# Integers, because each operation on a `Flag` takes a microsecond.
 _DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
-_ONLY_SAID, _GAP, _WRONG_RATE = int(ONLY_SAID), int(Flag.GAP), int(Flag.WRONG_RATE)
+_NONZERO_FLAGS, _GAP, _WRONG_RATE = int(NONZERO_FLAGS), int(Flag.GAP), int(Flag.WRONG_RATE)
 _IN_CONTACT = int(Flag.IN_CONTACT)
-_DOUBTS = {NOT_FINITE: Flag.NOT_FINITE, TOO_LARGE: Flag.OUT_OF_RANGE, AT_RANGE: Flag.SATURATED}
-# At rest, rms: specific force [m/s^2], angular velocity [rad/s]; noise of the wrench, as a multiple
-# of what the identification left, and at least [N, N m].
-_MOVED, _TURNING = 0.1, 0.02
-_WAVERS, _WAVERS_LEAST = 4.0, np.repeat([0.1, 0.005], 3)
+_PROBLEM_FLAGS = {
+    NOT_FINITE: Flag.NOT_FINITE,
+    TOO_LARGE: Flag.OUT_OF_RANGE,
+    AT_RANGE: Flag.SATURATED,
+}
+# Maximum rms at rest: specific force [m/s^2], angular velocity [rad/s]; wrench, as a multiple of
+# the residual of the identification, and at least [N, N m].
+_MAX_REST_FORCE, _MAX_REST_RATE = 0.1, 0.02
+_MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
+
+
+class _RateCheck:
+    """Comparison of the measured rate of the readings with the stated one."""
+
+    def __init__(self, dt: float) -> None:
+        self._dt, self._readings = dt, max(_RATE_READINGS, round(_RATE_S / dt))
+        self._start_t, self._start_number = 0.0, 0
+        self.reset()
+
+    def reset(self) -> None:
+        self._count, self._flag = 0, 0
+
+    def flag(self, reading: Reading) -> int:
+        """Return the result of the last complete interval, 0 or `WRONG_RATE`."""
+        if self._count == 0:
+            self._start_t, self._start_number = reading.t, reading.number
+        self._count += 1
+        if self._count > self._readings:
+            spacing = (reading.t - self._start_t) / max(1, reading.number - self._start_number)
+            wrong = abs(spacing / self._dt - 1.0) > RATE_TOLERANCE
+            self._flag, self._count = _WRONG_RATE if wrong else 0, 0
+        return self._flag
 
 
 class Compensator:
-    """From readings to wrenches (module docstring).
+    """Conversion of readings to wrenches.
 
     Args:
-        load: what is eliminated.
-        dt: between readings [s].
-        sigma, gamma: scales of the load's wrench and of the contact in what is called scaled.
-        cutoff_hz: of the low-pass; None for none.
-        wait: readings that a motion comes behind the wrench, already brought together by the
-            source; what comes out is late by as many.
+        sigma, gamma: scales of load wrench and contact wrench in the scaled wrench.
+        wait: readings by which the motion comes late, already aligned by the source.
         predicted: extrapolate over wait and low-pass.
-        largest: (6,) the sensor's range [N, N m].
-        watch: says of each good reading whether something is touched, or it is another load.
-        detector: says of each whether something is touched, instead of `watch`.
-        tare_limit: how far offsets may drift [N], [N m].
+        largest: (6,) range of the sensor [N, N m].
+        detector: flags contact instead of `watch`.
 
     Attributes:
         offsets: (6,) of the sensor [N, N m].
-        lag_s: by how much a slow contact comes late, or would without the prediction [s].
-        rested: good readings in a row.
+        lag_s: delay of a slow contact without prediction [s].
+        good_count: number of successive good readings.
     """
 
     def __init__(
@@ -96,9 +111,8 @@ class Compensator:
         largest: Array | None = None,
         watch: Watch | None = None,
         detector: Detector | None = None,
-        tare_limit: tuple[float, float] = (5.0, 0.25),
     ) -> None:
-        self._phi, self._nothing = usable_phi(load)[0], np.zeros(10)
+        self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
         self._scales, self._dt = np.array([sigma, sigma, gamma], float), dt
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
@@ -107,152 +121,143 @@ class Compensator:
             b, a, settled = low_pass_coefficients(dt, cutoff_hz, self.lag_s if predicted else 0.0)
             self._low_pass = np.concatenate([b, a[1:], settled])
         self._range = np.full(6, np.inf) if largest is None else np.array(largest, float)
-        self._largest = np.concatenate([np.minimum(_LARGEST[:6], 2.0 * self._range), _LARGEST[6:]])
-        self._wavers = np.maximum(_WAVERS * load.residual_rms, _WAVERS_LEAST)
-        self._tare_limit = np.repeat(tare_limit, 3)
+        self._largest = np.concatenate(
+            [np.minimum(_MAX_VALUES[:6], 2.0 * self._range), _MAX_VALUES[6:]]
+        )
+        self._noise_limit = np.maximum(_MAX_NOISE_RATIO * load.residual_rms, _MIN_NOISE_LIMIT)
         self._memory = np.full((2, 12), np.nan)
-        self._late: deque[Array] = deque(maxlen=wait + 1)
+        self._delay_line: deque[Array] = deque(maxlen=wait + 1)
         self._number, self._t, self._now = -1, 0.0, -math.inf
-        self._offset = math.inf  # the least now - t
-        self._in_time = -math.inf  # when the last one came that was not late
-        self._since, self._first, self._readings, self._rate_off = 0.0, 0, 0, 0
-        self._rate_of = max(_RATE_OF, round(_RATE_S / dt))
-        self._rest = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
-        self.rested = 0
-        # What is compiled is loaded now: the first readings would be stale before they are judged.
-        doubts(np.zeros(VALUES), self._largest, self._range)
-        clipped(self._eliminated(np.zeros(VALUES)), self._range)
-        self._settle_anew()
-        self.rested = 0
+        self._min_offset = math.inf  # least (now - t)
+        self._last_in_time = -math.inf  # arrival of the last reading in time
+        self._rate = _RateCheck(dt)
+        self._tare_rows = np.zeros((max(2, round(TARE_S / dt)), VALUES + 6))
+        self.good_count = 0
+        # Load compiled code now; otherwise the first readings would be stale.
+        value_problem(np.zeros(VALUES), self._largest, self._range)
+        clip(self._eliminate(np.zeros(VALUES)), self._range)
+        self._reset_filters()
+        self.good_count = 0
 
     def step(self, reading: Reading, now: float) -> Compensated:
-        """Takes a reading that came at `now` [s], of a clock that never goes back."""
-        flags = self._judge(reading, now)
-        wrong = flags & ~_ONLY_SAID
-        if wrong & ~_GAP:
+        """Return the output for a reading received at `now` of a monotonic clock."""
+        flags = self._reading_flags(reading, now)
+        invalid = flags & ~_NONZERO_FLAGS
+        if invalid & ~_GAP:
             return self._zero(flags)
         if now - self._now > STALE_S:
-            self._settle_anew()
+            self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
-        self._late.append(self._eliminated(reading.values))
-        if wrong:
+        self._delay_line.append(self._eliminate(reading.values))
+        if invalid:
             return self._zero(flags)
         if self._watch is not None:
             flags |= self._watch.flags(reading.values)
         if self._detector is not None:
             flags &= ~_IN_CONTACT
-            flags |= self._detector.flags(reading.values, self._late[-1][:6])
-        wrench = self._late[0].copy()
-        if clipped(wrench, self._range):
+            flags |= self._detector.flags(reading.values, self._delay_line[-1][:6])
+        wrench = self._delay_line[0].copy()
+        if clip(wrench, self._range):
             flags |= _CLIPPED
         return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
-    def idle(self, now: float) -> Compensated | None:
-        """What to say when nothing comes: nothing at first, then that it is stale."""
+    def stale_output(self, now: float) -> Compensated | None:
+        """Return a stale zero wrench if nothing came for `STALE_S`, else None."""
         if now - self._now <= STALE_S:
             return None
         return self._zero(_STALE)
 
-    def left(self, now: float) -> float:
-        """How long the last reading is not stale yet [s]."""
+    def time_to_stale(self, now: float) -> float:
+        """Return the time until the last reading is stale [s]."""
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
-        """Sets the offsets; what it did, or why it did not: "refused: ..."."""
-        if self.rested < len(self._rest):
-            return f"refused: there are not {TARE_S:g} s of good readings yet"
-        spread = self._rest.std(axis=0)
-        turning = float(np.abs(self._rest[:, 9:12]).mean(axis=0).max())
-        if spread[6:9].max() > _MOVED or turning > _TURNING:
-            return "refused: it moves"
-        if (spread[VALUES:] > self._wavers).any():
-            return "refused: the wrench wavers, as in contact"
-        step = self._rest[:, VALUES:].mean(axis=0)
-        if (np.abs(step) > self._tare_limit).any():
+        """Set the offsets to their mean in `TARE_S`; return the result or why it is refused."""
+        if self.good_count < len(self._tare_rows):
+            return f"refused: fewer than {TARE_S:g} s of good readings so far"
+        spread = self._tare_rows.std(axis=0)
+        turning = float(np.abs(self._tare_rows[:, 9:12]).mean(axis=0).max())
+        if spread[6:9].max() > _MAX_REST_FORCE or turning > _MAX_REST_RATE:
+            return "refused: the sensor moves"
+        if (spread[VALUES:] > self._noise_limit).any():
+            return "refused: the wrench varies, as in contact"
+        step = self._tare_rows[:, VALUES:].mean(axis=0)
+        if (np.abs(step) > MAX_OFFSET_DRIFT).any():
             force, torque = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
             return (
-                f"refused: {force:.3g} N and {torque:.3g} N m are more than offsets drift:"
-                " something is touched, or it is another load"
+                f"refused: {force:.3g} N and {torque:.3g} N m exceed the drift of offsets:"
+                " contact, or another load"
             )
         self.offsets = self.offsets + step
         if self._watch is not None:
             self._watch.restart(self.offsets)
         if self._detector is not None:
             self._detector.restart()
-        self.rested = 0
+        self.good_count = 0
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
-    def _judge(self, reading: Reading, now: float) -> int:
-        """The reading's flags; keeps the clocks."""
+    def _reading_flags(self, reading: Reading, now: float) -> int:
+        """Return the flags of a reading and update the clocks."""
         flags = reading.flags
         if flags & _DAMAGED:
             return _DAMAGED
-        doubt = doubts(reading.values, self._largest, self._range)
+        problem = value_problem(reading.values, self._largest, self._range)
         if not math.isfinite(reading.t):
-            doubt = NOT_FINITE
-        elif abs(reading.t) > _LATEST and doubt != NOT_FINITE:
-            doubt = TOO_LARGE
-        if doubt:
-            flags |= int(_DOUBTS[doubt])
-        if doubt in (NOT_FINITE, TOO_LARGE):
+            problem = NOT_FINITE
+        elif abs(reading.t) > _MAX_TIME_S and problem != NOT_FINITE:
+            problem = TOO_LARGE
+        if problem:
+            flags |= int(_PROBLEM_FLAGS[problem])
+        if problem in (NOT_FINITE, TOO_LARGE):
             return flags
         ahead = now - reading.t
-        known = not math.isinf(self._offset)
+        started = not math.isinf(self._min_offset)
         step = reading.t - self._t
-        # What is out of order comes between what is not; if nothing else comes, it is the order.
+        # Out-of-order readings are mixed with ordered ones; only such readings mean a restart.
         lost = now - self._now > STALE_S
-        if known and reading.number <= self._number and (abs(step) > JUMP_S or lost):
-            return self._anew(reading, ahead, flags | int(Flag.RESTART))
-        if known and (abs(ahead - self._offset) > JUMP_S or (step <= 0.0 and lost)):
-            return self._anew(reading, ahead, flags | int(Flag.CLOCK_JUMP))
-        if known and step <= 0.0:
+        if started and reading.number <= self._number and (abs(step) > JUMP_S or lost):
+            return self._restart_clock(reading, ahead, flags | int(Flag.RESTART))
+        if started and (abs(ahead - self._min_offset) > JUMP_S or (step <= 0.0 and lost)):
+            return self._restart_clock(reading, ahead, flags | int(Flag.CLOCK_JUMP))
+        if started and step <= 0.0:
             return flags | int(Flag.REORDERED)
-        if known and reading.number <= self._number:
-            return self._anew(reading, ahead, flags | int(Flag.RESTART))
-        self._offset = min(ahead, self._offset + (DRIFT * self._dt if known else 0.0))
-        if ahead - self._offset <= STALE_S:
-            self._in_time = now
-        elif now - self._in_time > JUMP_S:
-            return self._anew(reading, ahead, flags | int(Flag.CLOCK_JUMP))
+        if started and reading.number <= self._number:
+            return self._restart_clock(reading, ahead, flags | int(Flag.RESTART))
+        drift = CLOCK_DRIFT * self._dt if started else 0.0
+        self._min_offset = min(ahead, self._min_offset + drift)
+        if ahead - self._min_offset <= STALE_S:
+            self._last_in_time = now
+        elif now - self._last_in_time > JUMP_S:
+            return self._restart_clock(reading, ahead, flags | int(Flag.CLOCK_JUMP))
         else:
             flags |= _STALE
-        return flags | self._rate(reading)
+        return flags | self._rate.flag(reading)
 
-    def _anew(self, reading: Reading, ahead: float, flags: int) -> int:
-        """Believes the clock from here on."""
-        self._offset, self._number, self._t = ahead, reading.number, reading.t
-        self._readings, self._rate_off, self.rested = 0, 0, 0
-        self._now = self._in_time = reading.t + ahead
-        self._settle_anew()
+    def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
+        """Accept the clock of this reading and restart."""
+        self._min_offset, self._number, self._t = ahead, reading.number, reading.t
+        self._rate.reset()
+        self.good_count = 0
+        self._now = self._last_in_time = reading.t + ahead
+        self._reset_filters()
         return flags
 
-    def _settle_anew(self) -> None:
+    def _reset_filters(self) -> None:
         self._memory[:] = np.nan
         if self._detector is not None:
             self._detector.restart()
-        self._late.clear()
+        self._delay_line.clear()
 
-    def _rate(self, reading: Reading) -> int:
-        """Whether the rate is the stated one, over a while."""
-        if self._readings == 0:
-            self._since, self._first = reading.t, reading.number
-        self._readings += 1
-        if self._readings > self._rate_of:
-            spacing = (reading.t - self._since) / max(1, reading.number - self._first)
-            off = abs(spacing / self._dt - 1.0) > RATE_OFF
-            self._rate_off, self._readings = _WRONG_RATE if off else 0, 0
-        return self._rate_off
-
-    def _eliminated(self, values: Array) -> Array:
-        """(12,) contact and scaled, behind the low-pass; keeps what a tare wants to know."""
+    def _eliminate(self, values: Array) -> Array:
+        """Return low-passed contact and scaled wrench (12,)."""
         out = np.empty(12)
-        at = self.rested % len(self._rest)
-        load = self._phi, self._nothing, self._scales
-        kept = self._low_pass, self._memory, self._rest, at
-        eliminated_into(values, self.offsets, *load, *kept, out)
-        self.rested += 1
+        at = self.good_count % len(self._tare_rows)
+        phi, zero, scales = self._phi, self._zero_phi, self._scales
+        filters = self._low_pass, self._memory
+        eliminate_into(values, self.offsets, phi, zero, scales, *filters, self._tare_rows, at, out)
+        self.good_count += 1
         return out
 
     def _zero(self, flags: int) -> Compensated:
-        self.rested = 0
+        self.good_count = 0
         return Compensated(max(0, self._number), self._t, np.zeros(6), np.zeros(6), int(flags))

@@ -1,35 +1,10 @@
-"""An identified load in the format of a robot, of a compensation, or of a model.
-
-**Frames.** Robots and models want the load about a frame of theirs, the flange say; X_FS places the
-sensor in it. Compensations work in the sensor's frame.
-
-**Signs.** `Identification.offsets` are those of the wrench that the sensor exerts on the load. What
-a compensation subtracts is in the sensor's own sign, which for most is the opposite: what the load
-exerts on the sensor, `sign: -1` in a log description.
-
-**Sources.** Of the formats, as read in November 2026; none was tried on the real thing here:
-
-=============== ================================================================================
-ur              URScript manual, `set_target_payload(m, cog, inertia)`; the order of the six as in
-                ur_msgs/SetPayload: xx, yy, zz, xy, xz, yz, about the centre, axes of the flange
-franka          endeffector-config.json of Desk (frankarobotics/external_gripper_example): inertia
-                about the centre, 3 x 3 by columns; transformation of the flange, 4 x 4 by columns
-xarm            xArm-Python-SDK, `set_tcp_load(kg, [mm])`
-kth             kth-ros-pkg/force_torque_tools, gravity_compensation/config
-ft_tools        tpoignonec/ft_tools_ros2, FtParameters: reading = R^T m g + offset
-ros2-admittance ros2_controllers, admittance_controller: gravity_compensation
-bota            bota-payload-utils 1.0.3, payload_compensator_config; whether its inertia is about
-                the centre or about the sensor it does not say: the centre's is written
-urdf, sdf, mjcf a link, a model, a body with this inertia, on the frame F
-=============== ================================================================================
-"""
+"""An identified load in the format of a robot, of a compensation, or of a model."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -41,18 +16,17 @@ from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi
 
-STANDARD_GRAVITY = 9.80665  #: m/s^2, for a weight in N
+STANDARD_GRAVITY = 9.80665  #: m/s^2
 
 
 @dataclass(frozen=True)
 class Load:
-    """What a format is written from, in SI.
+    """Values for a format, in SI.
 
     Args:
-        mass: [kg].
-        com: (3,) centre of mass in the frame of the values [m].
-        inertia: (3, 3) about that centre, axes of that frame [kg m^2].
-        offsets: (6,) of the sensor, in its frame and sign [N, N m].
+        com: (3,) centre of mass in the frame F of the values [m].
+        inertia: (3, 3) about the centre of mass, in F [kg m^2].
+        offsets: (6,) in the sensor's frame and sign [N, N m].
     """
 
     mass: float
@@ -69,15 +43,13 @@ class Load:
 
 @dataclass(frozen=True)
 class Format:
-    """One target.
+    """Export format.
 
     Args:
-        write: the text of a load.
-        of_sensor: its values are in the sensor's frame, whatever it is mounted on.
-        inertia, offsets: whether it takes them.
-        body: it is read as a body, so that there has to be one with these values.
-        comment: what a comment's line begins with; empty if there are none.
-        note: what to know of it besides.
+        of_sensor: the values are in the sensor's frame.
+        inertia, offsets: whether the format contains them.
+        body: the target requires a physically consistent body.
+        comment: prefix of a comment line; "" for none.
     """
 
     write: Callable[[Load], str]
@@ -93,30 +65,23 @@ def export(
     found: Identification,
     to: str,
     *,
-    R_FS: Array | None = None,
-    p_FoSo_F: Array | None = None,
+    sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
-    """The text for a target, and what to know before it is entered.
+    """Return the text for a target of `FORMATS`, and warnings of dropped and unidentified values.
 
     Args:
-        found: the load.
-        to: one of `FORMATS`.
-        R_FS, p_FoSo_F: (3, 3) and (3,) orientation and place [m] of the sensor in the frame F that
-            the target's values are in; None: F is S.
-        sign: -1 if the sensor reports what the load exerts on it, as most do, else 1.
-
-    Returns:
-        text: with the warnings as comments, if the format has any.
-        warnings: what the target drops, and which of its values are not identified.
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the values,
+            as in a URDF; None: F is S.
+        sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
 
     Raises:
-        DrakeTeleopError: for an unknown target, a pose that the target has no use for, or a load
-            that no body has for a target that is read as one.
+        DrakeTeleopError: for an unknown target, a pose for a target in the sensor's frame, or an
+            inconsistent load for a target that requires a body.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(
-            f"{to!r} is no target", where="export", remedy=f"one of {', '.join(FORMATS)}"
+            f"{to!r} is not a target", where="export", remedy=f"one of {', '.join(FORMATS)}"
         )
     format = FORMATS[to]
     if found.weight_removed and format.of_sensor:
@@ -126,23 +91,21 @@ def export(
             where="export",
             remedy="use a wrench without the robot's payload compensation, or `compensate`",
         )
-    moved = R_FS is not None or p_FoSo_F is not None
-    if moved and format.of_sensor:
+    if sensor_pose is not None and format.of_sensor:
         raise DrakeTeleopError(
             f"{to} takes its values in the sensor's frame",
             where="export",
-            remedy="leave out the sensor's pose",
+            remedy="remove the sensor's pose",
         )
-    phi = transform_phi(
-        found.phi,
-        np.eye(3) if R_FS is None else R_FS,
-        np.zeros(3) if p_FoSo_F is None else p_FoSo_F,
-    )
+    R_FS, p_FoSo_F = np.eye(3), np.zeros(3)
+    if sensor_pose is not None:
+        R_FS, p_FoSo_F = rotation_rpy(sensor_pose[3:]), np.array(sensor_pose[:3])
+    phi = transform_phi(found.phi, R_FS, p_FoSo_F)
     if found.mass <= 0.0 or (format.body and not is_physically_consistent(phi)):
         raise DrakeTeleopError(
-            f"no body has these values (mass {found.mass:.4g} kg), and {to} describes one",
+            f"the load is not physically consistent (mass {found.mass:.4g} kg), as {to} requires",
             where="export",
-            remedy="`identify --method consistent` finds the nearest body; a negative mass means"
+            remedy="use `identify --method consistent`; a negative mass means"
             " that the sign of the wrench is wrong",
         )
     load = Load(*mass_com_inertia(phi), sign * found.offsets)
@@ -151,31 +114,8 @@ def export(
     return notes + format.write(load), warnings
 
 
-def export_command(
-    identification: Path, to: str, sensor_pose: tuple[float, ...] | None, sign: int
-) -> tuple[str, list[str]]:
-    """The command `export`: the text and the warnings, see `export`.
-
-    Args:
-        identification: an identification.json.
-        to: one of `FORMATS`.
-        sensor_pose: x, y, z [m] of the sensor in the frame of the values, and its roll, pitch, yaw
-            [deg] about that frame's fixed axes, as in a URDF; None: the sensor's own frame.
-        sign: as for `export`.
-
-    Raises:
-        DrakeTeleopError: as `Identification.load` and `export`.
-    """
-    found = Identification.load(identification)
-    if sensor_pose is None:
-        return export(found, to, sign=sign)
-    roll, pitch, yaw = np.radians(sensor_pose[3:])
-    R_FS = turn(2, yaw) @ turn(1, pitch) @ turn(0, roll)
-    return export(found, to, R_FS=R_FS, p_FoSo_F=np.array(sensor_pose[:3]), sign=sign)
-
-
-def turn(axis: int, angle: float) -> Array:
-    """(3, 3) rotation about the axis 0, 1 or 2 [rad]."""
+def _rotation_about(axis: int, angle: float) -> Array:
+    """Return the rotation matrix about the axis 0, 1 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
     R[i, i] = R[j, j] = np.cos(angle)
@@ -184,26 +124,31 @@ def turn(axis: int, angle: float) -> Array:
     return R
 
 
+def rotation_rpy(angles: Sequence[float]) -> Array:
+    """Return the rotation matrix of roll, pitch, yaw [deg] about fixed axes, as in a URDF."""
+    roll, pitch, yaw = np.radians(angles)
+    return _rotation_about(2, yaw) @ _rotation_about(1, pitch) @ _rotation_about(0, roll)
+
+
 def _warnings(found: Identification, to: str, format: Format) -> list[str]:
-    taken = {name: name.startswith(("m", "I")) for name in PARAMETERS}
-    taken |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
-    taken |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
+    written = {name: name.startswith(("m", "I")) for name in PARAMETERS}
+    written |= {name: format.inertia for name in PARAMETERS if name.startswith("I")}
+    written |= {name: format.offsets for name in PARAMETERS if name.endswith(("_ox", "_oy", "_oz"))}
     warnings = [
-        f"{name} is not identified ({verdict}): do not enter what depends on it"
+        f"{name} is not identified ({verdict}): do not use values that depend on it"
         for name, verdict in zip(PARAMETERS, found.verdicts, strict=True)
-        if taken[name] and verdict != "identified"
+        if written[name] and verdict != "identified"
     ]
     if not format.inertia:
-        warnings.append(f"{to} has no place for the inertia: what it causes in motion stays")
+        warnings.append(f"{to} has no field for the inertia: inertial wrenches remain")
     if not found.physically_consistent:
         warnings.append(
-            "no body has these values: `identify --method consistent` finds the nearest"
+            "the load is not physically consistent; `identify --method consistent` corrects it"
         )
     return [*warnings, format.note] if format.note else warnings
 
 
 def _number(value: float) -> str:
-    """All digits that matter; no exponent's capital, no -0."""
     return repr(float(value) + 0.0)
 
 
@@ -322,12 +267,12 @@ def _json(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2) + "\n"
 
 
-_FRAME = "ft_sensor stands for the name of your sensor's frame"
+_FRAME_NOTE = "replace ft_sensor by the name of your sensor's frame"
 
 FORMATS = {
     "ur": Format(_ur, comment="#"),
     "franka": Format(
-        _franka, note="transformation is the flange itself: put in that of your end effector"
+        _franka, note="transformation is the identity: replace it by that of your end effector"
     ),
     "xarm": Format(_xarm, inertia=False, comment="#"),
     "kth": Format(
@@ -336,19 +281,21 @@ FORMATS = {
         inertia=False,
         offsets=True,
         comment="#",
-        note=f"{_FRAME}; the weight is the mass times what an IMU reads: if the compensated force"
-        " is twice the weight, turn the sign of the mass round",
+        note=f"{_FRAME_NOTE}; the weight is the mass times the reading of an IMU: if the"
+        " compensated force is twice the weight, change the sign of the mass",
     ),
     "ft_tools": Format(_ft_tools, of_sensor=True, inertia=False, offsets=True, comment="#"),
-    "ros2-admittance": Format(_admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME),
+    "ros2-admittance": Format(
+        _admittance, of_sensor=True, inertia=False, comment="#", note=_FRAME_NOTE
+    ),
     "bota": Format(
         _bota,
         of_sensor=True,
         offsets=True,
-        note="the inertia is about the centre of mass; Bota does not say about which point it is",
+        note="the inertia is about the centre of mass; Bota does not document the reference point",
     ),
     "urdf": Format(_urdf, body=True),
     "sdf": Format(_sdf, body=True),
     "mjcf": Format(_mjcf, body=True),
 }
-"""What `export` writes, by the name of the target."""
+"""Export formats by name."""

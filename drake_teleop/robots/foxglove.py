@@ -1,20 +1,15 @@
-"""Wrenches for Foxglove: live in its window, or in an MCAP file, by the library foxglove-sdk.
-
-Both have one topic, `/wrench`, of JSON: number and t of the reading, contact and scaled by name,
-and the flags.
-"""
+"""Wrenches for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.writing import make_folder, naming
 from drake_teleop.logs.read.canonical import WRENCH
-from drake_teleop.robots.lines import names_of
+from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated
 from drake_teleop.robots.udp import endpoint
 
@@ -36,19 +31,14 @@ _SCHEMA = {
 
 class _Channel:
     def __init__(self, where: str) -> None:
-        if importlib.util.find_spec("foxglove") is None:
-            raise DrakeTeleopError(
-                "is written by the library foxglove-sdk, which is not installed",
-                where=where,
-                remedy=install_extra("robots"),
-            )
+        require_library("foxglove", "foxglove-sdk", "robots", where)
         import foxglove
 
         self.context = foxglove.Context()
         self._channel = foxglove.Channel(TOPIC, schema=_SCHEMA, context=self.context)
 
     def log(self, out: Compensated, ns: int | None) -> None:
-        data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": names_of(out.flags)}
+        data: dict[str, Any] = {"number": out.number, "t": out.t, "flags": flag_names(out.flags)}
         for name, wrench in (("contact", out.contact), ("scaled", out.scaled)):
             data[name] = dict(zip(WRENCH, wrench.tolist(), strict=True))
         self._channel.log(json.dumps(data).encode(), log_time=ns)
@@ -58,11 +48,7 @@ class _Channel:
 
 
 class FoxgloveSink:
-    """Live at foxglove://[HOST][:PORT]: whoever connects there sees them, now by our clock.
-
-    Raises:
-        DrakeTeleopError: if foxglove-sdk is missing, or the address is taken.
-    """
+    """Live server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
         host, port = endpoint(address, PORT)
@@ -88,11 +74,7 @@ class FoxgloveSink:
 
 
 class McapSink:
-    """Into a file, as they come, at the times of the readings.
-
-    Raises:
-        DrakeTeleopError: if foxglove-sdk is missing, or the file cannot be written.
-    """
+    """MCAP file, written continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
         self._channel = _Channel(str(path))

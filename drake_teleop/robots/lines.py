@@ -1,7 +1,7 @@
-"""Readings and wrenches as lines of JSON, one object each.
+"""Readings and wrenches as lines of JSON.
 
-In: t [s], wrench (6), s, omega, alpha (3 each); number and saturated may be left out. Out: number,
-t, contact and scaled (6 each), and flags as a list of names.
+Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
+number, t, contact and scaled (6 each), and names of flags.
 """
 
 from __future__ import annotations
@@ -13,20 +13,15 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading
+from drake_teleop.robots.streams import DAMAGED, VALUES, Compensated, Flag, Reading, Sink, Source
 
-_LONGEST = 4096  # bytes of a line
-_BLOCK = 65536
+_MAX_LINE_BYTES = 4096  # bytes per line
+_BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """The reading in a line, `DAMAGED` if it is none. It never raises.
-
-    Args:
-        line: without its end.
-        number: of the reading, if the line has none.
-    """
-    if len(line) > _LONGEST:
+    """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default."""
+    if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:
         data = json.loads(line)
@@ -40,42 +35,42 @@ def read_line(line: bytes, number: int) -> Reading:
     return Reading(number, t, values, flags) if good and 0 <= number < 2**64 else DAMAGED
 
 
-def written_line(out: Compensated) -> str:
-    """The line of a wrench, without its end."""
+def wrench_line(out: Compensated) -> str:
+    """Return the line of a wrench."""
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
         "contact": out.contact.tolist(),
         "scaled": out.scaled.tolist(),
-        "flags": names_of(out.flags),
+        "flags": flag_names(out.flags),
     }
     return json.dumps(data)
 
 
-def names_of(flags: int) -> list[str]:
-    """What the bits say, as in "out of range"."""
+def flag_names(flags: int) -> list[str]:
+    """Return the names of the set flags, such as "out of range"."""
     return [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & flags]
 
 
-class LineSource:
-    """Readings from a file that is being written, such as standard input."""
+class LineSource(Source[Reading]):
+    """Readings from a growing file, such as standard input."""
 
     live = True
 
     def __init__(self, file: int, dt: float) -> None:
-        self.dt, self._file, self._rest, self._number, self._over = dt, file, b"", 0, False
+        self.dt, self._file, self._partial, self._number, self._ended = dt, file, b"", 0, False
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        if self._over:
+        if self._ended:
             return None
         if not select.select([self._file], [], [], timeout_s)[0]:
             return []
-        block = os.read(self._file, _BLOCK)
-        self._over = not block
-        *lines, self._rest = (self._rest + block).split(b"\n")
-        if self._over or len(self._rest) > _LONGEST:
-            lines, self._rest = [*lines, self._rest], b""
+        block = os.read(self._file, _BLOCK_BYTES)
+        self._ended = not block
+        *lines, self._partial = (self._partial + block).split(b"\n")
+        if self._ended or len(self._partial) > _MAX_LINE_BYTES:
+            lines, self._partial = [*lines, self._partial], b""
         found = []
         for line in lines:
             if line.strip():
@@ -83,20 +78,14 @@ class LineSource:
                 self._number += 1
         return found
 
-    def close(self) -> None:
-        """See `Source`."""
 
-
-class LineSink:
-    """Wrenches into a text file, such as standard output, at once."""
+class LineSink(Sink):
+    """Unbuffered lines in a text file, such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file
 
     def write(self, out: Compensated) -> None:
         """See `Sink`."""
-        self._file.write(written_line(out) + "\n")
+        self._file.write(wrench_line(out) + "\n")
         self._file.flush()
-
-    def close(self) -> None:
-        """See `Sink`."""

@@ -1,13 +1,7 @@
-"""ATI's Net F/T, and OnRobot's sensors that speak it: RDT, raw data transfer over UDP.
+"""Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP.
 
-A request of 8 bytes starts the stream, records of 36 come until another stops it; both are
-big-endian. A record has its number in the stream (rdt_sequence), the number of the measurement
-(ft_sequence), a status, and six whole numbers, counts of force and torque. It has no time: `Pace`
-makes one of the number. Counts, units and rate are read once from the box's page netftapi2.xml,
-unless the address says them.
-
-The stream is asked for again whenever nothing has come for a while, so that it goes on after the
-box was off. It is of the box that was named: the socket is connected.
+A request of 8 bytes starts the stream of records of 36 bytes, both big-endian. It is repeated after
+a silence, so that the stream resumes after a restart of the box.
 """
 
 from __future__ import annotations
@@ -23,19 +17,18 @@ import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.pace import Pace
-from drake_teleop.robots.streams import WRENCH, Flag, Part
+from drake_teleop.robots.streams import DAMAGED_WRENCH, WRENCH, Flag, Part
 
 PORT = 49152
 REQUEST = struct.Struct(">HHI")
 RECORD = struct.Struct(">III6i")
 START, STOP = 2, 0
 _HEADER = 0x1234
-_SATURATED, _ERROR = 1 << 17, 1 << 31  # of the status
-_ASK_AGAIN_S, _FROZEN_S = 0.1, 0.05
-_MOST = 256  # records at once
-_PAGE_S, _PAGE_BYTES = 2.0, 1 << 20
-# What a unit of the box's page is in N or N m.
+_SATURATED, _ERROR = 1 << 17, 1 << 31  # bits of the status
+_REQUEST_PERIOD_S, _MAX_UNCHANGED_S = 0.1, 0.05
+_MAX_RECORDS = 256  # records per call
+_PAGE_TIMEOUT_S, _MAX_PAGE_BYTES = 2.0, 1 << 20
+# Units of the box's page in N or N m.
 _UNITS = {
     "lbf": 4.4482216152605, "N": 1.0, "klbf": 4448.2216152605, "kN": 1e3,
     "kgf": 9.80665, "gf": 9.80665e-3,
@@ -45,7 +38,7 @@ _UNITS = {
 
 
 class Record(NamedTuple):
-    """A record as it comes."""
+    """RDT record."""
 
     rdt_sequence: int
     ft_sequence: int
@@ -53,8 +46,8 @@ class Record(NamedTuple):
     counts: tuple[int, ...]
 
 
-def unpacked_record(packet: bytes) -> Record | None:
-    """The record in a packet; None if it is none. It never raises."""
+def unpack_record(packet: bytes) -> Record | None:
+    """Return the record in a packet, None if it is invalid."""
     if len(packet) != RECORD.size:
         return None
     rdt, ft, status, *counts = RECORD.unpack(packet)
@@ -62,63 +55,58 @@ def unpacked_record(packet: bytes) -> Record | None:
 
 
 class NetFtSource:
-    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1].
-
-    Args:
-        address: counts are those of 1 N and 1 N m; sign -1, the default, is for a sensor that tells
-            what the load exerts on it.
-        dt: between records, if the address does not say it [s].
+    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
 
     Raises:
-        DrakeTeleopError: if the address cannot be used, or the box's page cannot be had.
+        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the box cannot be read.
     """
 
     streams: tuple[str, ...] = (WRENCH,)
 
     def __init__(self, address: str, dt: float | None = None) -> None:
-        told = Address(address, PORT, known=("counts", "rate", "sign"))
-        counts, rate = told.numbers("counts", 2), told.numbers("rate", 1)
-        sign = told.sign()
+        parsed = Address(address, PORT, allowed=("counts", "rate", "sign"))
+        counts, rate = parsed.numbers("counts", 2), parsed.numbers("rate", 1)
+        sign = parsed.sign()
         if rate is None and dt is not None:
             rate = [1.0 / dt]
         if counts is None or rate is None:
-            page = _page(told)
+            page = _read_page(parsed)
             counts = counts or page[:2]
             rate = rate or page[2:]
         self.dt = 1.0 / rate[0]
         self._per_count = sign / np.repeat(counts, 3)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._socket.connect((told.host, told.port))
+            self._socket.connect((parsed.host, parsed.port))
         except OSError as error:
             self._socket.close()
             raise DrakeTeleopError(str(error), where=address) from error
-        self._pace, self._number = Pace(self.dt), 0
-        self._heard = self._asked = -math.inf
+        self._pace, self._number = SampleClock(self.dt), 0
+        self._last_received = self._last_request = -math.inf
         self._measured, self._measured_at = -1, -math.inf
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
-        self._ask()
+        """See `PartSource`."""
+        self._request_stream()
         found: list[Part] = []
         self._socket.settimeout(timeout_s)
         try:
-            while len(found) < _MOST:
+            while len(found) < _MAX_RECORDS:
                 packet = self._socket.recv(RECORD.size + 1)
                 found.append(self.part(packet, time.monotonic()))
                 self._socket.settimeout(0.0)
-        except OSError:  # nothing more, or nobody there
+        except OSError:  # no further record, or no box
             pass
         return found
 
     def part(self, packet: bytes, now: float) -> Part:
-        """The wrench in a packet that came at `now`, flagged as damaged if there is none."""
-        record = unpacked_record(packet)
+        """Return the wrench in a packet received at `now`, flagged if it is invalid."""
+        record = unpack_record(packet)
         if record is None:
-            return Part(WRENCH, -1, math.nan, np.full(6, math.nan), int(Flag.DAMAGED))
-        # rdt_sequence has 32 bits: what is less by half of them has begun again from zero.
+            return DAMAGED_WRENCH
+        # rdt_sequence has 32 bits and wraps around.
         self._number += (record.rdt_sequence - self._number + 2**31) % 2**32 - 2**31
-        self._heard = now
+        self._last_received = now
         flags = 0
         if record.status & _SATURATED:
             flags = int(Flag.SATURATED)
@@ -126,37 +114,36 @@ class NetFtSource:
             flags = int(Flag.DAMAGED)
         if record.ft_sequence != self._measured:
             self._measured, self._measured_at = record.ft_sequence, now
-        elif now - self._measured_at > _FROZEN_S:
+        elif now - self._measured_at > _MAX_UNCHANGED_S:
             flags |= int(Flag.STALE)
         t = self._pace.time_of(self._number, now)
         return Part(WRENCH, self._number, t, np.array(record.counts) * self._per_count, flags)
 
-    def _ask(self) -> None:
+    def _request_stream(self) -> None:
         now = time.monotonic()
-        if now - max(self._heard, self._asked) > _ASK_AGAIN_S:
-            self._asked = now
+        if now - max(self._last_received, self._last_request) > _REQUEST_PERIOD_S:
+            self._last_request = now
             self._send(START)
 
     def _send(self, command: int) -> None:
-        with suppress(OSError):  # nobody there yet
+        with suppress(OSError):  # no box yet
             self._socket.send(REQUEST.pack(_HEADER, command, 0))
 
     def close(self) -> None:
-        """See `Source`."""
+        """See `PartSource`."""
         self._send(STOP)
         self._socket.close()
 
 
-def _page(told: Address) -> list[float]:
-    """Counts of 1 N and of 1 N m, and the rate [Hz], as the box says them."""
+def _read_page(address: Address) -> list[float]:
     from http.client import HTTPConnection, HTTPException
 
-    remedy = "or say them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
-    where = f"http://{told.host}/netftapi2.xml"
-    connection = HTTPConnection(told.host, timeout=_PAGE_S)
+    remedy = "or give them: netft://HOST?counts=FORCE,TORQUE&rate=HZ"
+    where = f"http://{address.host}/netftapi2.xml"
+    connection = HTTPConnection(address.host, timeout=_PAGE_TIMEOUT_S)
     try:
         connection.request("GET", "/netftapi2.xml")
-        return page_of(connection.getresponse().read(_PAGE_BYTES))
+        return parse_page(connection.getresponse().read(_MAX_PAGE_BYTES))
     except (OSError, HTTPException, SyntaxError, ValueError, KeyError) as error:
         raise DrakeTeleopError(
             f"counts, units and rate cannot be read ({error!r})", where=where, remedy=remedy
@@ -165,11 +152,11 @@ def _page(told: Address) -> list[float]:
         connection.close()
 
 
-def page_of(content: bytes) -> list[float]:
-    """Counts of 1 N and of 1 N m, and the rate [Hz], as netftapi2.xml says them.
+def parse_page(content: bytes) -> list[float]:
+    """Return counts of 1 N and 1 N m, and rate [Hz], from netftapi2.xml.
 
     Raises:
-        SyntaxError, KeyError, ValueError: if it does not.
+        SyntaxError, KeyError, ValueError: if they are missing or invalid.
     """
     from xml.etree import ElementTree
 
@@ -177,5 +164,41 @@ def page_of(content: bytes) -> list[float]:
     counts = [float(text[f"cfgcp{kind}"]) / _UNITS[text[f"scfg{kind}u"]] for kind in ("f", "t")]
     values = [*counts, float(text["comrdtrate"])]
     if not all(0.0 < value < 1e12 for value in values):
-        raise ValueError("they are no positive numbers")
+        raise ValueError("not positive numbers")
     return values
+
+
+_MIN_SPAN_S, _MAX_SPAN_S = 1.0, 10.0  # span of our clock for measuring the period
+_JUMP_S = 1.0  # a larger step of the number is a restart
+
+
+class SampleClock:
+    """Clock from sample numbers.
+
+    The period is first the stated one, after a second the measured one, so that a wrong stated rate
+    causes no growing delay.
+    """
+
+    def __init__(self, dt: float) -> None:
+        self._dt = self._period = dt
+        self._number, self._t = 0, 0.0
+        self._first: tuple[int, float] | None = None
+
+    def time_of(self, number: int, now: float) -> float:
+        """Return the time of a sample, on its own clock [s].
+
+        Args:
+            number: smaller than before if out of order or after a restart.
+            now: our monotonic clock [s].
+        """
+        step = number - self._number
+        if self._first is None or abs(step) * self._dt > _JUMP_S:
+            self._first = number, now
+        elif now - self._first[1] >= _MIN_SPAN_S and number > self._first[0]:
+            self._period = (now - self._first[1]) / (number - self._first[0])
+            if now - self._first[1] > _MAX_SPAN_S:
+                self._first = number, now
+        t = self._t + step * self._period
+        if step > 0 or self._first == (number, now):
+            self._number, self._t = number, t
+        return t

@@ -1,21 +1,14 @@
-"""What comes from a stream, kept until it is written as a log.
+"""Samples of a stream, collected and written as a log.
 
-Readings make a canonical log. Parts make a table for each stream and a description of them,
-log.yaml: the poses stay as they came, so that `identify` finds the motion, its noise, the delay and
-the drift of the clock as it does of every log, and better than a motion that was differentiated as
-it came. What is damaged, not finite, no pose, or saturated is left out, and so is what comes late.
-A clock that was set begins another part of the record, if `_SET` samples in a row confirm it: fewer
-are wrong stamps, and left out. The longest part is written.
-
-**Clocks.** Streams of one source have one. Those of two are brought together by what each took
-least time for; what is left of that is the delay that is estimated.
+Readings make a canonical log; parts a table for each stream and a description, log.yaml. A set
+clock starts a new part of the record; the longest part is written.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -26,97 +19,79 @@ from drake_teleop.common.writing import write_table, write_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.rotations import rotation_matrices
+from drake_teleop.robots.assembly import Parts
 from drake_teleop.robots.compensator import JUMP_S
-from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.streams import IMU, POSE, VALUES, WRENCH, Flag, Part, Reading
 
-_WRONG = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
+_INVALID_FLAGS = Flag.DAMAGED | Flag.NOT_FINITE | Flag.OUT_OF_RANGE | Flag.SATURATED | Flag.GAP
 _COLUMNS = {
     WRENCH: canonical.WRENCH,
     POSE: (*canonical.ORIENTATION, *canonical.POSITION),
     IMU: (*canonical.SPECIFIC_FORCE, *canonical.ANGULAR_VELOCITY),
 }
-_GRAVITY = 9.81  # as `compensate` has it
-_UNIT = 0.01  # by which the norm of a quaternion may be off
-_SET = 50  # samples in a row on another clock
-_T = TypeVar("_T", contravariant=True)
+_GRAVITY = 9.81  # as in `compensate`
+_NORM_TOLERANCE = 0.01  # tolerated error of a quaternion's norm
+_CLOCK_SAMPLES = 50  # successive samples that confirm another clock
+_T = TypeVar("_T")
 
 
-class Records(Protocol[_T]):
-    """Keeps what comes.
+class Records(Generic[_T]):
+    """Collector of samples.
 
     Attributes:
-        file: name of the log that it writes.
-        files: names of all that it writes.
-        left_out: of what came.
-        began_anew: how often the clock was set.
-        seconds: length of the record.
+        file, files: name of the log, and of all written files.
+        left_out: number of rejected samples.
+        began_anew: number of clock changes.
     """
 
     file: str
     files: tuple[str, ...]
-    left_out: int
-    began_anew: int
-
-    @property
-    def seconds(self) -> float:
-        """How long what was kept is."""
-        ...
-
-    def take(self, one: _T) -> None:
-        """Keeps it if it is good."""
-
-    def write(self, path: Path) -> None:
-        """Writes the log.
-
-        Raises:
-            DrakeTeleopError: if hardly anything came, or it cannot be written.
-        """
-
-
-class _Record:
-    """Samples of streams in parts between steps of a clock."""
 
     def __init__(self, largest: dict[str, Array | None]) -> None:
         self._largest = {k: np.full(6, np.inf) if x is None else x for k, x in largest.items()}
         self.left_out, self.began_anew = 0, 0
-        self._part, self._other_clock = self._new(), self._new()
+        self._part, self._other_clock = self._empty_part(), self._empty_part()
         self._longest = self._part
 
-    def _new(self) -> dict[str, _Kept]:
-        return {stream: _Kept() for stream in self._largest}
+    def _empty_part(self) -> dict[str, _Samples]:
+        return {stream: _Samples() for stream in self._largest}
 
-    def _keep(self, stream: str, t: float, values: Array, flags: int, now: float = 0.0) -> None:
+    def _add(self, stream: str, t: float, values: Array, flags: int, now: float = 0.0) -> None:
         finite = math.isfinite(t) and bool(np.isfinite(values).all())
-        if not finite or flags & _WRONG or (np.abs(values[:6]) >= self._largest[stream]).any():
+        saturated = (np.abs(values[:6]) >= self._largest[stream]).any()
+        if not finite or flags & _INVALID_FLAGS or saturated:
             self.left_out += 1
             return
-        kept, other = self._part[stream], self._other_clock[stream]
-        stays = not kept.jumps(t)
-        if stays or other.jumps(t):
+        samples, other = self._part[stream], self._other_clock[stream]
+        same_clock = not samples.jumps(t)
+        if same_clock or other.jumps(t):
             self.left_out += len(other.t)
-            other = self._other_clock[stream] = _Kept()
-        self.left_out += not (kept if stays else other).add(t, values, now)
-        if len(other.t) == _SET:
+            other = self._other_clock[stream] = _Samples()
+        self.left_out += not (samples if same_clock else other).add(t, values, now)
+        if len(other.t) == _CLOCK_SAMPLES:
             self.began_anew += 1
-            self._longest = self._best()
-            self._part, self._other_clock = self._other_clock, self._new()
+            self._longest = self._longest_part()
+            self._part, self._other_clock = self._other_clock, self._empty_part()
 
-    def _best(self) -> dict[str, _Kept]:
+    def _longest_part(self) -> dict[str, _Samples]:
         return max(self._part, self._longest, key=_seconds)
 
     @property
     def seconds(self) -> float:
         """Length of the record [s]."""
-        return _seconds(self._best())
+        return _seconds(self._longest_part())
+
+    def take(self, sample: _T) -> None:
+        """Add a sample if it is good."""
+        raise NotImplementedError
+
+    def write(self, path: Path) -> None:
+        """Write the log; raise DrakeTeleopError if there are too few samples."""
+        raise NotImplementedError
 
 
-class Recorder(_Record):
-    """`Records` of readings.
-
-    Args:
-        largest: (6,) the sensor's range [N, N m]; what is at its ends is left out.
-    """
+class Recorder(Records[Reading]):
+    """`Records` of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
     file = "log.parquet"
     files: tuple[str, ...] = (file,)
@@ -124,64 +99,61 @@ class Recorder(_Record):
     def __init__(self, largest: Array | None = None) -> None:
         super().__init__({WRENCH: largest})
 
-    def take(self, reading: Reading) -> None:
+    def take(self, sample: Reading) -> None:
         """See `Records`."""
-        self._keep(WRENCH, reading.t, reading.values, reading.flags)
+        self._add(WRENCH, sample.t, sample.values, sample.flags)
 
     def write(self, path: Path) -> None:
         """See `Records`."""
-        t, values = self._best()[WRENCH].table(VALUES, self.left_out)
+        t, values = self._longest_part()[WRENCH].table(VALUES, self.left_out)
         wrench, s, omega, alpha = np.split(values, [6, 9, 12], axis=1)
         write_log(Log(t - t[0], wrench, s, omega, alpha), path)
 
 
-class PartRecorder(_Record):
-    """`Records` of what `Parts` reads.
-
-    Args:
-        parts: which streams there are, and whether they have a clock each.
-        largest: see `Recorder`.
-        X_FS: (7,) see `Assembly`.
-    """
+class PartRecorder(Records[tuple[Part, float]]):
+    """`Records` of parts; `X_FS` as in `Assembly`."""
 
     file = "log.yaml"
     files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
 
     def __init__(self, parts: Parts, largest: Array | None, X_FS: Array) -> None:
-        super().__init__({WRENCH: largest, parts.told: None})
-        self._told, self._two_clocks = parts.told, parts.two_clocks
+        super().__init__({WRENCH: largest, parts.motion_stream: None})
+        self._motion_stream, self._two_clocks = parts.motion_stream, parts.two_clocks
         self._R_FS = rotation_matrices(X_FS[None, :4], "quaternion_wxyz")[0]
         self._p_FS = X_FS[4:]
 
-    def take(self, one: tuple[Part, float]) -> None:
+    def take(self, sample: tuple[Part, float]) -> None:
         """See `Records`."""
-        part, now = one
+        part, now = sample
         if part.stream not in self._part:
             return
         size = float(np.linalg.norm(part.values[:4])) if part.stream == POSE else 1.0
-        flags = part.flags if abs(size - 1.0) < _UNIT else part.flags | Flag.DAMAGED
-        self._keep(part.stream, part.t, part.values, flags, now)
+        flags = part.flags if abs(size - 1.0) < _NORM_TOLERANCE else part.flags | Flag.DAMAGED
+        self._add(part.stream, part.t, part.values, flags, now)
 
     def write(self, path: Path) -> None:
-        """See `Records`. The tables stand beside the log."""
+        """See `Records`."""
         import polars as pl
 
-        wrench, motion = (self._best()[stream] for stream in (WRENCH, self._told))
+        wrench, motion = (self._longest_part()[stream] for stream in (WRENCH, self._motion_stream))
         start = wrench.table(6, self.left_out)[0][0]
-        behind = motion.least - wrench.least if self._two_clocks else 0.0
-        for stream, kept, shift in ((WRENCH, wrench, -start), (self._told, motion, behind - start)):
+        behind = motion.min_offset - wrench.min_offset if self._two_clocks else 0.0
+        for stream, samples, shift in (
+            (WRENCH, wrench, -start),
+            (self._motion_stream, motion, behind - start),
+        ):
             names = _COLUMNS[stream]
-            t, values = kept.table(len(names), self.left_out)
+            t, values = samples.table(len(names), self.left_out)
             columns = {"t": t + shift} | dict(zip(names, values.T, strict=True))
             write_table(path.with_name(f"{stream}.parquet"), pl.DataFrame(columns))
         write_text(path, yaml_text(self._description()))
 
     def _description(self) -> dict[str, Any]:
         found: dict[str, Any] = {"gravity": _GRAVITY}
-        for stream in (WRENCH, self._told):
+        for stream in (WRENCH, self._motion_stream):
             fields = {name: {"columns": list(names)} for name, names in _FIELDS[stream].items()}
             found[stream] = {"file": f"{stream}.parquet", "time": {"column": "t"}} | fields
-        if self._told == POSE:
+        if self._motion_stream == POSE:
             R_SF = self._R_FS.T
             found[POSE]["orientation"]["form"] = "quaternion_wxyz"
             found[POSE]["position_in_sensor"] = (-R_SF @ self._p_FS).tolist()
@@ -199,41 +171,36 @@ _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 
-class _Kept:
-    """Samples of one stream, in order.
-
-    Attributes:
-        t: their times [s].
-        least: our clock less the stream's, of the sample that took least time.
-    """
+class _Samples:
+    """Samples of one stream; `min_offset` is the minimum of (our - its clock) [s]."""
 
     def __init__(self) -> None:
         self.t: list[float] = []
         self._values: list[Array] = []
-        self.least = math.inf
+        self.min_offset = math.inf
 
     def jumps(self, t: float) -> bool:
         return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
 
     def add(self, t: float, values: Array, now: float) -> bool:
-        """Whether it came in order; it is kept then."""
+        """Add the sample and return True, unless it is out of order."""
         if self.t and t <= self.t[-1]:
             return False
         self.t.append(t)
         self._values.append(values)
-        self.least = min(self.least, now - t)
+        self.min_offset = min(self.min_offset, now - t)
         return True
 
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
-        """(N,) times and (N, width) values."""
+        """Return times (N,) and values (N, width)."""
         if len(self.t) < 2:
             raise DrakeTeleopError(
-                f"{len(self.t)} good readings came, {left_out} were left out",
+                f"{len(self.t)} good readings received, {left_out} rejected",
                 where="calibrate",
-                remedy="does the source send, and to this port?",
+                remedy="check that the source sends to this port",
             )
         return np.array(self.t), np.array(self._values).reshape(-1, width)
 
 
-def _seconds(part: dict[str, _Kept]) -> float:
-    return min(kept.t[-1] - kept.t[0] if kept.t else 0.0 for kept in part.values())
+def _seconds(part: dict[str, _Samples]) -> float:
+    return min(samples.t[-1] - samples.t[0] if samples.t else 0.0 for samples in part.values())

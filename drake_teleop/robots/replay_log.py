@@ -1,9 +1,4 @@
-"""A log as a source: what a loop would have been given of it.
-
-Wrench and motion are brought together as `eliminate` does, with the delay that it estimates; the
-loop waits for the motion, and is late by that. Motion that a log tells by poses alone was
-differentiated with a look ahead, see `drake_teleop.logs.causal`.
-"""
+"""A log as a source, aligned as by `eliminate`."""
 
 from __future__ import annotations
 
@@ -20,25 +15,21 @@ from drake_teleop.logs.processing import usable_phi
 from drake_teleop.logs.read.alignment import measured, undelayed
 from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.robots.streams import Flag, Reading
+from drake_teleop.robots.streams import Flag, Reading, Source
 
 
-class LogSource:
-    """Readings of a log.
+class LogSource(Source[Reading]):
+    """Readings of a log. The motion comes late by its delay, `wait` readings.
 
     Args:
-        path: canonical table or log description.
-        load: whose wrench tells the delay; None leaves wrench and motion as they were recorded.
-            If the robot had removed its weight, the specific force is the acceleration alone.
-        cutoff_hz, delay: as of `eliminate_log`.
-        real_time: in the log's own time; else as fast as they are taken.
-        chunk: readings at once.
-
-    Attributes:
-        wait: readings that the motion comes late.
+        load: load for the estimate of the delay; None keeps wrench and motion as recorded. If the
+            robot removed its weight, the acceleration replaces the specific force.
+        cutoff_hz, delay: see `eliminate_log`.
+        real_time: replay in real time; else as fast as possible.
+        chunk: maximum number of readings per call.
 
     Raises:
-        DrakeTeleopError: if the log cannot be used, or is of static poses.
+        DrakeTeleopError: if the log cannot be used, or contains static poses.
     """
 
     def __init__(
@@ -53,7 +44,7 @@ class LogSource:
     ) -> None:
         log = read_log(path, bandwidth_hz=cutoff_hz)
         if log.static:
-            raise DrakeTeleopError("poses at rest have no order in time", where=str(path))
+            raise DrakeTeleopError("static poses have no order in time", where=str(path))
         delay_s = 0.0
         if load is not None:
             log = accelerated(log) if load.weight_removed else log
@@ -85,6 +76,3 @@ class LogSource:
             Reading(k, float(self._t[k]), self._values[k], int(self._flags[k]))
             for k in range(first, self._at)
         ]
-
-    def close(self) -> None:
-        """See `Source`."""

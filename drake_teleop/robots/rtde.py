@@ -1,14 +1,7 @@
-"""Universal Robots: wrench, pose and acceleration of the tool by RTDE, with the library ur_rtde.
-
-Of each sample of the controller, 500 or 125 a second: `ft_raw_wrench`, what the sensor in the wrist
-of an e-Series measures; `actual_TCP_pose` in the frame of the robot's base, z upwards; and
-`actual_tool_accelerometer`. With a TCP of zero in the robot's installation the pose is that of the
-flange, where the sensor is. The library runs in a process of its own, see `rtde_reader`.
-"""
+"""Universal Robots: wrench, pose and tool acceleration by RTDE, with the library ur_rtde."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import select
 import subprocess
@@ -18,75 +11,67 @@ from itertools import pairwise
 
 import numpy as np
 
-from drake_teleop.common.errors import DrakeTeleopError, install_extra
+from drake_teleop.common.errors import DrakeTeleopError, require_library
 from drake_teleop.common.quaternions import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part
 
 PORT = 30004
-_FIRST_S = 10.0  # to wait for the robot at the start
-_AGAIN_S = 0.2  # from one start of the child to the next
-_FIRST = 5  # samples that tell the rate
-_BLOCK = 65536
+_START_TIMEOUT_S = 10.0  # wait for the robot at the start
+_RESTART_PERIOD_S = 0.2  # between two starts of the child
+_RATE_SAMPLES = 5  # samples for the rate
+_BLOCK_BYTES = 65536
 
 
 class RtdeSource:
-    """Parts of rtde://HOST[?sign=-1]: wrench, pose and acceleration, of the same instants.
-
-    Args:
-        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
+    """Parts of rtde://HOST[?sign=-1], of the same instants, 500 or 125 a second.
 
     Raises:
-        DrakeTeleopError: if the address cannot be used, ur_rtde is missing, or no robot answers.
+        DrakeTeleopError: if the address is invalid, ur_rtde is missing, or no robot answers.
     """
 
     streams: tuple[str, ...] = (WRENCH, POSE, ACCELERATION)
 
     def __init__(self, address: str) -> None:
-        told = Address(address, PORT, known=("sign",))
-        if told.port != PORT:
-            raise DrakeTeleopError("RTDE has one port, 30004", where=address)
-        if importlib.util.find_spec("rtde_receive") is None:
-            raise DrakeTeleopError(
-                "robots of UR are read by the library ur_rtde, which is not installed",
-                where=address,
-                remedy=install_extra("robots"),
-            )
-        self._host, self._sign, self._rest, self._began = told.host, told.sign(), b"", 0.0
+        parsed = Address(address, PORT, allowed=("sign",))
+        if parsed.port != PORT:
+            raise DrakeTeleopError("RTDE always uses port 30004", where=address)
+        require_library("rtde_receive", "ur_rtde", "robots", address)
+        self._host, self._sign, self._partial, self._started = parsed.host, parsed.sign(), b"", 0.0
         self._start()
-        exponential((0.0, 0.0, 0.0))  # what is compiled is loaded now
+        exponential((0.0, 0.0, 0.0))  # loads compiled code before the first sample
         self._first: list[tuple[float, ...]] = []
-        until = time.monotonic() + _FIRST_S
-        while len(self._first) < _FIRST and (left := until - time.monotonic()) > 0.0:
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        while len(self._first) < _RATE_SAMPLES and (left := deadline - time.monotonic()) > 0.0:
             self._first += self._samples(left)
-        if len(self._first) < _FIRST:
+        if len(self._first) < _RATE_SAMPLES:
             self.close()
             raise DrakeTeleopError("no robot answers on port 30004", where=address)
         spacing = min(abs(b[0] - a[0]) for a, b in pairwise(self._first))
         self.dt = 0.002 if spacing < 0.005 else 0.008
 
     def read(self, timeout_s: float) -> list[Part] | None:
-        """See `Source`."""
+        """See `PartSource`."""
         samples, self._first = [*self._first, *self._samples(timeout_s)], []
         return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
 
     def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
-        """Those that have come; starts the child anew if it has ended."""
+        """Return the received samples; restart an ended child process."""
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
-        block = os.read(self._pipe, _BLOCK)
+        block = os.read(self._pipe, _BLOCK_BYTES)
         if not block:
-            if time.monotonic() - self._began > _AGAIN_S:
-                self._end()
+            if time.monotonic() - self._started > _RESTART_PERIOD_S:
+                self._stop()
                 self._start()
             else:
-                time.sleep(min(timeout_s, _AGAIN_S))
+                time.sleep(min(timeout_s, _RESTART_PERIOD_S))
             return []
-        block = self._rest + block
-        whole = len(block) - len(block) % SAMPLE.size
-        self._rest = block[whole:]
-        return list(SAMPLE.iter_unpack(block[:whole]))
+        block = self._partial + block
+        complete = len(block) - len(block) % SAMPLE.size
+        self._partial = block[complete:]
+        return list(SAMPLE.iter_unpack(block[:complete]))
 
     def _start(self) -> None:
         code = "from drake_teleop.robots.rtde_reader import main; main()"
@@ -98,25 +83,25 @@ class RtdeSource:
             stderr=subprocess.DEVNULL,
         )
         os.close(into)
-        self._rest, self._began = b"", time.monotonic()
+        self._partial, self._started = b"", time.monotonic()
 
-    def _end(self) -> None:
+    def _stop(self) -> None:
         self._child.kill()
         self._child.wait()
         os.close(self._pipe)
 
     def close(self) -> None:
-        """See `Source`."""
-        self._end()
+        """See `PartSource`."""
+        self._stop()
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """What a sample of `rtde_reader` tells, see `RtdeSource`. It never raises."""
+    """Return the parts of a sample."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
-    told = {
+    values_of_stream = {
         WRENCH: sign * values[:6],
         POSE: np.array([*exponential(sample[10:13]), *sample[7:10]]),
         ACCELERATION: values[12:15],
     }
-    return [Part(stream, number, t, each) for stream, each in told.items()]
+    return [Part(stream, number, t, each) for stream, each in values_of_stream.items()]

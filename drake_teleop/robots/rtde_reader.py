@@ -1,8 +1,6 @@
-"""The child process of `rtde`: ur_rtde's samples into a pipe, for as long as a connection lasts.
+"""Child process of `rtde`: writes the samples of ur_rtde to a pipe.
 
-In a process of its own because ur_rtde holds its caller up where it connects or ends, writes to
-stdout, and may end the process if a robot answers what it does not expect. The loop says meanwhile
-that nothing comes, and starts it anew. It imports nothing else.
+ur_rtde blocks its caller while it connects or ends, writes to stdout, and may abort the process.
 """
 
 from __future__ import annotations
@@ -13,27 +11,22 @@ import sys
 import time
 
 SAMPLE = struct.Struct("<16d")
-"""Time of the controller [s]; raw wrench; pose of the TCP; acceleration that its tool measures."""
+"""Time of the controller [s], raw wrench (6), TCP pose (6), tool acceleration (3)."""
 VARIABLES = ("timestamp", "ft_raw_wrench", "actual_TCP_pose", "actual_tool_accelerometer")
-_POLL_S, _STILL_S = 0.0002, 1.0
+_POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
 def read(host: str, pipe: int) -> None:
-    """Writes samples until the robot is gone, or says nothing new.
-
-    Raises:
-        RuntimeError: if nobody is there.
-        BrokenPipeError: if nobody reads.
-    """
+    """Write samples until the robot disconnects or sends no new ones."""
     import rtde_receive
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
     last, new = -1.0, time.monotonic()
-    while robot.isConnected() and time.monotonic() - new < _STILL_S:
+    while robot.isConnected() and time.monotonic() - new < _MAX_SILENCE_S:
         t = robot.getTimestamp()
         wrench, pose = robot.getFtRawWrench(), robot.getActualTCPPose()
         acceleration = robot.getActualToolAccelerometer()
-        if t == last or t != robot.getTimestamp():  # nothing new, or of two samples
+        if t == last or t != robot.getTimestamp():  # no new sample, or a mixture of two
             time.sleep(_POLL_S)
             continue
         last, new = t, time.monotonic()
@@ -41,7 +34,7 @@ def read(host: str, pipe: int) -> None:
 
 
 def main() -> None:
-    """HOST, and the number of the pipe."""
+    """Run with the arguments host and file descriptor."""
     try:
         read(sys.argv[1], int(sys.argv[2]))
     finally:

@@ -1,47 +1,46 @@
-"""What flows through `compensate`: readings in, wrenches out, and what was wrong with either.
+"""Types of the live streams: readings, parts, compensated wrenches, flags, sources and sinks.
 
-A source is an object with `dt` and `read`, a sink one with `write` and `close`: nothing else is
-asked of them. Readings are of S, the sensor's frame, in SI, with the sign of Eq. (1): what the
-sensor exerts on the load.
+Readings are in the sensor's frame S, in SI, with the sign of Eq. (1): wrench of sensor on load.
 """
 
 from __future__ import annotations
 
 from enum import IntFlag
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
 
+_T = TypeVar("_T")
 VALUES = 15
-"""Of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
+"""Length of a reading: wrench (6), specific force, angular velocity and acceleration (3 each)."""
 
 
 class Flag(IntFlag):
-    """Why a wrench is zero, or what else to know of it; the bits of the packets."""
+    """Reason of a zero wrench, or further information; the bits of the packets."""
 
-    SATURATED = 1  #: the sensor says so, or a channel is at its range
-    DAMAGED = 2  #: no reading could be made of what came
+    SATURATED = 1  #: reported by the sensor, or a channel at its range
+    DAMAGED = 2  #: invalid packet
     NOT_FINITE = 4  #: NaN or infinity
-    OUT_OF_RANGE = 8  #: beyond what any sensor or motion has
-    REORDERED = 16  #: older than one that was here before, or the same
-    STALE = 32  #: nothing has come for a while, or what came was late
+    OUT_OF_RANGE = 8  #: beyond any sensor or motion
+    REORDERED = 16  #: not newer than an earlier reading
+    STALE = 32  #: no reading for a while, or a late one
     CLOCK_JUMP = 64  #: the source's clock was set
-    RESTART = 128  #: the source began anew
-    GAP = 256  #: a straight line stands in for what a log does not have
-    WRONG_RATE = 512  #: the rate is not the stated one; the wrench is no zero for that
-    CLIPPED = 1024  #: limited to the sensor's range; likewise
-    IN_CONTACT = 2048  #: the known load does not explain the wrench; likewise
-    OTHER_LOAD = 4096  #: another load hangs there; likewise
+    RESTART = 128  #: the source restarted
+    GAP = 256  #: interpolated gap of a log
+    WRONG_RATE = 512  #: not the stated rate; the wrench is not zero
+    CLIPPED = 1024  #: limited to the sensor's range, not zero
+    IN_CONTACT = 2048  #: not explained by the load; the wrench is not zero
+    OTHER_LOAD = 4096  #: explained by another load; the wrench is not zero
 
 
-ONLY_SAID = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
-"""Flags whose wrench is not zero."""
+NONZERO_FLAGS = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LOAD
+"""Flags with a nonzero wrench."""
 
 
 class Reading(NamedTuple):
-    """A sample of a source: its number and time [s], both of the source; (15,); flags."""
+    """Sample of a source: number, time [s] on its clock, values (15,), flags."""
 
     number: int
     t: float
@@ -50,15 +49,10 @@ class Reading(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one stream of several told, on its own clock; readings are made of them.
+    """Sample of one stream of several, on its own clock.
 
-    Args:
-        stream: one of `WRENCH`, `POSE`, `IMU`, `JOINTS`, `ACCELERATION`, whose values are the
-            wrench of S (6), the pose X_WF of a frame on the wrist (7), specific force and angular
-            velocity of S (6), positions of the arm's joints (n), or what an accelerometer somewhere
-            on the wrist says (3), which nobody reads yet.
-        number: of the stream, one more each time.
-        t: of the stream [s].
+    The values are the wrench of S (6), the pose X_WF of a frame on the wrist (7), specific force
+    and angular velocity of S (6), joint positions (n), or a tool acceleration (3).
     """
 
     stream: str
@@ -73,7 +67,7 @@ ACCELERATION = "acceleration"
 
 
 class Compensated(NamedTuple):
-    """A sample for a sink: number and time of the reading; contact and scaled (6,); flags."""
+    """Sample for a sink: contact and scaled are (6,)."""
 
     number: int
     t: float
@@ -83,34 +77,32 @@ class Compensated(NamedTuple):
 
 
 DAMAGED = Reading(-1, np.nan, np.full(VALUES, np.nan), int(Flag.DAMAGED))
-"""The reading of what is none."""
+"""Reading for invalid packets."""
+DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))
+"""Part for invalid packets."""
 
 
-class Source(Protocol):
-    """Where readings come from.
+class Source(Protocol[_T]):
+    """Source of readings, or of other samples.
 
     Attributes:
-        dt: between readings [s].
-        live: they come when they come; else as fast as they are taken, on the clock that they tell.
+        dt: period of the samples [s].
+        live: whether they arrive in real time; else as fast as they are read.
     """
 
     dt: float
     live: bool
 
-    def read(self, timeout_s: float) -> list[Reading] | None:
-        """What has come, after waiting for the first; none in that time: []; at the end: None."""
+    def read(self, timeout_s: float) -> list[_T] | None:
+        """Return the samples after waiting for the first; [] if none, None at the end."""
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the source."""
+        return
 
 
 class PartSource(Protocol):
-    """Likewise of parts; `assembly` makes readings of them.
-
-    Attributes:
-        dt: between wrenches [s].
-        streams: that it tells.
-    """
+    """Source of parts; `dt` [s] is the period of the wrenches."""
 
     dt: float
     streams: tuple[str, ...]
@@ -123,10 +115,11 @@ class PartSource(Protocol):
 
 
 class Sink(Protocol):
-    """Where wrenches go."""
+    """Sink of wrenches."""
 
     def write(self, out: Compensated) -> None:
-        """Takes one."""
+        """Write a wrench."""
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the sink."""
+        return

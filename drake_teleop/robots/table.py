@@ -1,4 +1,4 @@
-"""Wrenches into a CSV file or a folder of Parquet files, while they come."""
+"""Wrenches in a CSV file or a folder of Parquet files, written continuously."""
 
 from __future__ import annotations
 
@@ -13,16 +13,14 @@ from drake_teleop.common.writing import make_folder, naming, part_of_log, remove
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.streams import Compensated
 
-#: Time between two writes [s]: what a kill loses. A file of Parquet takes milliseconds.
+#: Time between two writes [s], lost if the process is killed. A Parquet file takes milliseconds.
 PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
 
 
 class TableSink:
-    """A row for each: t, number, contact_f_x ..., scaled_f_x ..., flags.
+    """Table with the columns t, number, contact_f_x ..., scaled_f_x ..., flags.
 
-    Args:
-        path: a .csv file; or .parquet, a folder of files that are one table. What is there is
-            replaced when the first wrench comes.
+    An existing file or .parquet folder is replaced at the first wrench.
     """
 
     def __init__(self, path: Path) -> None:
@@ -44,7 +42,7 @@ class TableSink:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the rows. After an interrupt or an error the next call writes them once more."""
+        """Write the rows; a call after an interrupt or an error writes them again."""
         import polars as pl
 
         rows, table = len(self._rows), pl.DataFrame(self._columns())
@@ -58,7 +56,7 @@ class TableSink:
             mode = "r+b" if self._written else "wb"
             with naming(self._path), self._path.open(mode, buffering=0) as file:
                 file.seek(self._end)
-                if file.write(text) < len(text):  # a part of a number would be another number
+                if file.write(text) < len(text):  # a truncated number would be a wrong number
                     file.truncate(self._end)
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._end += len(text)

@@ -1,8 +1,8 @@
-"""Readings and wrenches in UDP packets of a fixed layout, as `drake_teleop_udp.h` has it in C.
+"""Readings and wrenches in UDP packets, with the layout of `drake_teleop_udp.h`.
 
-Little-endian, without padding. In: "DTW1", flags (of `Flag`, SATURATED alone is read), number,
-time [s], 15 numbers; or "DTP1", the same, wrench (6), pose (w x y z, position). Out: "DTC1",
-flags, number, time [s], contact (6), scaled (6).
+Little-endian, without padding. Input: "DTW1", flags (`Flag.SATURATED` only), number, time [s],
+15 numbers; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
+same head, contact (6), scaled (6).
 """
 
 from __future__ import annotations
@@ -18,73 +18,65 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.robots import streams
 from drake_teleop.robots.address import Address
-from drake_teleop.robots.streams import DAMAGED, Compensated, Flag, Part, Reading
+from drake_teleop.robots.streams import DAMAGED, DAMAGED_WRENCH, Compensated, Flag, Part, Reading
 
 THIS_MACHINE = "127.0.0.1"
 READING = struct.Struct("<4sIQd15d")
 POSED = struct.Struct("<4sIQd13d")
 WRENCH = struct.Struct("<4sIQd12d")
-_IN, _POSED, _OUT = b"DTW1", b"DTP1", b"DTC1"
+_READING_TAG, _POSED_TAG, _WRENCH_TAG = b"DTW1", b"DTP1", b"DTC1"
 _HEAD = struct.Struct("<4sIQd")
-_MOST = 256  # packets at once
-_BUFFER = 1 << 20  # bytes: a tenth of a second at 8 kHz, while the system is busy elsewhere
+_MAX_PACKETS = 256  # packets per call
+_BUFFER_BYTES = 1 << 20  # bytes: a tenth of a second at 8 kHz
 _SATURATED = int(Flag.SATURATED)
 
 
-def packed(reading: Reading) -> bytes:
-    """The packet of a reading."""
-    return READING.pack(_IN, reading.flags, reading.number, reading.t, *reading.values)
+def pack_reading(reading: Reading) -> bytes:
+    """Return the packet of a reading."""
+    return READING.pack(_READING_TAG, reading.flags, reading.number, reading.t, *reading.values)
 
 
-def unpacked(packet: bytes) -> Reading:
-    """The reading in a packet, `DAMAGED` if it is none. It never raises."""
-    if len(packet) != READING.size or packet[:4] != _IN:
+def unpack_reading(packet: bytes) -> Reading:
+    """Return the reading in a packet, `DAMAGED` if it is invalid."""
+    if len(packet) != READING.size or packet[:4] != _READING_TAG:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 15, _HEAD.size).astype(np.float64)
     return Reading(number, t, values, flags & _SATURATED)
 
 
-def packed_parts(wrench: Part, pose: Part) -> bytes:
-    """The packet of a wrench and a pose of the same instant."""
-    head = _POSED, wrench.flags, wrench.number, wrench.t
+def pack_parts(wrench: Part, pose: Part) -> bytes:
+    """Return the packet of a wrench and a pose."""
+    head = _POSED_TAG, wrench.flags, wrench.number, wrench.t
     return POSED.pack(*head, *wrench.values, *pose.values)
 
 
-def unpacked_parts(packet: bytes) -> list[Part]:
-    """Wrench and pose in a packet, a damaged wrench if it is none. It never raises."""
-    if len(packet) != POSED.size or packet[:4] != _POSED:
-        return [Part(streams.WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))]
+def unpack_parts(packet: bytes) -> list[Part]:
+    """Return wrench and pose in a packet, a damaged wrench if it is invalid."""
+    if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
+        return [DAMAGED_WRENCH]
     _, flags, number, t = _HEAD.unpack_from(packet)
     values = np.frombuffer(packet, "<f8", 13, _HEAD.size).astype(np.float64)
     wrench = Part(streams.WRENCH, number, t, values[:6], flags & _SATURATED)
     return [wrench, Part(streams.POSE, number, t, values[6:])]
 
 
-def packed_wrench(out: Compensated) -> bytes:
-    """The packet of a wrench."""
+def pack_wrench(out: Compensated) -> bytes:
+    """Return the packet of a wrench."""
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
-    return _HEAD.pack(_OUT, out.flags, out.number, out.t) + b"".join(wrenches)
+    return _HEAD.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
-def unpacked_wrench(packet: bytes) -> Compensated:
-    """The wrench in a packet.
-
-    Raises:
-        DrakeTeleopError: if there is none.
-    """
-    if len(packet) != WRENCH.size or packet[:4] != _OUT:
-        raise DrakeTeleopError("is no wrench", where="packet")
+def unpack_wrench(packet: bytes) -> Compensated:
+    """Return the wrench in a packet; raise DrakeTeleopError if it is invalid."""
+    if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
+        raise DrakeTeleopError("is not a wrench packet", where="packet")
     _, flags, number, t, *values = WRENCH.unpack(packet)
     return Compensated(number, t, np.array(values[:6]), np.array(values[6:]), flags)
 
 
 def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
-    """Host and port of udp://HOST:PORT; without a host, this machine, without a port, that one.
-
-    Raises:
-        DrakeTeleopError: if there is no port.
-    """
+    """Return host (default: this machine) and port; raise DrakeTeleopError without a port."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
@@ -92,17 +84,15 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
         host, port = "", None
     if port is None:
         raise DrakeTeleopError(
-            "has no port from 0 to 65535", where=address, remedy="udp://127.0.0.1:49152, say"
+            "has no port from 0 to 65535",
+            where=address,
+            remedy="give one, such as udp://127.0.0.1:49152",
         )
     return host, port
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """A socket that packets can be sent to.
-
-    Raises:
-        DrakeTeleopError: if the address is not this machine's, or taken.
-    """
+    """Return a socket that receives packets; raise DrakeTeleopError if the address is in use."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -113,28 +103,24 @@ def listening(host: str, port: int) -> socket.socket:
 
 
 class _Receiver:
-    """Packets that are sent to a port. Only this machine can, unless HOST says otherwise."""
-
     def __init__(self, address: str, dt: float) -> None:
         self.dt = dt
         self._socket = listening(*endpoint(address))
         self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
         self.port = self._socket.getsockname()[1]
 
     def packets(self, timeout_s: float) -> list[bytes]:
-        """Those that have come."""
         found: list[bytes] = []
         if self._poll.poll(1e3 * timeout_s):
             with suppress(BlockingIOError):
-                while len(found) < _MOST:
+                while len(found) < _MAX_PACKETS:
                     found.append(self._socket.recv(READING.size + 1))
         return found
 
     def close(self) -> None:
-        """See `Source`."""
         self._socket.close()
 
 
@@ -145,46 +131,39 @@ class UdpSource(_Receiver):
 
     def read(self, timeout_s: float) -> list[Reading] | None:
         """See `Source`."""
-        return [unpacked(packet) for packet in self.packets(timeout_s)]
+        return [unpack_reading(packet) for packet in self.packets(timeout_s)]
 
 
 class PosedSource(_Receiver):
-    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1].
-
-    Args:
-        address: sign -1, the default, is for a sensor that tells what the load exerts on it.
-        dt: between packets [s].
-    """
+    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1]."""
 
     streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
 
     def __init__(self, address: str, dt: float) -> None:
-        self._sign = Address(address, None, known=("sign",), host=THIS_MACHINE).sign()
+        self._sign = Address(address, None, allowed=("sign",), host=THIS_MACHINE).sign()
         super().__init__(address, dt)
 
     def read(self, timeout_s: float) -> list[Part] | None:
         """See `PartSource`."""
-        parts = [part for packet in self.packets(timeout_s) for part in unpacked_parts(packet)]
+        parts = [part for packet in self.packets(timeout_s) for part in unpack_parts(packet)]
         signs = {streams.WRENCH: self._sign}
         return [part._replace(values=signs.get(part.stream, 1.0) * part.values) for part in parts]
 
 
 class UdpSink:
-    """Wrenches, sent to HOST:PORT. Nobody has to listen."""
+    """Wrenches, sent to HOST:PORT whether there is a receiver or not."""
 
     def __init__(self, address: str) -> None:
         self._to = endpoint(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: Compensated) -> None:
-        """See `Sink`. What cannot be sent now is too old later."""
+        """Send a wrench; packets that cannot be sent now are dropped."""
         try:
-            self._socket.sendto(packed_wrench(out), self._to)
+            self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:
             if isinstance(error, socket.gaierror):
-                raise DrakeTeleopError(
-                    "is not known", where=self._to[0], remedy="give a host"
-                ) from error
+                raise DrakeTeleopError("is not a known host", where=self._to[0]) from error
 
     def close(self) -> None:
         """See `Sink`."""

@@ -1,27 +1,22 @@
-"""Whether something is touched, or another load hangs there, sample by sample: `--watch`.
+"""Detection of contact or of another load, sample by sample: `--watch`.
 
-`load.online.watched` beside the loop: it sees every reading that can be trusted and says what of
-the wrench the known load does not explain. What comes out of `compensate` stays as it is; two flags
-say what it is:
-
-* IN_CONTACT: something is touched, or it is the moment of a grasp;
-* OTHER_LOAD: another load than the known one, shown by a motion; what comes out is then not the
-  contact alone, until `calibrate` has found the new one. A push that lasts while the tool turns
-  looks likewise only if it turns with it.
-
-The noise of a reading is not known, but what the identification left behind its low-pass is: it is
-taken for white, and for no less than `LEAST`. Gains, and clocks that are not quite aligned, make
-`MODEL_ERROR` of the load's wrench.
+A lasting push looks like another load only if it turns with the tool. With `--free LOG`, contact
+is detected as by `detect`, with a noise floor fitted to a log of free motion.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
 from drake_teleop.common.arrays import Array
+from drake_teleop.common.compiled import njit
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
+from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.watched import (
@@ -31,61 +26,159 @@ from drake_teleop.load.online.watched import (
     watched_state,
     watched_update,
 )
+from drake_teleop.load.regressor import non_contact_wrench
+from drake_teleop.logs.causal import low_pass_coefficients
 from drake_teleop.logs.processing import usable_phi
+from drake_teleop.robots.compensation_step import low_pass_into
+from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import Flag
 
 MODEL_ERROR = 0.02
-"""Share of the load's wrench that may be wrong by gains and times."""
-LEAST = np.repeat([0.05, 0.0025], 3)
-"""Noise of a reading at 1 kHz is at least that [N, N m]."""
-_NEVER = 1e-12  # accuracy at which another load would count as the known one
+"""Relative error of the load's wrench by gains and clocks."""
+MIN_NOISE = np.repeat([0.05, 0.0025], 3)
+"""Minimum noise of a reading at 1 kHz [N, N m]."""
+_NEVER_REPLACED = 1e-12  # accuracy at which another load would replace the present one
 # Equivalent noise bandwidth of the zero-phase low-pass over its cut-off: integral of the gain^2.
-_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
+_NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """(6,) noise of a reading [N, N m], from what was left behind a low-pass, taken for white.
-
-    Args:
-        load: tells what was left.
-        dt: between readings [s].
-        cutoff_hz: of the low-pass; None for none.
-    """
-    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _BANDWIDTH * cutoff_hz * dt)
-    return np.maximum(load.residual_rms / math.sqrt(share), LEAST * math.sqrt(1e-3 / dt))
+    """Return the noise (6,) of a reading [N, N m] from the low-passed residual, assumed white."""
+    share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
+    return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
 class Watch:
-    """What `Compensator` asks of each good reading.
-
-    Args:
-        load: that hangs there at the start.
-        dt: between readings [s].
-        cutoff_hz: of the low-pass that its residual was seen behind.
-    """
+    """Detection for `Compensator`; the residual of `load` was low-passed at `cutoff_hz`."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = raw_noise(load, dt, cutoff_hz)
-        # The known load stays what is eliminated, however well a new one is known.
+        # The identified load remains the reference, even if a new one is well known.
         self._parameters = change_parameters(
-            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER
+            noise, np.zeros(9), dt, model_error=MODEL_ERROR, bound=_NEVER_REPLACED
         )
         self._phi = usable_phi(load)[0]
         self._covariance = finite_covariance(self._phi, load.covariance)
         self._fallback, self._dt = np.zeros(10), dt
         self.restart(load.offsets)
-        self.flags(np.concatenate([load.offsets, np.zeros(9)]))  # what is compiled is loaded now
+        self.flags(np.concatenate([load.offsets, np.zeros(9)]))  # loads compiled code
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Forgets all but the known load, with these offsets (6,)."""
+        """Reset all but the identified load."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched_memory(self._out, self._covariance)
 
     def flags(self, values: Array) -> int:
-        """Takes a good reading (15,)."""
+        """Return the flags of a good reading (15,)."""
         watched_update(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
         state = watched_state(self._memory)
         if state == OTHER_LOAD:
             return int(Flag.OTHER_LOAD)
         return int(Flag.IN_CONTACT) if state == DISTURBED else 0
+
+
+MEAN_TIME_S = 3.0
+"""Time constant of the mean [s]."""
+_GRAVITY_HZ = 0.5
+_STATISTIC = "level"
+_RATE_TOLERANCE = 0.05
+
+
+class Detector:
+    """Contact detection by the noise floor of a log after the causal low-pass.
+
+    Gravity is the specific force below `_GRAVITY_HZ`.
+
+    Args:
+        free: log of free motion of the load, at the rate of the stream.
+        delay: delay of the log, see `eliminate_log`.
+
+    Raises:
+        DrakeTeleopError: for an unreadable log, another rate, too little motion, or no low-pass.
+    """
+
+    def __init__(
+        self,
+        load: Identification,
+        free: Path,
+        dt: float,
+        cutoff_hz: float | None,
+        delay: str | float = "auto",
+    ) -> None:
+        if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
+            raise DrakeTeleopError("needs a low-pass", where="--free", remedy="give --cutoff HZ")
+        source = LogSource(free, load, cutoff_hz=cutoff_hz, delay=delay, chunk=10**9)
+        if abs(source.dt / dt - 1.0) > _RATE_TOLERANCE:
+            raise DrakeTeleopError(
+                f"has {1.0 / source.dt:.4g} Hz, and the stream {1.0 / dt:.4g} Hz",
+                where=str(free),
+                remedy="use the log that `calibrate` wrote from this stream",
+            )
+        self._fast, self._slow = (_low_pass(dt, hz) for hz in (cutoff_hz, _GRAVITY_HZ))
+        readings = [each for each in source.read(0.0) or () if not each.flags]
+        values = np.array([each.values for each in readings]).reshape(-1, 15)
+        phi, (s, omega, alpha) = usable_phi(load)[0], np.split(values[:, 6:], 3, axis=1)
+        contact = values[:, :6] - non_contact_wrench(s, omega, alpha, phi)
+        contact -= contact[: round(0.5 / dt)].mean(axis=0)  # as a tare
+        rows = self._low_passed(np.hstack([contact, values[:, 6:]]))
+        # Skip the transient of the low-passes.
+        settled = rows[round(0.5 / (_GRAVITY_HZ * dt)) :]
+        hold = round(1.0 / (cutoff_hz * dt))
+        fade = float(np.exp(-1.0 / hold))
+        covariance = finite_covariance(phi, load.covariance, tared=True)
+        contact, s, omega, alpha, a = np.split(settled, [6, 9, 12, 15], axis=1)
+        floor = fit_noise_floor(contact, s, omega, alpha, a, covariance, fade=fade)
+        threshold = max(RARE, floor.threshold(_STATISTIC))
+        self._settings = ContactDetector(
+            floor, threshold, statistic=_STATISTIC, hold=hold, following=dt / MEAN_TIME_S
+        ).settings
+        self.restart()
+        self.flags(np.zeros(15), np.zeros(6))  # loads compiled code before the first reading
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset all but the noise floor."""
+        self._memory = ContactDetector.initial_memory()
+        self._filters = np.full((2, 12), np.nan)
+
+    def _low_passed(self, rows: Array) -> Array:
+        """Return low-passed contact, motion and acceleration (N, 18)."""
+        filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
+        out = np.empty((len(rows), 18))
+        for row, to in zip(rows, out, strict=True):
+            to[:6] = row[:6]
+            low_pass_into(to[:6], self._fast, contacts)
+            _filter_motion_into(row, self._fast, self._slow, filters, to[6:])
+        return out
+
+    def flags(self, values: Array, contact: Array) -> int:
+        """Return the flags of a good reading (15,) with low-passed contact wrench (6,)."""
+        touched = _detect(
+            self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
+        )
+        return int(Flag.IN_CONTACT) if touched else 0
+
+
+def _low_pass(dt: float, cutoff_hz: float) -> Array:
+    b, a, settled = low_pass_coefficients(dt, cutoff_hz)
+    return np.concatenate([b, a[1:], settled])
+
+
+@njit(cache=True)
+def _filter_motion_into(values, fast, slow, filters, out):
+    """Write low-passed motion (9,) and acceleration without gravity (3,)."""
+    out[:9] = values[6:]
+    low_pass_into(out[:9], fast, filters[:, :9])
+    out[9:] = values[6:9]
+    low_pass_into(out[9:], slow, filters[:, 9:])
+    for i in range(3):
+        out[9 + i] = out[i] - out[9 + i]
+
+
+@njit(cache=True)
+def _detect(memory, values, contact, fast, slow, filters, settings):
+    filtered = np.empty(12)
+    _filter_motion_into(values, fast, slow, filters, filtered)
+    s, omega, alpha, acceleration = filtered[:3], filtered[3:6], filtered[6:9], filtered[9:]
+    return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)

@@ -1,4 +1,4 @@
-"""The policy of a page: its own scripts run and no others, nothing is loaded."""
+"""Content-Security-Policy of pages: only their own scripts run, and nothing is loaded."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ def hashed(script: str) -> str:
 
 @pytest.mark.parametrize("tag", ["<script>", '<script type="text/javascript">', "<script id=a>"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_scripts_are_allowed_by_what_is_in_them(tag, end):
-    """As a browser reads them: with line feeds alone."""
+def test_policy_contains_the_hashes_of_the_scripts(tag, end):
+    """Browsers hash scripts with line feeds only."""
     page = f"<body>{tag}{CODE}</script><p>{tag}other()</script>".replace("\n", end)
     parts = dict(part.split(" ", 1) for part in policy(page).split("; "))
     assert parts["script-src"].split() == [hashed(CODE), hashed("other()")]
     assert parts["default-src"] == parts["base-uri"] == parts["form-action"] == "'none'"
 
 
-def test_a_server_is_named_and_a_file_reaches_nothing():
+def test_policy_allows_connections_only_to_the_given_server():
     served = dict(part.split(" ", 1) for part in policy("", "127.0.0.1:80").split("; "))
     assert served["connect-src"].split() == ["'self'", "ws://127.0.0.1:80", "data:", "blob:"]
     assert served["script-src"].split() == ["'self'"]
     assert "http" not in policy("<script>x</script>") and "'self'" not in policy("")
 
 
-def test_films_and_reports_have_one(tmp_path):
+def test_replays_and_reports_have_a_policy(tmp_path):
     film = Film("x", np.arange(2.0), 1.0)
     film.write(tmp_path / "x.html", lambda meshcat: lambda time, frame: None)
     page = (tmp_path / "x.html").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Bars are shown to whom looks, unless one argument says no, and only of what takes its time."""
+"""Progress bars on terminals only, unless disabled, and only of long tasks."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ SLOW = [
 
 @pytest.fixture
 def terminal(monkeypatch):
-    """What a terminal would show."""
+    """Output of a terminal."""
     written = io.StringIO()
     monkeypatch.setattr(rich, "_console", Console(file=written, force_terminal=True, width=100))
     return written
 
 
 @pytest.mark.parametrize("function", SLOW, ids=lambda function: function.__name__)
-def test_what_takes_long_shows_it_unless_progress_is_false(function):
+def test_long_functions_show_progress_unless_disabled(function):
     assert inspect.signature(function).parameters["progress"].default is True
     assert "progress" in (function.__doc__ or "") or function is run_study
 
@@ -52,13 +52,13 @@ def shown(progress, **options) -> None:
             told(fraction, f"{fraction:.2f}")
 
 
-def test_a_terminal_shows_each_stage(terminal):
+def test_terminal_shows_each_stage(terminal):
     shown(True)
     text = terminal.getvalue()
     assert "Counting sheep" in text and "100%" in text
 
 
-def test_nothing_is_shown_if_nobody_wants_it(terminal, capsys):
+def test_no_output_without_progress(terminal, capsys):
     shown(False)
     shown(silent)
     shown(True, after=3600.0)  # done before
@@ -80,7 +80,7 @@ def test_without_a_terminal_each_stage_is_one_line_on_stderr(monkeypatch, capsys
     assert (said.err, said.out, file.getvalue()) == ("Counting goats ...\n", "", "")
 
 
-def test_without_a_terminal_a_stage_that_takes_long_is_told_late(monkeypatch, capsys):
+def test_without_a_terminal_the_line_appears_after_the_delay(monkeypatch, capsys):
     monkeypatch.setattr(rich, "_console", Console(file=io.StringIO(), force_terminal=False))
     with show_progress(True, after=0.05) as stage:
         told = stage("Counting sheep")
@@ -92,7 +92,7 @@ def test_without_a_terminal_a_stage_that_takes_long_is_told_late(monkeypatch, ca
         assert capsys.readouterr().err == "Counting sheep ...\n"
 
 
-def test_a_callers_stages_go_on_in_what_it_calls(terminal):
+def test_callees_continue_the_stages_of_the_caller(terminal):
     with show_progress(True) as stage, show_progress(stage) as same:
         assert same is stage
     calls = []
@@ -100,7 +100,7 @@ def test_a_callers_stages_go_on_in_what_it_calls(terminal):
     assert calls[-1] == ("Counting sheep", 1.0) and len(calls) == 5
 
 
-def test_bars_within_bars_are_no_error(terminal):
+def test_nested_bars_raise_no_error(terminal):
     with show_progress(True) as stage:
         stage("Outside")(0.5)
         shown(True)

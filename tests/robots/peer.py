@@ -1,8 +1,8 @@
-"""A robot or sensor that plays a story with everything that can go wrong, as a process of its own.
+"""Simulated robot or sensor in its own process, with all kinds of faults.
 
-`python peer.py netft` prints its port, serves whoever asks, and ends with the story. It imports
-nothing but what its protocol needs. Each wrench is (number, 2, 3, 0.1, 0.2, 0.3), so that what was
-received tells which it was; the pose is that of a tool that rests.
+`python peer.py netft` prints its port, serves one client, and ends after its sequence. It imports
+only the libraries of its protocol. Each wrench is (number, 2, 3, 0.1, 0.2, 0.3), which identifies
+the sample; the pose is that of a tool at rest.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SATURATED = 1  # of the flags in a UDP packet
 
 
 def chapters(flaws=FLAWS):
-    """(seconds to wait, number, flaw) in the order of sending."""
+    """Yield (wait [s], number, flaw) in the order of sending."""
     number = 0
     for flaw in flaws:
         rows = [(DT, number + k, "") for k in range(EACH)]
@@ -55,7 +55,7 @@ def chapters(flaws=FLAWS):
 
 
 def play(send, flaws=FLAWS):
-    """Calls send(number, flaw) when it is time."""
+    """Call send(number, flaw) in real time."""
     due = time.monotonic()
     for wait, number, flaw in chapters(flaws):
         due += wait
@@ -68,7 +68,7 @@ def wrench(number):
 
 
 def netft():
-    """An RDT box that is switched off and on: its numbers begin again, and it has to be asked."""
+    """RDT box that is switched off and on: its numbers restart, and it needs a new request."""
     box = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     box.bind(("127.0.0.1", 0))
     box.settimeout(5.0)
@@ -98,9 +98,9 @@ def netft():
 
 
 def rtde(host, table=""):
-    """A controller that is started again: its time begins anew. It says nothing of its own.
+    """Controller that restarts with time zero.
 
-    Or one that moves its tool: the table has wrenches and poses, 12 doubles in a row.
+    With a table (wrench and pose, 12 doubles a row) it is a moving tool.
     """
     stories = (SEEN, 100.0), (("good",) * 20, 1.0)
     rows = []
@@ -166,9 +166,9 @@ def router(port):
 
 
 def ros(port):
-    """A driver behind a router: it is started again, and then its clock is set.
+    """ROS 2 driver behind a router: it restarts, and then its clock is set.
 
-    Its CDR is made by hand, as rmw_zenoh's attachment and key are.
+    CDR, attachment and key are written explicitly.
     """
     kind = "geometry_msgs::msg::dds_::WrenchStamped_"
     with router(port) as session:
@@ -191,7 +191,7 @@ def ros(port):
 
 
 def udp(port):
-    """A sender that is started again, and then its clock is set; as the C header has it."""
+    """Sender that restarts, and then its clock is set; layout of the C header."""
     print(port, flush=True)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for flaws, later, first in ((FLAWS, 0, 0), (TWO, 0, 0), (TWO, 50, 500)):
@@ -208,7 +208,7 @@ def udp(port):
 
 
 def joint_state(ns, names, positions):
-    """A sensor_msgs/JointState in CDR, as velocity and effort are left out."""
+    """Return a sensor_msgs/JointState in CDR, without velocity and effort."""
     data = struct.pack("<iII5s", ns // 10**9, ns % 10**9, 5, b"base\0")
 
     def aligned(data, size):
@@ -224,7 +224,7 @@ def joint_state(ns, names, positions):
 
 
 def moving(table, columns, epoch, send):
-    """Calls send(number, row) in the time of the table, which began at `epoch`."""
+    """Call send(number, row) at the times of a table that began at `epoch`."""
     with open(table, "rb") as file:
         rows = list(struct.iter_unpack(f"<{columns}d", file.read()))
     while (k := int((time.time() - float(epoch)) / DT)) < len(rows):
@@ -233,7 +233,7 @@ def moving(table, columns, epoch, send):
 
 
 def netft_moving(table, columns, epoch):
-    """A box on a moving tool."""
+    """RDT box on a moving tool."""
     box = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     box.bind(("127.0.0.1", 0))
     print(box.getsockname()[1], flush=True)
@@ -247,7 +247,7 @@ def netft_moving(table, columns, epoch):
 
 
 def ros_moving(port, table, columns, epoch, names):
-    """Wrench and joints of a moving tool, and joints of a gripper between them."""
+    """Wrench and joints of a moving tool, and joints of a gripper."""
     wrench_kind, joint_kind = (
         f"{package}::msg::dds_::{name}_"
         for package, name in (("geometry_msgs", "WrenchStamped"), ("sensor_msgs", "JointState"))
@@ -270,7 +270,7 @@ def ros_moving(port, table, columns, epoch, names):
 
 
 def ros_echo(port):
-    """What a node of ROS would have seen of the first message: tokens, key, attachment, CDR."""
+    """Print the first message as a ROS node receives it: tokens, key, attachment, CDR."""
     with router(port) as session:
         tokens = session.liveliness().declare_subscriber("@ros2_lv/**", history=True)
         messages = session.declare_subscriber("4/**")

@@ -1,4 +1,4 @@
-"""A load from a stream: known when it is, and not before."""
+"""Calibration from a stream: parameters are known when they are, and not before."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import sockets
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 from test_peers import ADDRESS, peer
-from test_reading_assembly import X_FS, Told, truth
+from test_reading_assembly import X_FS, StreamStub, truth
 
 from drake_teleop.cli.main import cli
 from drake_teleop.common.errors import DrakeTeleopError
@@ -22,20 +22,19 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import errors_of, read_tolerance, sizes_of, values_of
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.canonical import Log, write_log
-from drake_teleop.robots.calibrate import calibrate
-from drake_teleop.robots.calibration import Look, look, missing_motion
-from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.assembly import Parts
+from drake_teleop.robots.calibration import Evaluation, best_motion, calibrate, evaluate_record
 from drake_teleop.robots.recording import PartRecorder, Recorder
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Flag, Part, Reading
 
 DT = 0.005
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
 NOISE = np.repeat([0.1, 0.005], 3)
-ASKED = read_tolerance("mass 0.5 %, com 0.5 mm")
+TOLERANCE = read_tolerance("mass 0.5 %, com 0.5 mm")
 
 
 def motion(t: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Turns about `axes`, one after the other, by 1 rad and back in a second each."""
+    """Return rotations about `axes` in turn, by 1 rad and back in one second each."""
     angle, k = 0.5 * (1.0 - np.cos(2 * np.pi * t)), np.floor(t).astype(int) % len(axes)
     e = np.eye(3)[axes[k]]
     speed, change = np.pi * np.sin(2 * np.pi * t), 2 * np.pi**2 * np.cos(2 * np.pi * t)
@@ -54,7 +53,7 @@ def recorded(seconds: float, axes: list[int], *, phi: np.ndarray = PHI) -> np.nd
 
 
 class Stream:
-    """A source that ends."""
+    """Source that ends."""
 
     dt, live = DT, False
 
@@ -69,10 +68,10 @@ class Stream:
         pass
 
 
-def test_it_stops_when_two_looks_know_and_says_what_identify_says(tmp_path: Path) -> None:
+def test_calibration_stops_after_two_agreeing_results_and_equals_identify(tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
     recorder = Recorder()
-    looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, ASKED)
+    looks = calibrate(Stream(recorded(20.0, [0, 1, 2])), recorder, path, TOLERANCE)
     assert recorder.seconds < 8.0
     assert [at.sure.all() for at in looks[-3:]] == [False, True, True]
     assert [at.known.all() for at in looks[-3:]] == [False, False, True]
@@ -80,13 +79,13 @@ def test_it_stops_when_two_looks_know_and_says_what_identify_says(tmp_path: Path
     assert last.found is not None and last.advice == "" and all(at.advice for at in looks[:-2])
     again = identify_log(path).identification
     np.testing.assert_array_equal(last.found.identification.phi, again.phi)
-    error = values_of(ASKED, again.phi) - values_of(ASKED, PHI)
-    assert (np.abs(error) < sizes_of(ASKED, PHI)).all()
+    error = values_of(TOLERANCE, again.phi) - values_of(TOLERANCE, PHI)
+    assert (np.abs(error) < sizes_of(TOLERANCE, PHI)).all()
     assert last.t == pytest.approx(identify_log(path).log.t[-1])
 
 
 class Live(Stream):
-    """A stream that fails in the end."""
+    """Live stream that ends with an error."""
 
     live = True
 
@@ -97,26 +96,26 @@ class Live(Stream):
         return found
 
 
-def test_a_source_that_fails_loses_no_record_and_no_earlier_one(tmp_path: Path) -> None:
+def test_failing_source_keeps_the_record_and_earlier_records(tmp_path: Path) -> None:
     path = tmp_path / Recorder.file
     for seconds in (0.5, 0.8):
         with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-            calibrate(Live(recorded(seconds, [0])), Recorder(), path, ASKED)
+            calibrate(Live(recorded(seconds, [0])), Recorder(), path, TOLERANCE)
     with pytest.raises(DrakeTeleopError, match="the robot is gone"):
-        calibrate(Live(recorded(0.0, [0])), Recorder(), path, ASKED)  # nothing came
+        calibrate(Live(recorded(0.0, [0])), Recorder(), path, TOLERANCE)  # nothing came
     assert len(pl.read_parquet(path)) == 160
     assert len(pl.read_parquet(tmp_path / "earlier-1" / path.name)) == 100
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def looked_at(values: np.ndarray, until: str, path: Path) -> Look:
+def evaluate(values: np.ndarray, until: str, path: Path) -> Evaluation:
     log = Log(DT * np.arange(len(values)), *np.split(values, [6, 9, 12], axis=1))
     write_log(log, path)
-    return look(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
+    return evaluate_record(path, read_tolerance(until), None, cutoff_hz=30.0, delay="auto")
 
 
-def test_about_one_axis_the_inertia_about_the_others_stays_unknown(tmp_path: Path) -> None:
-    at = looked_at(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
+def test_rotation_about_one_axis_leaves_other_inertias_unknown(tmp_path: Path) -> None:
+    at = evaluate(recorded(4.0, [1]), "mass 5 %, inertia 20 %", tmp_path / "log.parquet")
     known = dict(zip(read_tolerance("mass 5 %, inertia 20 %").entries, at.sure, strict=True))
     assert known["mass"] and known["inertia xy"]
     assert not any(known[f"inertia {axes}"] for axes in ("xx", "xz", "zz"))
@@ -124,9 +123,9 @@ def test_about_one_axis_the_inertia_about_the_others_stays_unknown(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_of_two_loads_none_is_known(tmp_path: Path) -> None:
+def test_no_parameter_is_known_after_a_change_of_load(tmp_path: Path) -> None:
     both = np.concatenate([recorded(3.0, [0, 1, 2]), recorded(3.0, [0, 1, 2], phi=1.5 * PHI)])
-    at = looked_at(both, "mass 1000 %", tmp_path / "log.parquet")
+    at = evaluate(both, "mass 1000 %", tmp_path / "log.parquet")
     assert at.half < 1.0 and not at.sure.any()
     assert at.doubts[0].startswith("from t = 3.00 s on there is another load")
     assert (
@@ -135,17 +134,17 @@ def test_of_two_loads_none_is_known(tmp_path: Path) -> None:
 
 
 def contact(seconds: float) -> np.ndarray:
-    """(N, 6) a push and pull of 12 N between 2.5 and 3.5 s."""
+    """Return a contact wrench (N, 6) of up to 12 N between 2.5 and 3.5 s."""
     t = DT * np.arange(round(seconds / DT))
     force = np.where(np.abs(t - 3.0) < 0.5, 12.0 * np.sin(np.pi * (t - 2.5)) ** 2, 0.0)
     return force[:, None] * np.array([1.0, -0.6, 0.3, 0.05, 0.1, 0.0]) * np.cos(9.0 * t)[:, None]
 
 
 @pytest.mark.slow
-def test_a_contact_that_is_left_out_is_no_doubt(tmp_path: Path) -> None:
+def test_excluded_contact_causes_no_doubt(tmp_path: Path) -> None:
     values = recorded(6.0, [0, 1, 2])
     values[:, :6] += contact(6.0)
-    at = looked_at(values, "mass 0.5 %", tmp_path / "log.parquet")
+    at = evaluate(values, "mass 0.5 %", tmp_path / "log.parquet")
     assert at.found is not None
     assert [cause.name for cause in at.found.causes] == ["contact"]
     assert at.doubts == () and at.sure.all() and at.advice == ""
@@ -154,7 +153,7 @@ def test_a_contact_that_is_left_out_is_no_doubt(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.pictures
 @pytest.mark.parametrize(("name", "time"), [("zero change", 4.0), ("load change", 2.5)])
-def test_the_command_gives_the_time_of_a_tare_and_of_a_grasp(
+def test_command_reports_the_time_of_a_tare_and_of_a_grasp(
     tmp_path: Path, name: str, time: float
 ) -> None:
     values, first = recorded(6.0, [0, 1, 2]), round(time / DT)
@@ -162,7 +161,7 @@ def test_the_command_gives_the_time_of_a_tare_and_of_a_grasp(
         values[first:, :6] += [2.0, -1.0, 3.0, 0.05, 0.1, -0.1]
     else:
         values[first:] = recorded(6.0, [0, 1, 2], phi=1.3 * PHI)[first:]
-    looked_at(values, "mass 1 %", tmp_path / "log.csv")
+    evaluate(values, "mass 1 %", tmp_path / "log.csv")
     arguments = ["calibrate", f"replay:{tmp_path}/log.csv", "--until", "mass 0.001 %"]
     result = CliRunner().invoke(cli, [*arguments, "--out", str(tmp_path)], standalone_mode=False)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -174,19 +173,19 @@ def test_the_command_gives_the_time_of_a_tare_and_of_a_grasp(
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_motion_that_was_not_made_is_missing(axis: int) -> None:
-    """Swung about two axes, the third is what is asked for; at rest, no turn about the vertical."""
+def test_advice_is_the_missing_motion(axis: int) -> None:
+    """At rest the advice is a rotation about a horizontal axis."""
     others = [k for k in range(3) if k != axis]
     t = DT * np.arange(1600)
     errors = errors_of(read_tolerance("inertia 1 %"), PHI)
-    words = missing_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
+    words = best_motion(motion(t, np.array(others)), DT, 30.0, errors, NOISE)
     assert f"swing the wrist about {'xyz'[axis]}" in words
     rest = np.tile(9.81 * np.eye(3)[axis], (400, 1)), np.zeros((400, 3)), np.zeros((400, 3))
-    words = missing_motion(rest, DT, 30.0, errors_of(read_tolerance("mass 1 %"), PHI), NOISE)
+    words = best_motion(rest, DT, 30.0, errors_of(read_tolerance("mass 1 %"), PHI), NOISE)
     assert f"about {'xyz'[axis]}" not in words and "turn" in words
 
 
-def test_bad_readings_are_left_out_and_a_set_clock_begins_anew(tmp_path: Path) -> None:
+def test_bad_readings_are_rejected_and_a_set_clock_starts_a_new_part(tmp_path: Path) -> None:
     rows, recorder = recorded(1.0, [0]), Recorder(np.full(6, 80.0))
     broken = rows[3].copy()
     broken[1], rows[5, 0] = np.nan, 80.0
@@ -203,7 +202,7 @@ def test_bad_readings_are_left_out_and_a_set_clock_begins_anew(tmp_path: Path) -
 
 
 def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
-    """So many readings from each of these times on."""
+    """Record a number of readings from each start time."""
     number = 0
     for start, count in clocks:
         for k in range(count):
@@ -214,14 +213,16 @@ def take(recorder: Recorder, *clocks: tuple[float, int]) -> Recorder:
 
 @pytest.mark.parametrize("wrong", [1e6, -1e6, 1e300, 20.0, 0.0])
 @pytest.mark.parametrize("count", [1, 2, 49])
-def test_wrong_stamps_cost_only_their_own_readings(wrong: float, count: int) -> None:
+def test_wrong_stamps_reject_only_their_own_readings(wrong: float, count: int) -> None:
     recorder = take(Recorder(), (10.0, 800), (wrong, count), (14.0, 200))
     assert (recorder.left_out, recorder.began_anew) == (count, 0)
     assert recorder.seconds == pytest.approx(4.0 + 199 * DT)
 
 
 @pytest.mark.parametrize(("first", "second"), [(800, 60), (60, 800)])
-def test_of_two_clocks_the_longest_part_is_kept(first: int, second: int, tmp_path: Path) -> None:
+def test_longest_part_is_written_after_a_clock_change(
+    first: int, second: int, tmp_path: Path
+) -> None:
     recorder = take(Recorder(), (0.0, first), (1e6, 1), (500.0, second))
     assert (recorder.left_out, recorder.began_anew) == (1, 1)
     assert recorder.seconds == pytest.approx(799 * DT)
@@ -229,8 +230,8 @@ def test_of_two_clocks_the_longest_part_is_kept(first: int, second: int, tmp_pat
     assert len(pl.read_parquet(tmp_path / recorder.file)) == 800
 
 
-def test_wrong_stamps_of_one_stream_leave_the_others_alone() -> None:
-    recorder = PartRecorder(Parts(Told(WRENCH), Told(POSE)), None, X_FS)
+def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
+    recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), None, X_FS)
     pose, wrench = np.eye(7)[0], np.ones(6)
     for k in range(1000):
         recorder.take((Part(WRENCH, k, 1e7 if k == 400 else DT * k, wrench), DT * k))
@@ -245,8 +246,8 @@ def test_wrong_stamps_of_one_stream_leave_the_others_alone() -> None:
 
 @pytest.mark.slow
 @pytest.mark.pictures
-def test_the_command_says_by_its_status_that_it_is_not_known(tmp_path: Path) -> None:
-    looked_at(recorded(2.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.csv")
+def test_exit_status_is_1_if_the_tolerance_is_not_met(tmp_path: Path) -> None:
+    evaluate(recorded(2.0, [0, 1, 2]), "mass 1 %", tmp_path / "log.csv")
     out = tmp_path / "out"
     arguments = f"calibrate replay:{tmp_path}/log.csv --until".split()
     arguments += ["mass 0.0001 %", "--out", str(out)]
@@ -258,18 +259,18 @@ def test_the_command_says_by_its_status_that_it_is_not_known(tmp_path: Path) -> 
 
 
 def posed(seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times at 500 Hz, noisy wrenches of S and noisy poses of F, which is not S."""
+    """Return times at 500 Hz, noisy wrenches of S and noisy poses of F."""
     t, rng = 0.002 * np.arange(round(seconds / 0.002)), np.random.default_rng(2)
-    told = [truth(each) for each in t]
-    motion = np.split(np.array([each[1] for each in told]), 3, axis=1)
+    sent = [truth(each) for each in t]
+    motion = np.split(np.array([each[1] for each in sent]), 3, axis=1)
     wrench = non_contact_wrench(*motion, PHI) + 1.0 + NOISE * rng.normal(size=(len(t), 6))
-    poses = np.array([each[0] for each in told])
+    poses = np.array([each[0] for each in sent])
     return t, wrench, poses + np.repeat([2e-5, 2e-5], [4, 3]) * rng.normal(size=(len(t), 7))
 
 
-def test_poses_of_another_frame_and_clock_are_kept_as_they_came(tmp_path: Path) -> None:
-    """Stamps of the motion are 4 ms late, and of another clock."""
-    recorder = PartRecorder(Parts(Told(WRENCH), Told(POSE)), np.full(6, 80.0), X_FS)
+def test_poses_of_another_frame_and_clock_are_recorded_unprocessed(tmp_path: Path) -> None:
+    """The stamps of the motion are 4 ms late and from another clock."""
+    recorder = PartRecorder(Parts(StreamStub(WRENCH), StreamStub(POSE)), np.full(6, 80.0), X_FS)
     late, clock = 0.004, 1e4
     for k, (t, wrench, pose) in enumerate(zip(*posed(2.0), strict=True)):
         recorder.take((Part(WRENCH, k, t, wrench), t + 0.001))
@@ -281,13 +282,13 @@ def test_poses_of_another_frame_and_clock_are_kept_as_they_came(tmp_path: Path) 
     recorder.write(tmp_path / recorder.file)
     found = identify_log(tmp_path / recorder.file)
     assert found.identification.delay_s == pytest.approx(late, abs=1e-3)
-    error = values_of(ASKED, found.identification.phi) - values_of(ASKED, PHI)
-    assert (np.abs(error) < sizes_of(ASKED, PHI)).all()
+    error = values_of(TOLERANCE, found.identification.phi) - values_of(TOLERANCE, PHI)
+    assert (np.abs(error) < sizes_of(TOLERANCE, PHI)).all()
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("rtde_receive") is None, reason="ur_rtde has no wheel here")
-def test_a_robot_of_ur_with_a_turned_and_shifted_sensor(tmp_path: Path) -> None:
+def test_calibration_with_a_ur_and_a_rotated_and_shifted_sensor(tmp_path: Path) -> None:
     sockets.on_purpose.add(30004)
     _, wrench, pose = posed(9.0)
     turn = Rotation.from_quat(pose[:, [1, 2, 3, 0]]).as_rotvec()

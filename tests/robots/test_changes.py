@@ -27,7 +27,7 @@ Values = np.ndarray
 
 
 def stream(rest_s: float | None = None, seconds: float = 14.0, seed: int = 0) -> Values:
-    """(N, 15) readings of a tool that turns about three axes, and rests from `rest_s` on."""
+    """Return readings (N, 15) of a tool that rotates about three axes, at rest from `rest_s` on."""
     rng = np.random.default_rng(seed)
     t = DT * np.arange(round(seconds / DT))
     angles = 0.8 * np.sin(np.outer(t, [0.9, 1.3, 0.7]) + rng.uniform(0.0, 6.0, 3))
@@ -47,7 +47,7 @@ def loaded(values: Values, phi: Values) -> Values:
 
 
 class Readings:
-    """A source that ends."""
+    """Source that ends."""
 
     dt = DT
 
@@ -63,8 +63,8 @@ class Readings:
         pass
 
 
-class Kept:
-    """A sink that keeps everything."""
+class ListSink:
+    """Sink that stores all outputs."""
 
     def __init__(self) -> None:
         self.out: list[Compensated] = []
@@ -79,16 +79,16 @@ class Kept:
 def compensated(
     values: Values, *, looked_for: bool = True, live: bool = False
 ) -> tuple[list[Compensated], list[str]]:
-    """What came out, and what was said but for the flags."""
-    said: list[str] = []
-    sought = Changes(DT, live=live, say=said.append) if looked_for else None
-    kept = Kept()
+    """Return outputs and reports."""
+    messages: list[str] = []
+    sought = Changes(DT, live=live, report=messages.append) if looked_for else None
+    sink = ListSink()
     compensator = Compensator(LOAD, DT, watch=Watch(LOAD, DT, 30.0))
     # As fast as it comes: the clock of the loop is that of the readings.
-    run(Readings(values, live=False), compensator, kept, changes=sought)
+    run(Readings(values, live=False), compensator, sink, changes=sought)
     if sought is not None:
         sought.close()
-    return kept.out, said
+    return sink.out, messages
 
 
 def time_of(report: str) -> float:
@@ -117,54 +117,54 @@ def release(values: Values, k: int) -> None:
         (release, "another load, -0.85 kg"),
     ],
 )
-def test_a_change_is_reported_once_with_its_time_and_size(
+def test_change_is_reported_once_with_time_and_size(
     change: Callable[[Values, int], None], words: str, time: float
 ) -> None:
     values = stream(seed=round(time))
     change(values, round(time / DT))
-    out, said = compensated(values)
-    assert len(said) == 1 and time_of(said[0]) == pytest.approx(time, abs=0.02)
+    out, messages = compensated(values)
+    assert len(messages) == 1 and time_of(messages[0]) == pytest.approx(time, abs=0.02)
     kind, *sizes = words.split(", ")
     numbers = [float(x) for x in re.findall(r"[+-][\d.]+", sizes[0])]
-    found = [float(x) for x in re.findall(r"[+-][\d.]+", said[0])]
-    assert kind in said[0]
+    found = [float(x) for x in re.findall(r"[+-][\d.]+", messages[0])]
+    assert kind in messages[0]
     np.testing.assert_allclose(found[: len(numbers)], numbers, atol=0.02)
     if change is not tare:
         assert out[-1].flags & Flag.OTHER_LOAD
 
 
 @pytest.mark.slow
-def test_a_tare_and_then_a_grasp_are_both_reported() -> None:
+def test_tare_and_later_grasp_are_both_reported() -> None:
     values = stream(seconds=20.0)
     tare(values, round(5.0 / DT))
     grasp(values, round(11.0 / DT))
-    said = compensated(values)[1]
-    assert ["zero" in said[0], "load" in said[1]] == [True, True]
-    assert [time_of(x) for x in said] == pytest.approx([5.0, 11.0], abs=0.02)
+    messages = compensated(values)[1]
+    assert ["zero" in messages[0], "load" in messages[1]] == [True, True]
+    assert [time_of(x) for x in messages] == pytest.approx([5.0, 11.0], abs=0.02)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("push", [[1, 2, -6, 0.3, 0.1, 0], [0, 0, -4, 0.1, 0, 0]])
-def test_a_push_at_rest_is_neither(push: list[float]) -> None:
+def test_push_at_rest_is_not_reported(push: list[float]) -> None:
     values = stream(rest_s=5.0)
     values[round(6.0 / DT) :, :6] += push
-    out, said = compensated(values)
-    assert said == [] and out[-1].flags == Flag.IN_CONTACT
+    out, messages = compensated(values)
+    assert messages == [] and out[-1].flags == Flag.IN_CONTACT
 
 
 @pytest.mark.slow
-def test_a_contact_that_varies_is_neither_and_nothing_is_nothing() -> None:
+def test_varying_contact_and_free_motion_are_not_reported() -> None:
     values = stream()
     assert compensated(values)[1] == []
     t = DT * np.arange(len(values))
     size = np.where(np.abs(t - 8.0) < 2.0, 8.0 * np.cos(5.0 * t), 0.0)
     values[:, :6] += size[:, None] * np.array([1.0, -0.5, 0.3, 0.05, 0.1, 0.0])
-    out, said = compensated(values)
-    assert said == [] and any(row.flags & Flag.IN_CONTACT for row in out)
+    out, messages = compensated(values)
+    assert messages == [] and any(row.flags & Flag.IN_CONTACT for row in out)
 
 
 @pytest.mark.slow
-def test_the_wrenches_are_the_same_to_the_last_bit() -> None:
+def test_monitoring_does_not_change_the_wrenches() -> None:
     values = stream()
     tare(values, round(6.0 / DT))
     (out, _), (plain, _) = (compensated(values, looked_for=x) for x in (True, False))
@@ -174,31 +174,30 @@ def test_the_wrenches_are_the_same_to_the_last_bit() -> None:
 
 
 @pytest.mark.slow
-def test_a_live_stream_is_explained_by_another_process() -> None:
+def test_live_stream_is_explained_by_another_process() -> None:
     values = stream()
     grasp(values, round(6.0 / DT))
-    said = compensated(values, live=True)[1]
-    assert len(said) == 1 and time_of(said[0]) == pytest.approx(6.0, abs=0.02)
+    messages = compensated(values, live=True)[1]
+    assert len(messages) == 1 and time_of(messages[0]) == pytest.approx(6.0, abs=0.02)
 
 
-def test_a_failing_explanation_does_not_end_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_explanation_does_not_stop_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(rows: Values, dt: float) -> list[tuple[float, str]]:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(changes, "reports", fail)
+    monkeypatch.setattr(changes, "find_changes", fail)
     values = stream(seconds=8.0)
     tare(values, round(4.0 / DT))
-    out, said = compensated(values)
+    out, messages = compensated(values)
     assert len(out) == len(values)
-    assert said and all("could not be looked for (singular)" in words for words in said)
+    assert messages and all("another load failed (singular)" in words for words in messages)
 
 
-def test_lost_readings_and_a_clock_that_was_set() -> None:
-    """What is explained are the last 20 s, in order, and only what came after the clock was set."""
+def test_record_contains_the_last_20_s_after_a_clock_change() -> None:
     seen = []
-    sought = Changes(DT, live=False, say=print)
-    sought._beside.shutdown()
-    sought._next = np.inf
+    sought = Changes(DT, live=False, report=print)
+    sought._executor.shutdown()
+    sought._next_attempt = np.inf
     row = np.zeros(15)
     for k, t in enumerate([0.0, *(50.0 + DT * np.arange(11_000))]):
         sought.take(Reading(k, t, row + t), int(Flag.STALE if k == 500 else 0))
@@ -220,6 +219,6 @@ def test_the_command_reports_the_time_of_a_tare(
     LOAD.save(tmp_path / "load.json")
     source, sink = f"replay:{tmp_path}/log.parquet", f"{tmp_path}/out.csv"
     compensate_command(source, tmp_path / "load.json", sink, watch=True, delay=0.0)
-    said = capfd.readouterr().err
-    assert said.count("the sensor has another zero") == 1
-    assert "t = 6.00 s: the sensor has another zero" in said
+    messages = capfd.readouterr().err
+    assert messages.count("the sensor has another zero") == 1
+    assert "t = 6.00 s: the sensor has another zero" in messages

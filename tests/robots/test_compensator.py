@@ -1,4 +1,4 @@
-"""The live wrench is that of `eliminate --causal`, and zero where it cannot be trusted."""
+"""The live wrench equals `eliminate --causal`, and is zero for invalid readings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def moving(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def readings(count: int, *, touched: float = 0.0, start: float = 0.0) -> list[Reading]:
-    """Of a load that moves, with a force of `touched` N along x."""
+    """Return readings of a moving load, with a contact force of `touched` N along x."""
     t = start + DT * np.arange(count)
     motion = moving(t)
     wrench = non_contact_wrench(*motion, PHI) + OFFSETS
@@ -54,8 +54,8 @@ def resting(count: int, wrench: np.ndarray) -> list[Reading]:
     return [Reading(k, DT * k, values) for k in range(count)]
 
 
-class Kept:
-    """A sink."""
+class ListSink:
+    """Sink that stores all outputs."""
 
     def __init__(self) -> None:
         self.rows: list[Compensated] = []
@@ -69,7 +69,7 @@ class Kept:
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """2 s with a push, noise, a motion that comes late, and a gap."""
+    """2 s with a push, noise, a late motion, and a gap."""
     t = DT * np.arange(1000)
     rng = np.random.default_rng(3)
     wrench = non_contact_wrench(*moving(t), PHI) + OFFSETS + 0.1 * rng.normal(size=(1000, 6))
@@ -81,7 +81,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("mode", ["delayed", "predicted"])
-def test_replayed_it_is_what_eliminate_writes(log: Path, mode: str) -> None:
+def test_replayed_log_equals_eliminate(log: Path, mode: str) -> None:
     options = {"sigma": 0.3, "gamma": 1.5}
     wanted = eliminate_log(log, load(), **options, causal=mode, delay=DELAY)
     assert wanted.causal is not None and len(wanted.log) < 960
@@ -89,7 +89,7 @@ def test_replayed_it_is_what_eliminate_writes(log: Path, mode: str) -> None:
     @settings(max_examples=3, deadline=None, derandomize=True)
     @given(chunk=st.integers(1, 2000))
     def at(chunk: int) -> None:
-        source, kept = LogSource(log, load(), delay=DELAY, chunk=chunk), Kept()
+        source, kept = LogSource(log, load(), delay=DELAY, chunk=chunk), ListSink()
         late = {"wait": source.wait, "predicted": mode == "predicted"}
         counts = run(source, Compensator(load(), source.dt, **options, **late), kept)
         good = [row for row in kept.rows if not row.flags]
@@ -125,7 +125,7 @@ def bad(reading: Reading, name: str) -> Reading:
         ("told", Flag.SATURATED),
     ],
 )  # fmt: skip
-def test_a_bad_reading_is_zero_and_the_next_is_not(name: str, flag: Flag) -> None:
+def test_wrench_is_zero_for_a_bad_reading_only(name: str, flag: Flag) -> None:
     compensator = Compensator(load(), DT, largest=np.full(6, 60.0))
     stream = readings(40, touched=5.0)
     for reading in stream[:20]:
@@ -140,17 +140,17 @@ def test_a_bad_reading_is_zero_and_the_next_is_not(name: str, flag: Flag) -> Non
     np.testing.assert_allclose(after.contact, [5.0, 0, 0, 0, 0, 0], atol=1e-9)
 
 
-def test_nothing_for_a_while_is_zero_and_then_it_settles_anew() -> None:
+def test_wrench_is_zero_during_silence_and_the_filter_restarts() -> None:
     compensator = Compensator(load(), DT)
-    first = compensator.idle(0.0)
+    first = compensator.stale_output(0.0)
     assert first is not None and first.flags == Flag.STALE
     for reading in readings(20, touched=5.0):
         compensator.step(reading, reading.t)
     last = 19 * DT
-    assert compensator.idle(last + 0.9 * STALE_S) is None
-    assert compensator.left(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
-    assert compensator.left(last + 1.1 * STALE_S) == 0.0
-    stale = compensator.idle(last + 1.1 * STALE_S)
+    assert compensator.stale_output(last + 0.9 * STALE_S) is None
+    assert compensator.time_to_stale(last + 0.9 * STALE_S) == pytest.approx(0.1 * STALE_S)
+    assert compensator.time_to_stale(last + 1.1 * STALE_S) == 0.0
+    stale = compensator.stale_output(last + 1.1 * STALE_S)
     assert stale is not None and stale.flags == Flag.STALE and not stale.contact.any()
     again = readings(1200, touched=-4.0)[1000]  # two seconds later, another contact
     out = compensator.step(again, again.t)
@@ -158,7 +158,7 @@ def test_nothing_for_a_while_is_zero_and_then_it_settles_anew() -> None:
     np.testing.assert_allclose(out.contact[0], -4.0, atol=1e-9)
 
 
-def test_what_is_late_is_stale_until_it_proves_another_clock() -> None:
+def test_late_readings_are_stale_until_the_clock_is_accepted() -> None:
     compensator, delay = Compensator(load(), DT), 0.2
     flags = []
     for reading in readings(800, touched=5.0):
@@ -176,9 +176,7 @@ def test_what_is_late_is_stale_until_it_proves_another_clock() -> None:
     [(50.0, 20, Flag.CLOCK_JUMP), (-50.0, 20, Flag.CLOCK_JUMP), (-50.0, 0, Flag.RESTART),
      (20 * DT, 0, Flag.RESTART)],
 )  # fmt: skip
-def test_clocks_that_are_set_and_sources_that_begin_anew_are_named(
-    start: float, number: int, flag: Flag
-) -> None:
+def test_clock_jumps_and_restarts_are_flagged(start: float, number: int, flag: Flag) -> None:
     compensator = Compensator(load(), DT)
     for reading in readings(20):
         compensator.step(reading, reading.t)
@@ -192,9 +190,7 @@ def test_clocks_that_are_set_and_sources_that_begin_anew_are_named(
 
 
 @pytest.mark.parametrize(("number", "flag"), [(0, Flag.RESTART), (60, Flag.CLOCK_JUMP)])
-def test_less_than_a_second_back_is_believed_when_nothing_else_comes(
-    number: int, flag: Flag
-) -> None:
+def test_small_backward_clock_step_is_accepted_after_a_silence(number: int, flag: Flag) -> None:
     compensator = Compensator(load(), DT)
     for reading in readings(60):
         compensator.step(reading, reading.t)
@@ -207,7 +203,7 @@ def test_less_than_a_second_back_is_believed_when_nothing_else_comes(
     assert flags == [Flag.REORDERED] * at + [flag] + [0] * (49 - at)
 
 
-def test_another_rate_than_the_stated_one_is_named() -> None:
+def test_wrong_rate_is_flagged() -> None:
     flags = {}
     for share in (1.0, 1.2):
         compensator = Compensator(load(), share * DT)
@@ -215,14 +211,14 @@ def test_another_rate_than_the_stated_one_is_named() -> None:
     assert flags == {1.0: 0, 1.2: Flag.WRONG_RATE}
 
 
-def test_no_wrench_is_above_the_sensors_range() -> None:
+def test_wrench_is_limited_to_the_range_of_the_sensor() -> None:
     compensator = Compensator(load(), DT, gamma=30.0, largest=np.full(6, 60.0))
     out = [compensator.step(each, each.t) for each in readings(20, touched=5.0)][-1]
     assert out.flags == Flag.CLIPPED and out.scaled[0] == 60.0
     np.testing.assert_allclose(out.contact[0], 5.0)
 
 
-def test_what_waits_is_clipped_whenever_it_comes_out() -> None:
+def test_delayed_wrenches_are_clipped() -> None:
     compensator = Compensator(load(), DT, wait=2, cutoff_hz=None, largest=np.full(6, 60.0))
     compensator.offsets = OFFSETS - 20.0 * (np.arange(6) == 0)
     out = [compensator.step(each, each.t) for each in readings(3, touched=45.0)]
@@ -230,11 +226,12 @@ def test_what_waits_is_clipped_whenever_it_comes_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
-    [("free", "done"), ("short", "not 0.5 s"), ("moving", "it moves"), ("push", "is touched"),
-     ("wavers", "wavers")],
+    ("name", "reason"),
+    [("free", "done"), ("short", "fewer than 0.5 s"), ("moving", "the sensor moves"),
+     ("push", "contact, or"),
+     ("wavers", "the wrench varies")],
 )  # fmt: skip
-def test_a_tare_refuses_and_says_why(name: str, said: str) -> None:
+def test_tare_is_refused_with_a_reason(name: str, reason: str) -> None:
     compensator, count = Compensator(load(), DT), round(TARE_S / DT)
     drift = np.array([0.5, -0.3, 0.2, 0.01, 0.0, 0.02])
     stream = resting(count, OFFSETS + drift)
@@ -246,7 +243,7 @@ def test_a_tare_refuses_and_says_why(name: str, said: str) -> None:
         values = reading.values.copy()
         values[2] += {"push": 8.0, "wavers": 0.5 * math.sin(30 * reading.t)}.get(name, 0.0)
         compensator.step(reading._replace(values=values), reading.t)
-    assert said in compensator.tare()
+    assert reason in compensator.tare()
     moved = drift if name == "free" else np.zeros(6)
     np.testing.assert_allclose(compensator.offsets, OFFSETS + moved, atol=1e-12)
     assert compensator.tare().startswith("refused") or name != "free"

@@ -1,4 +1,4 @@
-"""`export`: what independent parsers read out of each format is the load that went in."""
+"""`export`: independent parsers read the exported load back."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ INERTIA = np.array([[4.1e-3, 3e-4, -2e-4], [3e-4, 5.2e-3, 1e-4], [-2e-4, 1e-4, 3
 OFFSETS = np.array([1.5, -2.5, 3.5, 0.1, -0.2, 0.3])
 X_FS = RigidTransform(RollPitchYaw(np.radians([20.0, -35.0, 110.0])), [0.01, -0.02, 0.045])
 POSE = ("0.01", "-0.02", "0.045", "20", "-35", "110")
-TURNED = {"R_FS": X_FS.rotation().matrix(), "p_FoSo_F": X_FS.translation()}
+TURNED = {"sensor_pose": tuple(map(float, POSE))}
 
 FOUND = Identification(
     phi=phi_from_mass_com_inertia(MASS, COM, INERTIA),
@@ -40,7 +40,7 @@ FOUND = Identification(
 
 
 def in_flange() -> tuple[np.ndarray, np.ndarray]:
-    """Centre of mass and inertia about it, in F."""
+    """Return centre of mass and inertia about it, in F."""
     R = X_FS.rotation().matrix()
     return X_FS @ COM, R @ INERTIA @ R.T
 
@@ -126,17 +126,17 @@ READERS = {
 }
 
 
-def test_all_targets_are_read_here():
+def test_every_target_has_a_reader():
     assert READERS.keys() == FORMATS.keys()
 
 
 @pytest.mark.parametrize("name", [*READERS, "mjcf by MuJoCo"])
-def test_what_is_read_back_is_the_load(name):
-    """To 1e-9 of each number's size, with a turned and shifted sensor where it may be."""
+def test_exported_load_is_read_back(name):
+    """Relative error 1e-9, with a rotated and shifted sensor where allowed."""
     target, _, other = name.partition(" ")
     of_sensor = FORMATS[target].of_sensor
     text, warnings = export(FOUND, target, **({} if of_sensor else TURNED))
-    assert FORMATS[target].inertia == (not any("no place for" in text for text in warnings))
+    assert FORMATS[target].inertia == (not any("no field for" in text for text in warnings))
     mass, com, inertia = (by_mujoco if other else READERS[target])(text)
     com_0, inertia_0 = (COM, INERTIA) if of_sensor else in_flange()
     assert mass == pytest.approx(MASS, rel=1e-9)
@@ -146,21 +146,21 @@ def test_what_is_read_back_is_the_load(name):
         np.testing.assert_allclose(inertia, inertia_0, rtol=0.0, atol=1e-9 * 5e-3)
 
 
-def test_a_ur_and_an_xarm_get_a_call():
+def test_ur_and_xarm_export_a_function_call():
     text, _ = export(FOUND, "ur", **TURNED)
     assert re.fullmatch(r"set_target_payload\([^,]+, \[([^,]+, ){2}[^,]+\], \[.*\]\)\n", text)
     text, warnings = export(FOUND, "xarm", **TURNED)
-    assert "no place for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
+    assert "no field for the inertia" in warnings[0] and text.startswith(f"# {warnings[0]}\n")
 
 
-def test_a_franka_gets_the_identity():
+def test_franka_exports_the_identity_transformation():
     read = json.loads(export(FOUND, "franka", **TURNED)[0])
     np.testing.assert_array_equal(np.reshape(read["transformation"], (4, 4), "F"), np.eye(4))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_compensations_take_off_what_the_sensor_reads(sign):
-    """Of any attitude: the reading is sign times what the sensor exerts on the load, Eq. (1)."""
+def test_exported_compensation_cancels_the_reading(sign):
+    """The reading is sign times the wrench of sensor on load, Eq. (1)."""
     g = X_FS.rotation().matrix()[2] * -9.81
     held = np.concatenate([-MASS * g, np.cross(COM, -MASS * g)]) + OFFSETS
     reading = sign * held
@@ -179,7 +179,7 @@ def test_compensations_take_off_what_the_sensor_reads(sign):
     assert list(bota["payload_properties"]["bias"].values()) == pytest.approx(sign * OFFSETS)
 
 
-def test_what_is_not_identified_is_not_to_be_entered():
+def test_unidentified_values_cause_warnings():
     unsure = dataclasses.replace(FOUND, identifiable=np.arange(16) != 10, covariance=np.eye(16))
     for name, told in (("ur", True), ("xarm", False)):
         text, warnings = export(unsure, name)
@@ -188,20 +188,20 @@ def test_what_is_not_identified_is_not_to_be_entered():
     assert not any("f_ox" in text for text in export(unsure, "ur")[1])
 
 
-def test_what_cannot_be_is_one_line():
+def test_inconsistent_load_and_wrong_target_raise_one_line():
     nobody = dataclasses.replace(FOUND, phi=FOUND.phi * [1, 1, 1, 1, -1, 1, 1, 1, 1, 1])
-    with pytest.raises(DrakeTeleopError, match=r"no body has these values.*consistent"):
+    with pytest.raises(DrakeTeleopError, match=r"not physically consistent.*consistent"):
         export(nobody, "urdf")
-    assert any("no body" in text for text in export(nobody, "ur")[1])
+    assert any("not physically consistent" in text for text in export(nobody, "ur")[1])
     with pytest.raises(DrakeTeleopError, match="the sign of the wrench is wrong"):
         export(dataclasses.replace(FOUND, phi=-FOUND.phi), "ur")
     with pytest.raises(DrakeTeleopError, match="kth takes its values in the sensor's frame"):
         export(FOUND, "kth", **TURNED)
-    with pytest.raises(DrakeTeleopError, match=r"'kuka' is no target.*ur, franka"):
+    with pytest.raises(DrakeTeleopError, match=r"'kuka' is not a target.*ur, franka"):
         export(FOUND, "kuka")
 
 
-def test_the_command(tmp_path, capsys):
+def test_command_prints_text_and_warnings(tmp_path, capsys):
     FOUND.save(tmp_path / "load.json")
     for name in FORMATS:
         pose = () if FORMATS[name].of_sensor else ("--sensor-pose", *POSE)
@@ -222,7 +222,7 @@ def test_the_command(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("to", sorted(FORMATS))
-def test_a_weight_that_the_robot_has_removed_is_not_subtracted_once_more(to) -> None:
+def test_removed_weight_is_not_subtracted_again(to) -> None:
     weightless = dataclasses.replace(FOUND, weight_removed=True)
     if FORMATS[to].of_sensor:
         with pytest.raises(DrakeTeleopError, match=f"{to} would subtract it once more"):

@@ -1,4 +1,4 @@
-"""The sensor's motion from the joints of an arm whose model is known."""
+"""Motion of the sensor from the joint positions of a modelled arm."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from test_calibrate import NOISE, PHI
 from test_peers import free_port, peer
-from test_reading_assembly import Told
+from test_reading_assembly import StreamStub
 
 from drake_teleop.cli.main import cli, main
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.tolerance import read_tolerance, sizes_of, values_of
-from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.joints import PosedByJoints
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.ros2_source import Messages
-from drake_teleop.robots.sources_and_sinks import source_of
+from drake_teleop.robots.assembly import Assembly, Parts, PosedByJoints
+from drake_teleop.robots.connections import open_source
+from drake_teleop.robots.ros2 import Messages
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
 from drake_teleop.station.slave.joint_poses import arm_of
@@ -62,7 +60,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def moved(seconds: float) -> tuple[np.ndarray, ...]:
-    """Times, and positions, speeds and accelerations of the joints."""
+    """Return times, and positions, speeds and accelerations of the joints."""
     t = DT * np.arange(round(seconds / DT))
     w = 2.0 * np.pi * np.array([0.5, 0.9, 1.3, 1.1])
     a, phase = np.array([0.3, 0.4, 0.5, 0.6]), np.outer(t, w) + np.arange(4)
@@ -70,14 +68,14 @@ def moved(seconds: float) -> tuple[np.ndarray, ...]:
 
 
 def motion_of(table: np.ndarray, joints: tuple[np.ndarray, ...]) -> np.ndarray:
-    """(N, 9) of S, by the arm's own recursion."""
+    """Return the motion (N, 9) of S by the recursion of the arm."""
     out = np.empty((len(joints[0]), 21))
     for row, q, v, vdot in zip(out, *joints, strict=True):
         sensor_motion(table, q, v, vdot, row)
     return out[:, :9]
 
 
-def test_the_pose_is_drakes(model: Path) -> None:
+def test_pose_equals_drake(model: Path) -> None:
     arm = arm_of(model, "tool")
     assert arm is not None and arm.joint_names == NAMES
     plant = MultibodyPlant(0.0)
@@ -92,18 +90,18 @@ def test_the_pose_is_drakes(model: Path) -> None:
     assert abs(pose[:4] @ wxyz) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_joints_come_in_any_order_and_those_of_a_gripper_are_left_out() -> None:
+def test_joint_order_is_arbitrary_and_gripper_joints_are_ignored() -> None:
     messages = Messages(1.0, joints=NAMES)
-    told = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
-    (part,) = messages.parts(JOINTS, told, b"")
+    sent = joint_state(5_250_000_000, [*NAMES[::-1], "finger"], [4.0, 3.0, 2.0, 1.0, 9.0])
+    (part,) = messages.parts(JOINTS, sent, b"")
     assert part.stream == JOINTS and part.t == 5.25
     np.testing.assert_array_equal(part.values, [1.0, 2.0, 3.0, 4.0])
     assert messages.parts(JOINTS, joint_state(0, ["finger"], [9.0]), b"") == []
     assert messages.parts(JOINTS, joint_state(0, list(NAMES), [1.0]), b"") == []
 
 
-class Joints(Told):
-    """A source of what it is given."""
+class Joints(StreamStub):
+    """Source of given parts."""
 
     def __init__(self, parts: list[Part]) -> None:
         super().__init__(WRENCH, JOINTS, POSE)
@@ -113,7 +111,7 @@ class Joints(Told):
         return self._parts
 
 
-def test_the_motion_is_that_of_the_sensor(model: Path) -> None:
+def test_joint_motion_gives_the_motion_of_the_sensor(model: Path) -> None:
     arm = arm_of(model, "tool")
     assert arm is not None
     t, *joints = moved(0.4)
@@ -121,10 +119,10 @@ def test_the_motion_is_that_of_the_sensor(model: Path) -> None:
     parts = [Part(JOINTS, k, float(t[k]), q) for k, q in enumerate(joints[0])]
     source = PosedByJoints(Joints([*bad, *parts]), arm)
     assert source.streams == (WRENCH, POSE)
-    told = source.read(0.0)
-    assert told is not None and len(told) == len(parts) + 1 and np.isnan(told[0].values).all()
+    sent = source.read(0.0)
+    assert sent is not None and len(sent) == len(parts) + 1 and np.isnan(sent[0].values).all()
     assembly, found = Assembly(Parts(source)), []
-    for k, part in enumerate(told[1:]):
+    for k, part in enumerate(sent[1:]):
         found += assembly.take(part, part.t) + assembly.take(
             Part(WRENCH, k, part.t, np.zeros(6)), part.t
         )
@@ -136,22 +134,20 @@ def test_the_motion_is_that_of_the_sensor(model: Path) -> None:
     np.testing.assert_array_less(worst, np.repeat([0.05, 0.01, 0.3], 3))
 
 
-def test_what_is_asked_for_goes_together(model: Path) -> None:
+def test_options_for_joints_are_checked_together(model: Path) -> None:
     arm, address = arm_of(model, "tool"), "zenoh://127.0.0.1/ft?joints=/joint_states"
-    with pytest.raises(DrakeTeleopError, match="joints are of an arm that is not known"):
-        source_of(address, None, rate_hz=500.0)
-    with pytest.raises(DrakeTeleopError, match="tells no joints of --model"):
-        source_of("posed://127.0.0.1:0", None, rate_hz=500.0, arm=arm)
+    with pytest.raises(DrakeTeleopError, match="joint positions need the model of the arm"):
+        open_source(address, None, rate_hz=500.0)
+    with pytest.raises(DrakeTeleopError, match="delivers no joint positions for --model"):
+        open_source("posed://127.0.0.1:0", None, rate_hz=500.0, arm=arm)
     with pytest.raises(SystemExit):
         main(["compensate", "udp://:1", "--rate", "1", "--load", "x", "--sensor-frame", "tool"])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("box", ["netft", "zenoh"])
-def test_a_load_is_known_by_a_box_and_the_arms_joints(
-    box: str, model: Path, tmp_path: Path
-) -> None:
-    """From processes of their own: wrench by either protocol, joints by ROS 2."""
+def test_calibration_with_a_wrench_source_and_joints(box: str, model: Path, tmp_path: Path) -> None:
+    """Wrench by either protocol and joints by ROS 2 come from other processes."""
     arm = arm_of(model, "tool")
     assert arm is not None
     _, *joints = moved(40.0)

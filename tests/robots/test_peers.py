@@ -1,4 +1,4 @@
-"""Each source against a peer in a process of its own, which does all that can go wrong."""
+"""Each source against a simulated device in another process, with all kinds of faults."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from websockets.sync.client import connect
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.netft import NetFtSource, page_of
-from drake_teleop.robots.ros2_source import Ros2Source
+from drake_teleop.robots.connections import open_sink
+from drake_teleop.robots.netft import NetFtSource, parse_page
+from drake_teleop.robots.ros2 import Ros2Source
 from drake_teleop.robots.rtde import RtdeSource
-from drake_teleop.robots.sources_and_sinks import sink_of
 from drake_teleop.robots.streams import (
     ACCELERATION,
     POSE,
@@ -52,7 +52,7 @@ OFFSETS = np.array([0.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 @contextmanager
 def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
-    """The peer while it runs: where it is, and what it says later."""
+    """Yield address and later output of a running peer."""
     with subprocess.Popen([sys.executable, PEER, *words], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         lines = (line.decode().strip() for line in process.stdout)
@@ -63,10 +63,10 @@ def peer(*words: str) -> Iterator[tuple[str, Iterator[str]]]:
 
 
 class Seen(list[Compensated]):
-    """What the loop of `compensate` makes of a source, with the times when."""
+    """Outputs of the loop of `compensate` for a source, with their times."""
 
     def __init__(self, source: Source, last: int, end: Flag = Flag.RESTART) -> None:
-        """Until a good wrench of the last number after that flag; the tool is at rest."""
+        """Read until a good wrench with number `last` after the flag `end`, with a tool at rest."""
         self.at: list[float] = []
         self.parts: list[Part] = []
         compensator = Compensator(load(), source.dt, cutoff_hz=None)
@@ -75,7 +75,7 @@ class Seen(list[Compensated]):
         while time.monotonic() < until:
             parts = source.read(0.01)
             assert parts is not None
-            if (stale := compensator.idle(time.monotonic())) and not parts:
+            if (stale := compensator.stale_output(time.monotonic())) and not parts:
                 self._take(stale)
             self.parts += parts
             for part in parts:
@@ -169,10 +169,10 @@ def test_ros_2() -> None:
     seen.check(flags | Flag.CLOCK_JUMP)
 
 
-def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
+def test_ros_2_node_receives_the_wrench() -> None:
     wrench = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     with peer("ros_echo", free_port()) as (port, lines):
-        sink = sink_of(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
+        sink = open_sink(f"zenoh://127.0.0.1:{port}/tool/contact?frame=tool0&domain=4")
         seen: list[str] = []
         reader = threading.Thread(target=lambda: seen.extend(lines))
         reader.start()
@@ -196,7 +196,7 @@ def test_a_wrench_for_ros_2_as_a_node_would_see_it() -> None:
 def test_foxglove_and_mcap(tmp_path: Path) -> None:
     path = tmp_path / "new" / "out.mcap"
     rows = [Compensated(k, 0.5 * k, np.arange(6.0), -np.arange(6.0), 32) for k in range(3)]
-    file, live = sink_of(str(path)), sink_of("foxglove://127.0.0.1:0")
+    file, live = open_sink(str(path)), open_sink("foxglove://127.0.0.1:0")
     with connect(f"ws://127.0.0.1:{live.port}", subprotocols=["foxglove.sdk.v1"]) as page:
         page.recv()
         channel = json.loads(page.recv())["channels"][0]["id"]
@@ -221,7 +221,7 @@ def test_foxglove_and_mcap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("real_hz", "named"), [(500.0, True), (1004.0, False)])
-def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, named: bool) -> None:
+def test_netft_with_another_rate_is_flagged_and_not_late(real_hz: float, named: bool) -> None:
     source = NetFtSource("netft://127.0.0.1?counts=1,1&rate=1000&sign=1")
     compensator, flags = Compensator(load(), source.dt), []
     for k in range(round(2.5 * real_hz)):
@@ -233,12 +233,12 @@ def test_a_box_at_another_rate_is_named_and_does_not_seem_late(real_hz: float, n
     assert set(flags[-200:]) == {Flag.WRONG_RATE if named else 0}
 
 
-def test_a_box_is_asked_for_its_counts_units_and_rate() -> None:
+def test_netft_page_contains_counts_units_and_rate() -> None:
     page = """<netft><cfgcpf>4448</cfgcpf><cfgcpt>1000000</cfgcpt><scfgfu>lbf</scfgfu>
         <scfgtu>N-mm</scfgtu><comrdtrate>500</comrdtrate></netft>"""
-    assert page_of(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
+    assert parse_page(page.encode()) == pytest.approx([4448 / 4.4482216, 1e9, 500.0])
     for bad in (b"", b"<a/>", page.encode().replace(b"500", b"0"), page.encode()[:60]):
         with pytest.raises((ValueError, KeyError, SyntaxError)):
-            page_of(bad)
-    with pytest.raises(DrakeTeleopError, match="or say them: netft://HOST"):
+            parse_page(bad)
+    with pytest.raises(DrakeTeleopError, match="or give them: netft://HOST"):
         NetFtSource("netft://127.0.0.9")

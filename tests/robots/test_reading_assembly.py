@@ -1,4 +1,4 @@
-"""Wrench and motion of the same instant, made of streams that tell one or the other."""
+"""Readings from separate streams of wrench and motion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from test_compensator import OFFSETS, PHI, load
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.rotations import rotation_matrices
-from drake_teleop.robots.assembly import Assembly
+from drake_teleop.robots.assembly import Assembly, Parts
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.parts import Parts
-from drake_teleop.robots.sources_and_sinks import source_of
+from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.streams import IMU, POSE, WRENCH, Flag, Part, Reading
 
 DT, GRAVITY = 0.001, np.array([0.0, 0.0, 9.81])
@@ -30,7 +29,7 @@ def turn(axis: int, angle: float) -> np.ndarray:
 
 
 def truth(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """X_WF (7,), and the motion of S (9,), by closed forms: R_WF = Rz(a) Rx(b), b constant rate."""
+    """Return X_WF (7,) and the motion (9,) of S in closed form: R_WF = Rz(a) Rx(b), linear b."""
     a, da, dda = 0.5 * math.sin(4 * t), 2.0 * math.cos(4 * t), -8.0 * math.sin(4 * t)
     b, db = 0.7 * t, 0.7
     R_WF = turn(2, a) @ turn(0, b)
@@ -47,8 +46,8 @@ def truth(t: float) -> tuple[np.ndarray, np.ndarray]:
     return pose, np.concatenate([R_FS.T @ x for x in (s, omega, alpha)])
 
 
-class Told:
-    """A source of parts, or of its streams."""
+class StreamStub:
+    """Source of parts without data."""
 
     def __init__(self, *streams: str) -> None:
         self.dt, self.streams = DT, streams
@@ -68,7 +67,7 @@ def wrench_at(t: float, k: int) -> Part:
 def played(
     assembly: Assembly, seconds: float, *, lost=lambda k: False, later: float = 0.0
 ) -> list[Reading]:
-    """Wrench at 1 kHz, poses at 500 Hz, whose clock is `later`; some poses do not come."""
+    """Feed wrenches at 1 kHz and poses at 500 Hz, with clock offset `later` and lost poses."""
     found = []
     for k in range(round(seconds / DT)):
         t = k * DT
@@ -79,8 +78,8 @@ def played(
 
 
 @pytest.mark.parametrize("lost", [lambda k: False, lambda k: k % 14 == 0])
-def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
-    found = played(Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost)
+def test_motion_belongs_to_the_instant_of_the_wrench(lost) -> None:
+    found = played(Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS), 0.4, lost=lost)
     good = [each for each in found if not each.flags]
     assert len(good) > 200 and good[-1].t > 0.4 - 0.035  # half a window late
     wanted = np.array([truth(each.t)[1] for each in good])
@@ -94,9 +93,9 @@ def test_the_motion_is_that_of_the_wrenchs_instant(lost) -> None:
     assert len(left) > 200 and np.abs(left).max() < 0.03  # of 17 N
 
 
-def test_the_inertia_alone_is_subtracted_where_the_robot_has_removed_the_weight() -> None:
-    """The weight is that of the same orientation, so that only mass times acceleration is left."""
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, weight_removed=True)
+def test_only_inertial_wrench_is_subtracted_if_the_weight_is_removed() -> None:
+    """The removed weight has the same orientation, so that only mass times acceleration remains."""
+    assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS, weight_removed=True)
     found = [each for each in played(assembly, 0.4) if not each.flags]
     rest, left = np.zeros(3), []
     for each in found:
@@ -106,33 +105,33 @@ def test_the_inertia_alone_is_subtracted_where_the_robot_has_removed_the_weight(
         left.append(each.values[:6] - weight - OFFSETS - non_contact_wrench(*motion, PHI))
     assert len(left) > 200 and np.abs(left).max() < 0.03
     with pytest.raises(DrakeTeleopError, match="without an orientation"):
-        Assembly(Parts(Told(WRENCH, IMU)), weight_removed=True)
+        Assembly(Parts(StreamStub(WRENCH, IMU)), weight_removed=True)
     weightless = dataclasses.replace(load(), weight_removed=True)
     with pytest.raises(DrakeTeleopError, match=r"udp://:0.*without an orientation"):
-        source_of("udp://:0", weightless, rate_hz=500.0)
+        open_source("udp://:0", weightless, rate_hz=500.0)
 
 
 def test_two_clocks() -> None:
-    apart = Assembly(Parts(Told(WRENCH), Told(POSE)), X_FS=X_FS)
-    same = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
+    apart = Assembly(Parts(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS)
+    same = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     a, b = played(apart, 0.3, later=1e4), played(same, 0.3)
     good = [each.values for each in a if not each.flags], [x.values for x in b if not x.flags]
     np.testing.assert_allclose(good[0][-150:], good[1][-150:], atol=1e-4)
-    late = Assembly(Parts(Told(WRENCH), Told(POSE)), X_FS=X_FS, delay_s=0.01)
+    late = Assembly(Parts(StreamStub(WRENCH), StreamStub(POSE)), X_FS=X_FS, delay_s=0.01)
     shifted = [each for each in played(late, 0.3, later=1e4) if not each.flags]
     np.testing.assert_allclose(shifted[-1].values[6:], truth(shifted[-1].t + 0.01)[1], atol=0.1)
 
 
-def test_without_poses_there_is_no_motion_and_it_begins_anew() -> None:
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
+def test_readings_are_stale_without_poses_and_recover() -> None:
+    assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     found = played(assembly, 0.6, lost=lambda k: 200 <= k < 280)
     assert not any(0.2 <= each.t < 0.28 for each in found if not each.flags)
     assert {each.flags for each in found} == {0, int(Flag.STALE)}
     assert [each.flags for each in found[-150:]] == [0] * 150
 
 
-def test_what_is_no_pose_or_out_of_order_is_left_out() -> None:
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
+def test_invalid_and_out_of_order_poses_are_ignored() -> None:
+    assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     played(assembly, 0.3)
     for values, t in (
         (np.full(7, math.nan), 0.3),
@@ -145,8 +144,8 @@ def test_what_is_no_pose_or_out_of_order_is_left_out() -> None:
     assert after == []  # as no more motions are known
 
 
-def test_a_clock_that_is_set_back() -> None:
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS)
+def test_assembly_accepts_a_clock_that_is_set_back() -> None:
+    assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS)
     compensator = Compensator(load(), DT)
     for each in played(assembly, 0.2):
         compensator.step(each, each.t + 0.03)
@@ -163,8 +162,8 @@ def test_a_clock_that_is_set_back() -> None:
     assert any(row.flags & Flag.CLOCK_JUMP for row in out)
 
 
-def test_an_imu_tells_it_too() -> None:
-    assembly, found = Assembly(Parts(Told(WRENCH, IMU))), []
+def test_imu_gives_the_motion() -> None:
+    assembly, found = Assembly(Parts(StreamStub(WRENCH, IMU))), []
     for k in range(250):
         t = k * DT
         found += assembly.take(Part(IMU, k, t, truth(t)[1][:6]), t)
@@ -175,6 +174,6 @@ def test_an_imu_tells_it_too() -> None:
     np.testing.assert_array_less(np.abs(motion - wanted).max(axis=0), [0.01] * 6 + [0.1] * 3)
 
 
-def test_a_wrench_alone_is_not_enough() -> None:
-    with pytest.raises(DrakeTeleopError, match="tells no motion; give --motion"):
-        Assembly(Parts(Told(WRENCH)))
+def test_wrench_without_motion_is_refused() -> None:
+    with pytest.raises(DrakeTeleopError, match="delivers no motion; give --motion"):
+        Assembly(Parts(StreamStub(WRENCH)))

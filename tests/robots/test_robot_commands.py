@@ -1,4 +1,4 @@
-"""What docs/robot.md has typed beside a stream on this machine, with a sender that is a thread."""
+"""Commands of docs/robot.md with a stream on this machine; a thread sends it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOUCH = np.array([5.0, 0.0, -3.0, 0.0, 0.2, 0.0])
 
 @pytest.fixture
 def here(tmp_path, monkeypatch) -> Iterator[None]:
-    """Where `identify` has been; one test at a time, since the page's ports are typed."""
+    """Folder with the result of `identify`; one test at a time, because the ports are fixed."""
     monkeypatch.chdir(tmp_path)
     Path("out/load").mkdir(parents=True)
     load().save(Path("out/load/identification.json"))
@@ -37,10 +37,10 @@ def here(tmp_path, monkeypatch) -> Iterator[None]:
 
 
 class Peer:
-    """Packets for port 49152, one every `each_s`, from when it is listened to.
+    """Sender of packets to port 49152, one every `each_s`, from when it is open.
 
-    With a socket of answers they begin with the first of those, and end with Ctrl-C.
-    A clock that is late for once is late for good, so that the first packet is of no reading.
+    With a socket of answers the packets start after the first answer, and end with Ctrl-C. The
+    first packet contains no reading, because a late one would shift the clock for good.
     """
 
     def __init__(
@@ -89,26 +89,26 @@ class Peer:
         if self._answers is not None:
             with contextlib.suppress(BlockingIOError):
                 while True:
-                    self.heard.append(udp.unpacked_wrench(self._answers.recv(1000)))
+                    self.heard.append(udp.unpack_wrench(self._answers.recv(1000)))
 
 
 @pytest.fixture
 def answers(here) -> Iterator[socket.socket]:
-    """Where the wrenches go."""
+    """Receiver of the wrenches."""
     with udp.listening(udp.THIS_MACHINE, 49153) as there:
         there.setblocking(False)
         yield there
 
 
 def touched(count: int) -> list[Reading]:
-    """Untouched at rest, and then touched."""
+    """Return readings at rest, first free, then in contact."""
     free, pushed = resting(count, OFFSETS), resting(2 * count, OFFSETS + TOUCH)
     return [row._replace(t=0.001 * row.number) for row in (*free, *pushed[count:])]
 
 
-def test_a_load_is_found_in_a_stream(here) -> None:
+def test_documented_calibrate_command_identifies_the_load(here) -> None:
     rows = recorded(40.0, [0, 1, 2])
-    packets = [udp.packed(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
+    packets = [udp.pack_reading(Reading(k, DT * k, row)) for k, row in enumerate(rows)]
     with Peer(packets, 0.1 * DT):
         type_in("docs/robot.md", "drake-teleop calibrate udp")
     found = json.loads(Path("out/load/identification.json").read_text())
@@ -117,8 +117,8 @@ def test_a_load_is_found_in_a_stream(here) -> None:
     assert found["mass"] == pytest.approx(PHI[0], rel=0.005)
 
 
-def test_a_tool_is_taken_out_of_a_stream(here, answers, capfd) -> None:
-    with Peer([udp.packed(row) for row in touched(800)], 0.001, answers) as peer:
+def test_documented_compensate_command_eliminates_the_tool(here, answers, capfd) -> None:
+    with Peer([udp.pack_reading(row) for row in touched(800)], 0.001, answers) as peer:
         type_in("docs/robot.md", "drake-teleop compensate udp")
     assert "tare" in capfd.readouterr().err
     last = [row for row in peer.heard if not row.flags][-1]
@@ -126,10 +126,10 @@ def test_a_tool_is_taken_out_of_a_stream(here, answers, capfd) -> None:
     np.testing.assert_allclose(last.contact, TOUCH, atol=0.01)
 
 
-def test_a_tool_is_taken_out_of_a_stream_with_poses(here, answers) -> None:
+def test_documented_compensate_command_works_with_poses(here, answers) -> None:
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.1, 0.3])
     packets = [
-        udp.packed_parts(
+        udp.pack_parts(
             Part(WRENCH, row.number, row.t, -row.values[:6]), Part(POSE, row.number, row.t, pose)
         )
         for row in touched(300)

@@ -1,4 +1,4 @@
-"""Packets and lines: nothing that comes in raises, and what goes out can be read."""
+"""Packets and lines: no input raises, and outputs can be read."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from drake_teleop.common.writing import CannotWrite
 from drake_teleop.robots import table
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.lines import LineSource, read_line, written_line
-from drake_teleop.robots.sources_and_sinks import sink_of, source_of
+from drake_teleop.robots.connections import open_sink, open_source
+from drake_teleop.robots.lines import LineSource, read_line, wrench_line
 from drake_teleop.robots.streams import DAMAGED, POSE, WRENCH, Compensated, Flag, Part, Reading
 
 HEADER = Path(udp.__file__).with_name("drake_teleop_udp.h").read_text()
@@ -36,23 +36,23 @@ def line_of(reading) -> bytes:
     return json.dumps({"t": reading.t} | {name: x.tolist() for name, x in names}).encode()
 
 
-def test_packets_and_lines_are_read_as_they_were_written() -> None:
+def test_packets_and_lines_are_read_back() -> None:
     reading = readings(3)[2]
-    back = udp.unpacked(udp.packed(reading._replace(flags=int(Flag.SATURATED))))
+    back = udp.unpack_reading(udp.pack_reading(reading._replace(flags=int(Flag.SATURATED))))
     assert back[:2] == reading[:2] and back.flags == Flag.SATURATED
     np.testing.assert_array_equal(back.values, reading.values)
     back = read_line(line_of(reading), 7)
     assert back.number == 7
     np.testing.assert_array_equal(back.values, reading.values)
     out = Compensated(5, 0.5, np.arange(6.0), -np.arange(6.0), 34)
-    again = udp.unpacked_wrench(udp.packed_wrench(out))
+    again = udp.unpack_wrench(udp.pack_wrench(out))
     assert again.flags == 34 and again.scaled.tolist() == out.scaled.tolist()
-    assert json.loads(written_line(out))["flags"] == ["damaged", "stale"]
-    with pytest.raises(DrakeTeleopError, match="is no wrench"):
-        udp.unpacked_wrench(b"x")
+    assert json.loads(wrench_line(out))["flags"] == ["damaged", "stale"]
+    with pytest.raises(DrakeTeleopError, match="is not a wrench packet"):
+        udp.unpack_wrench(b"x")
 
 
-def test_the_header_says_the_same() -> None:
+def test_c_header_has_the_same_layout_and_flags() -> None:
     sizes = {"char": 1, "uint32_t": 4, "uint64_t": 8, "double": 8}
     lengths = []
     for body in re.findall(r"typedef struct \{(.*?)\n\}", HEADER, re.S):
@@ -67,10 +67,10 @@ def test_the_header_says_the_same() -> None:
 
 
 @pytest.mark.parametrize("kind", ["packet", "line"])
-def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> None:
-    """10^4 of them, between good ones; the fuzz target `wrenches` makes more."""
+def test_damaged_input_raises_no_error_and_gives_finite_numbers(kind: str) -> None:
+    """5000 damaged inputs between good ones; the fuzz target `wrenches` tests more."""
     rng, compensator = random.Random(4), Compensator(load(), DT, gamma=2.0)
-    good = [udp.packed(each) if kind == "packet" else line_of(each) for each in readings(50)]
+    good = [udp.pack_reading(each) if kind == "packet" else line_of(each) for each in readings(50)]
     flags = 0
     for k in range(5000):
         data = bytearray(good[k % 50])
@@ -78,7 +78,7 @@ def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> Non
             data[rng.randrange(len(data))] = rng.randrange(256)
         if rng.random() < 0.1:
             data = data[: rng.randrange(len(data))]
-        reading = udp.unpacked(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
+        reading = udp.unpack_reading(bytes(data)) if kind == "packet" else read_line(bytes(data), k)
         out = compensator.step(reading, k * DT)
         assert np.isfinite([out.t, *out.contact, *out.scaled]).all()
         flags |= out.flags
@@ -92,27 +92,27 @@ def test_no_damage_raises_or_makes_a_number_that_is_not_finite(kind: str) -> Non
 @pytest.mark.parametrize(
     "line", [b"", b"[]", b"3", b"{}", b"\xff", b"[" * 4000, b"{" * 9000, b'{"t":1,"wrench":"x"}']
 )
-def test_a_line_that_is_none(line: bytes) -> None:
+def test_invalid_line_is_damaged(line: bytes) -> None:
     assert read_line(line, 0) is DAMAGED
 
 
 @pytest.mark.parametrize("number", [2**64, 10**20, -1, 1e300, 10**400, None, "x", [1]])
-def test_a_number_that_no_packet_and_no_table_holds_is_damage(number) -> None:
+def test_number_outside_64_bits_is_damaged(number) -> None:
     line = json.loads(line_of(readings(1)[0]))
     assert read_line(json.dumps(line | {"number": number}).encode(), 0) is DAMAGED
     largest = read_line(json.dumps(line | {"number": 2**64 - 1}).encode(), 0)
     out = Compensator(load(), DT).step(largest, 0.0)
-    assert udp.unpacked_wrench(udp.packed_wrench(out)).number == 2**64 - 1
+    assert udp.unpack_wrench(udp.pack_wrench(out)).number == 2**64 - 1
 
 
-def test_from_socket_to_socket_on_this_machine_alone() -> None:
+def test_udp_round_trip_accepts_only_this_machine() -> None:
     source = udp.UdpSource("udp://:0", DT)
     with udp.listening(udp.THIS_MACHINE, 0) as there:
         there.settimeout(5.0)
-        sink = sink_of(f"udp://127.0.0.1:{there.getsockname()[1]}")
+        sink = open_sink(f"udp://127.0.0.1:{there.getsockname()[1]}")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             for reading in readings(3, touched=5.0):
-                sender.sendto(udp.packed(reading), ("127.0.0.1", source.port))
+                sender.sendto(udp.pack_reading(reading), ("127.0.0.1", source.port))
             sender.sendto(b"x" * 1000, ("127.0.0.1", source.port))
         assert source._socket.getsockname()[0] == "127.0.0.1"
         found = source.read(5.0)
@@ -120,7 +120,7 @@ def test_from_socket_to_socket_on_this_machine_alone() -> None:
         compensator = Compensator(load(), DT)
         for reading in found:
             sink.write(compensator.step(reading, reading.t))
-        back = [udp.unpacked_wrench(there.recv(1000)) for _ in range(4)]
+        back = [udp.unpack_wrench(there.recv(1000)) for _ in range(4)]
     assert [row.flags for row in back] == [0, 0, 0, Flag.DAMAGED]
     np.testing.assert_allclose(back[2].contact[0], 5.0, atol=1e-9)
     assert source.read(0.0) == []
@@ -133,7 +133,7 @@ def test_wrench_and_pose_in_a_packet() -> None:
     pose = Part(POSE, 4, 0.5, np.array([1.0, 0, 0, 0, 0.4, 0.1, 0.3]))
     source = udp.PosedSource("posed://:0", DT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for packet in (udp.packed_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
+        for packet in (udp.pack_parts(wrench, pose), b"x" * udp.POSED.size, b"DTP1"):
             sender.sendto(packet, ("127.0.0.1", source.port))
     assert source._socket.getsockname()[0] == "127.0.0.1"
     found = source.read(5.0)
@@ -144,20 +144,20 @@ def test_wrench_and_pose_in_a_packet() -> None:
     assert [part.flags for part in found] == [Flag.SATURATED, 0, Flag.DAMAGED, Flag.DAMAGED]
 
 
-def test_lines_from_a_pipe_to_a_table(tmp_path: Path) -> None:
+def test_lines_from_a_pipe_are_written_to_a_table(tmp_path: Path) -> None:
     out, into = os.pipe()
     lines = b"\n".join(map(line_of, readings(30, touched=5.0)))
     os.write(into, lines[:1000])
     os.write(into, lines[1000:] + b"\n{}\n")
     os.close(into)
-    sink, said = sink_of(str(tmp_path / "x" / "out.csv")), []
-    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, say=said.append)
+    sink, messages = open_sink(str(tmp_path / "x" / "out.csv")), []
+    counts = run(LineSource(out, DT), Compensator(load(), DT), sink, report=messages.append)
     os.close(out)
     sink.close()
     table = pl.read_csv(tmp_path / "x" / "out.csv")
     assert counts["wrenches"] == len(table) == 31 and counts["damaged"] == 1
     assert table["contact_f_x"][29] == pytest.approx(5.0) and table["flags"][30] == 2
-    assert any(text.endswith("damaged") for text in said)
+    assert any(text.endswith("damaged") for text in messages)
 
 
 TABLES = ("x.csv", "x.parquet")
@@ -184,7 +184,7 @@ for k in range(10**6):
 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("after", [1, 57, 200])
-def test_a_kill_leaves_what_came_until_then(tmp_path: Path, name: str, after: int) -> None:
+def test_table_contains_the_rows_before_a_kill(tmp_path: Path, name: str, after: int) -> None:
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / name)], stdout=subprocess.PIPE, text=True
     )
@@ -201,7 +201,7 @@ def test_a_kill_leaves_what_came_until_then(tmp_path: Path, name: str, after: in
 
 
 class Failing:
-    """A sink's wrenches until the disk is full, or an error or Ctrl-C comes from elsewhere."""
+    """Sink that is used until the disk is full, or until an error or Ctrl-C."""
 
     def __init__(self, sink: table.TableSink) -> None:
         self.sink, self.written = sink, 0
@@ -215,7 +215,7 @@ class Failing:
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_what_was_written_before_a_full_disk_is_whole(tmp_path, name: str, monkeypatch) -> None:
+def test_rows_before_a_full_disk_are_complete(tmp_path, name: str, monkeypatch) -> None:
     monkeypatch.setattr(table, "PERIOD_S", dict.fromkeys((".csv", ".parquet"), 1e-3))
     with small_disk(tmp_path, 100_000):
         failing = Failing(table.TableSink(tmp_path / name))
@@ -229,8 +229,8 @@ def test_what_was_written_before_a_full_disk_is_whole(tmp_path, name: str, monke
 
 @pytest.mark.parametrize("name", TABLES)
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OverflowError])
-def test_an_error_or_an_interrupt_loses_no_row_and_doubles_none(tmp_path, name, error) -> None:
-    """Not even when it comes while rows are written."""
+def test_error_or_interrupt_neither_loses_nor_repeats_rows(tmp_path, name, error) -> None:
+    """This includes an interrupt while rows are written."""
     failing, path = Failing(table.TableSink(tmp_path / name)), tmp_path / name
     failing.write_until(error, 50)
     with pytest.MonkeyPatch.context() as patch:
@@ -242,7 +242,7 @@ def test_an_error_or_an_interrupt_loses_no_row_and_doubles_none(tmp_path, name, 
 
 
 @pytest.mark.parametrize("name", [*TABLES, "x.mcap"])
-def test_a_live_source_overwrites_no_earlier_file(tmp_path, name, monkeypatch) -> None:
+def test_live_source_keeps_earlier_files(tmp_path, name, monkeypatch) -> None:
     if name == "x.mcap":
         pytest.importorskip("foxglove")
     load().save(tmp_path / "load.json")
@@ -260,7 +260,7 @@ def test_a_live_source_overwrites_no_earlier_file(tmp_path, name, monkeypatch) -
 
 
 class Interrupted:
-    """A source with one reading, and then Ctrl-C."""
+    """Source with one reading, followed by Ctrl-C."""
 
     dt, live = DT, True
 
@@ -276,12 +276,12 @@ class Interrupted:
         pass
 
 
-def test_ctrl_c_ends_it_with_what_there_was(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(Interrupted(), Compensator(load(), DT), sink_of("-")) == {"wrenches": 1}
+def test_ctrl_c_returns_the_counts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Interrupted(), Compensator(load(), DT), open_sink("-")) == {"wrenches": 1}
     assert json.loads(capsys.readouterr().out)["number"] == 0
 
 
-def test_the_control_port_tares_and_says_so() -> None:
+def test_control_port_answers_tare_requests() -> None:
     control = Control(0)
     control.answer(lambda: "")  # nothing was asked
     with udp.listening(udp.THIS_MACHINE, 0) as asker:
@@ -289,23 +289,25 @@ def test_the_control_port_tares_and_says_so() -> None:
         for word in (b"tare\n", b"tear"):
             asker.sendto(word, (udp.THIS_MACHINE, control.port))
             control.answer(Compensator(load(), DT).tare)
-        said = [asker.recv(100) for _ in range(2)]
+        messages = [asker.recv(100) for _ in range(2)]
     control.close()
-    assert said[0].startswith(b"refused: there are not 0.5 s") and said[1].startswith(b"unknown")
+    assert messages[0].startswith(b"refused: fewer than 0.5 s") and messages[1].startswith(
+        b"unknown"
+    )
 
 
 @pytest.mark.parametrize(
     "address",
     ["udp://:x", "udp://:70000", "udp://a", "tcp://:1", "log.csv", "netft://", "rtde://a?x=1"],
 )
-def test_an_address_that_is_none(address: str) -> None:
+def test_invalid_address_raises(address: str) -> None:
     with pytest.raises(DrakeTeleopError):
-        source_of(address, load(), rate_hz=500.0)
+        open_source(address, load(), rate_hz=500.0)
     if address != "log.csv":
         with pytest.raises(DrakeTeleopError):
-            sink_of(address)
+            open_sink(address)
 
 
-def test_a_live_source_needs_its_rate() -> None:
+def test_live_source_requires_a_rate() -> None:
     with pytest.raises(DrakeTeleopError, match="give --rate HZ"):
-        source_of("udp://:0", load())
+        open_source("udp://:0", load())

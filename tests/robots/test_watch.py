@@ -1,4 +1,4 @@
-"""Contact and another load, flagged beside the live wrench."""
+"""Flags for contact and another load, beside the live wrench."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.robots.compensator import Compensator
-from drake_teleop.robots.detector import Detector
 from drake_teleop.robots.streams import Flag, Reading
-from drake_teleop.robots.watch import Watch
+from drake_teleop.robots.watch import Detector, Watch
 
 DT = 0.002
 PHI = phi_from_mass_com_inertia(1.7, [0.01, -0.02, 0.06], np.diag([0.004, 0.005, 0.003]))
@@ -27,7 +26,7 @@ LOAD = Identification(
 
 
 def readings(seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """4 s of turning, (N,) times and (N, 15) values."""
+    """Return 4 s of rotation: times (N,) and values (N, 15)."""
     t = DT * np.arange(2000)
     angle, w = 0.8 * np.sin(3.0 * t), 2.4 * np.cos(3.0 * t)
     zero = np.zeros_like(t)
@@ -40,7 +39,7 @@ def readings(seed: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flagged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(N,) flags; the wrench is the same with and without the watch."""
+    """Return flags (N,); the wrench is equal with and without the watch."""
     watched = Compensator(LOAD, DT, watch=Watch(LOAD, DT, 30.0))
     plain = Compensator(LOAD, DT)
     found = []
@@ -52,7 +51,7 @@ def flagged(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def test_a_push_is_flagged_while_it_lasts_and_nothing_else() -> None:
+def test_push_is_flagged_while_it_lasts() -> None:
     t, values = readings()
     assert not flagged(t, values).any()
     values[1000:1250, 0] += 5.0
@@ -61,8 +60,8 @@ def test_a_push_is_flagged_while_it_lasts_and_nothing_else() -> None:
     assert (flags[1025:1250] == Flag.IN_CONTACT).all()
 
 
-def test_a_log_of_free_motion_tells_what_is_no_contact(tmp_path: Path) -> None:
-    """Of a gain that is wrong by 5 %, too: a third of what the watch needs is found then."""
+def test_noise_floor_of_a_free_log_detects_small_contacts(tmp_path: Path) -> None:
+    """With gains wrong by 5 % the threshold is a third of that of the watch."""
     gains, free = np.array([1.05, 1.0, 0.95, 1.0, 1.05, 1.0]), tmp_path / "free.parquet"
     t, before = readings(seed=5)
     before[:, :6] *= gains
@@ -86,7 +85,7 @@ def test_a_log_of_free_motion_tells_what_is_no_contact(tmp_path: Path) -> None:
 
 
 def shaken(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """2 s at rest, 2 s along x with 8 m/s^2 at 4 Hz; forces are told 5 % too large."""
+    """Return 2 s at rest, 2 s along x with 8 m/s^2 at 4 Hz; forces are 5 % too large."""
     t = readings(seed)[0]
     at, zero = t - 2.0, np.zeros_like(t)
     x = np.where(at > 0.0, 8.0 * np.minimum(at / 0.2, 1.0) * np.sin(8 * np.pi * at), 0.0)
@@ -96,8 +95,8 @@ def shaken(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return t, np.hstack([wrench, *motion])
 
 
-def test_the_floor_rises_with_the_acceleration_and_not_at_rest(tmp_path: Path) -> None:
-    """What the gains leave of 8 m/s^2 is 0.7 N and no contact; at rest half of it is one."""
+def test_noise_floor_rises_with_acceleration(tmp_path: Path) -> None:
+    """The gain error leaves 0.7 N at 8 m/s^2, no contact; half of it at rest is contact."""
     free = tmp_path / "free.parquet"
     t, before = shaken(seed=5)
     write_log(Log(t, *np.split(before, [6, 9, 12], axis=1)), free)
@@ -117,7 +116,7 @@ def test_the_floor_rises_with_the_acceleration_and_not_at_rest(tmp_path: Path) -
     assert max(abs(row.contact[0]) for row in out[1200:]) > 0.6
 
 
-def test_a_noise_floor_needs_the_streams_rate_and_a_low_pass(tmp_path: Path) -> None:
+def test_noise_floor_requires_the_same_rate_and_a_low_pass(tmp_path: Path) -> None:
     t, values = readings()
     write_log(Log(t, *np.split(values, [6, 9, 12], axis=1)), tmp_path / "free.parquet")
     with pytest.raises(DrakeTeleopError, match="has 500 Hz, and the stream 1000 Hz"):
@@ -126,7 +125,7 @@ def test_a_noise_floor_needs_the_streams_rate_and_a_low_pass(tmp_path: Path) -> 
         Detector(LOAD, tmp_path / "free.parquet", DT, None)
 
 
-def test_another_load_is_flagged_as_that_once_it_has_moved() -> None:
+def test_another_load_is_flagged_after_a_motion() -> None:
     t, values = readings()
     more = phi_from_mass_com_inertia(0.5, [0.0, 0.03, 0.1], 1e-4 * np.eye(3))
     motion = values[:, 6:9], values[:, 9:12], values[:, 12:]
@@ -135,7 +134,7 @@ def test_another_load_is_flagged_as_that_once_it_has_moved() -> None:
     assert not flags[:800].any() and (flags[-200:] == Flag.OTHER_LOAD).all()
 
 
-def test_a_tare_is_told_to_the_watch() -> None:
+def test_tare_resets_the_watch() -> None:
     watch = Watch(LOAD, DT, 30.0)
     compensator = Compensator(LOAD, DT, watch=watch)
     values = np.concatenate([OFFSETS, [0.0, 0.0, 9.81], np.zeros(6)])

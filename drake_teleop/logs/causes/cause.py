@@ -250,7 +250,8 @@ def _change(state: State, i: int) -> Cause:
     return Cause(
         "load change",
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is stated for each part of the record",
+        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is stated for each"
+        " part of the record",
         start_s=step.time,
         values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
     )
@@ -264,7 +265,8 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
 def _contact(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
-        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part of the record is not used",
+        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part of the record"
+        " is not used",
         start_s=start,
         stop_s=stop,
     )

@@ -10,13 +10,18 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.aligned_log import without_orientation
-from drake_teleop.robots.assembly import NOWHERE, Assembly, pose_of
-from drake_teleop.robots.joints import PosedByJoints, SensorPoseOfJoints
+from drake_teleop.robots.assembly import (
+    IDENTITY_POSE,
+    Assembly,
+    Parts,
+    PosedByJoints,
+    SensorPoseOfJoints,
+    pose_from_rpy,
+)
 from drake_teleop.robots.lines import LineSink, LineSource
-from drake_teleop.robots.parts import Parts
 from drake_teleop.robots.recording import PartRecorder, Recorder, Records
 from drake_teleop.robots.replay_log import LogSource
-from drake_teleop.robots.streams import JOINTS, PartSource, Sink, Source
+from drake_teleop.robots.streams import JOINTS, PartSource, Reading, Sink, Source
 from drake_teleop.robots.table import TableSink
 from drake_teleop.robots.udp import PosedSource, UdpSink, UdpSource
 
@@ -29,11 +34,11 @@ _SINKS = (
     " .mcap file"
 )
 _REPLAY = "replay:"
-_ANY_HZ = 1000.0
-_OF_PARTS = ("posed", "rtde", "netft", "zenoh")
+_UNUSED_RATE_HZ = 1000.0
+_PART_KINDS = ("posed", "rtde", "netft", "zenoh")
 
 
-def source_of(
+def open_source(
     address: str,
     load: Identification | None,
     *,
@@ -44,57 +49,54 @@ def source_of(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
-) -> Source:
-    """The source at an address: udp, posed, rtde, netft, zenoh, - for stdin, or replay:LOG.
+) -> Source[Reading]:
+    """Return the source at an address (docs/robot.md).
 
     Args:
-        address: see the sources; docs/robot.md lists them.
-        load: tells the delay, of a log that of which it is the wrench, else its own.
-        rate_hz: of the wrenches; a log, a UR and a NetBox tell their own.
-        cutoff_hz, delay: as of `eliminate_log`; see `Assembly`, too, where "auto" begins with the
-            delay of the load file, and follows it.
-        real_time: replays a log in its own time.
-        motion: address of another source that tells the motion, if the first does not.
-        sensor_pose: of the sensor in the frame whose poses come: x, y, z [m], and roll, pitch, yaw
-            [deg] about its axes, as in a URDF.
-        arm: whose joint positions come.
+        load: identified load, for the delay and for `weight_removed`.
+        rate_hz: rate of the wrenches; logs, UR robots and NetBoxes deliver their own.
+        cutoff_hz, delay: see `eliminate_log`; "auto" tracks the delay of live parts.
+        real_time: replay a log in real time.
+        motion: address of a second source, for the motion.
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the posed frame.
+        arm: kinematics for joint positions.
 
     Raises:
-        DrakeTeleopError: for another address, a live source without a rate, or as the source does.
+        DrakeTeleopError: for an invalid address, a missing rate, or an error of the source.
     """
     kind = _kind(address)
-    if kind in _OF_PARTS:
-        follow = load if isinstance(delay, str) else None
+    if kind in _PART_KINDS:
+        track = load if isinstance(delay, str) else None
         if isinstance(delay, str):
             delay = 0.0 if load is None else load.delay_s
-        parts = _parts(address, rate_hz, motion, arm)
+        parts = _open_parts(address, rate_hz, motion, arm)
         return Assembly(
             parts,
             cutoff_hz=cutoff_hz,
             delay_s=delay,
-            follow=follow,
+            track=track,
             X_FS=_pose(sensor_pose),
             weight_removed=load is not None and load.weight_removed,
         )
     if motion is not None or sensor_pose is not None or arm is not None:
         raise DrakeTeleopError(
-            "tells the motion of the sensor itself",
+            "delivers the motion of the sensor itself",
             where=address,
-            remedy="without --motion, --model and --sensor-pose",
+            remedy="remove --motion, --model and --sensor-pose",
         )
     if kind == "replay":
         path = address.removeprefix(_REPLAY)
         options = {"cutoff_hz": cutoff_hz, "delay": delay, "real_time": real_time}
         return LogSource(path, load, **options)  # type: ignore[arg-type]
     if kind not in ("-", "udp"):
-        raise DrakeTeleopError("is no source", where=address, remedy=_SOURCES)
+        raise DrakeTeleopError("is not a source", where=address, remedy=_SOURCES)
     if load is not None and load.weight_removed:
         raise without_orientation(address)
     dt = _period(rate_hz, address)
     return LineSource(sys.stdin.fileno(), dt) if kind == "-" else UdpSource(address, dt)
 
 
-def recorded(
+def open_recording(
     address: str,
     largest: Array | None,
     *,
@@ -102,44 +104,32 @@ def recorded(
     motion: str | None = None,
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
-) -> tuple[Any, Records[Any]]:
-    """What `calibrate` reads, readings or parts as they come, and who keeps them.
-
-    Args:
-        address, real_time, motion, sensor_pose, arm: see `source_of`.
-        largest: see `Recorder`.
-
-    Raises:
-        DrakeTeleopError: as `source_of`.
-    """
+) -> tuple[Source[Any], Records[Any]]:
+    """Return the stream that `calibrate` reads, and its recorder."""
     kind = _kind(address)
-    # All is kept with its times: the rate is asked of a box alone, whose times are counts.
-    rate_hz = None if kind == "netft" else _ANY_HZ
-    if kind in _OF_PARTS:
-        parts = _parts(address, rate_hz, motion, arm)
+    # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
+    rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
+    if kind in _PART_KINDS:
+        parts = _open_parts(address, rate_hz, motion, arm)
         return parts, PartRecorder(parts, largest, _pose(sensor_pose))
     readings = {"real_time": real_time, "motion": motion, "sensor_pose": sensor_pose, "arm": arm}
-    return source_of(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
+    return open_source(address, None, rate_hz=rate_hz, **readings), Recorder(largest)  # type: ignore[arg-type]
 
 
 def is_file(address: str) -> bool:
-    """Whether a sink is a file, or a folder of them."""
+    """Return whether a sink is a file or a folder of files."""
     return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
 
 
-def sink_of(address: str) -> Sink:
-    """The sink at an address: udp, zenoh, foxglove, - for stdout, .csv, .parquet or .mcap.
-
-    Raises:
-        DrakeTeleopError: for another address, or as the sink does.
-    """
+def open_sink(address: str) -> Sink:
+    """Return the sink at an address; raise DrakeTeleopError if it is invalid."""
     kind, path = _kind(address), Path(address)
     if kind == "-":
         return LineSink(sys.stdout)
     if kind == "udp":
         return UdpSink(address)
     if kind == "zenoh":
-        from drake_teleop.robots.ros2_sink import Ros2Sink
+        from drake_teleop.robots.ros2 import Ros2Sink
 
         return Ros2Sink(address)
     if kind == "foxglove" or (is_file(address) and path.suffix == ".mcap"):
@@ -147,12 +137,12 @@ def sink_of(address: str) -> Sink:
 
         return FoxgloveSink(address) if kind else McapSink(path)
     if not is_file(address):
-        raise DrakeTeleopError("is no sink", where=address, remedy=_SINKS)
+        raise DrakeTeleopError("is not a sink", where=address, remedy=_SINKS)
     return TableSink(path)
 
 
 def _kind(address: str) -> str:
-    """What stands before ://; "-", "replay", or "" for a file."""
+    """Return the scheme of the address; "" for a file."""
     if address.startswith(_REPLAY):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""
@@ -166,7 +156,9 @@ def _period(rate_hz: float | None, address: str) -> float:
     return 1.0 / rate_hz
 
 
-def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ()) -> PartSource:
+def _open_part_source(
+    address: str, rate_hz: float | None, joints: tuple[str, ...] = ()
+) -> PartSource:
     kind = _kind(address)
     if kind == "posed":
         return PosedSource(address, _period(rate_hz, address))
@@ -179,30 +171,32 @@ def _of_parts(address: str, rate_hz: float | None, joints: tuple[str, ...] = ())
 
         return NetFtSource(address, None if rate_hz is None else 1.0 / rate_hz)
     if kind == "zenoh":
-        from drake_teleop.robots.ros2_source import Ros2Source
+        from drake_teleop.robots.ros2 import Ros2Source
 
         return Ros2Source(address, _period(rate_hz, address), joints)
-    raise DrakeTeleopError("tells no motion", where=address, remedy="rtde://HOST or zenoh://HOST")
+    raise DrakeTeleopError(
+        "delivers no motion", where=address, remedy="rtde://HOST or zenoh://HOST"
+    )
 
 
-def _parts(
+def _open_parts(
     address: str, rate_hz: float | None, motion: str | None, arm: SensorPoseOfJoints | None
 ) -> Parts:
     names = () if arm is None else arm.joint_names
-    wrench = _of_parts(address, rate_hz, names)
+    wrench = _open_part_source(address, rate_hz, names)
     other: PartSource | None = None
     try:
-        other = None if motion is None else _of_parts(motion, 1.0 / wrench.dt, names)
+        other = None if motion is None else _open_part_source(motion, 1.0 / wrench.dt, names)
         if arm is None:
             return Parts(wrench, other)
-        told = wrench if other is None else other
-        if JOINTS not in told.streams:
+        motion_source = wrench if other is None else other
+        if JOINTS not in motion_source.streams:
             raise DrakeTeleopError(
-                "tells no joints of --model",
+                "delivers no joint positions for --model",
                 where=address if motion is None else motion,
-                remedy="zenoh://HOST/TOPIC?joints=/joint_states, say",
+                remedy="give a source such as zenoh://HOST/TOPIC?joints=/joint_states",
             )
-        posed = PosedByJoints(told, arm)
+        posed = PosedByJoints(motion_source, arm)
         return Parts(posed) if other is None else Parts(wrench, posed)
     except BaseException:
         for each in (wrench, other):
@@ -212,4 +206,4 @@ def _parts(
 
 
 def _pose(sensor_pose: tuple[float, ...] | None) -> Array:
-    return NOWHERE if sensor_pose is None else pose_of(sensor_pose)
+    return IDENTITY_POSE if sensor_pose is None else pose_from_rpy(sensor_pose)

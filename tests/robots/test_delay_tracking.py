@@ -1,4 +1,4 @@
-"""The delay of the motion behind the wrench, followed by what the load shows of it."""
+"""Tracking of the motion's delay behind the wrench."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ import numpy as np
 import pytest
 from test_compensator import OFFSETS, PHI, load
 from test_reading_assembly import DT as WRENCH_DT
-from test_reading_assembly import X_FS, Told, played, truth
+from test_reading_assembly import X_FS, StreamStub, played, truth
 
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.robots.assembly import Assembly
-from drake_teleop.robots.delay_following import EVERY_S, DelayFollower
-from drake_teleop.robots.parts import Parts
+from drake_teleop.robots.assembly import Assembly, Parts
+from drake_teleop.robots.delay_tracking import SAMPLE_PERIOD_S, DelayTracker
 from drake_teleop.robots.streams import POSE, WRENCH
 
-DT = 1.01 * EVERY_S
+DT = 1.01 * SAMPLE_PERIOD_S
 NOISE = np.repeat([0.05, 0.0025], 3)
 
 
 def followed(
-    follower: DelayFollower, start: float, stop: float, late: float, *, push: float = 0.0
+    follower: DelayTracker, start: float, stop: float, late: float, *, push: float = 0.0
 ) -> None:
-    """Wrenches with noise and drifted offsets, and motions whose stamps are `late`.
+    """Feed wrenches with noise and drifted offsets, and motions whose stamps are `late`.
 
-    A push is [N] along x with the sign of the wrench's slope, as a longer delay would make it.
+    A push is [N] along x with the sign of the wrench's slope, as a longer delay would cause.
     """
     rng = np.random.default_rng(0)
     for t in np.arange(start, stop, DT):
@@ -38,16 +37,16 @@ def followed(
 
 
 @pytest.mark.parametrize("late", [-0.006, 0.011])
-def test_it_is_found_and_followed(late: float) -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.0)
+def test_delay_is_estimated_and_tracked(late: float) -> None:
+    follower = DelayTracker(load(), 0.001, 30.0, 0.0)
     followed(follower, 0.0, 3.0, late)
     assert follower.delay_s == pytest.approx(late, abs=2e-4)
     followed(follower, 3.0, 5.0, late + 0.003)
     assert late + 5e-4 < follower.delay_s < late + 0.003
 
 
-def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+def test_contact_is_excluded_and_another_clock_restarts_the_tracking() -> None:
+    follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     followed(follower, 0.0, 1.0, 0.005)
     followed(follower, 1.0, 2.0, 0.005, push=5.0)
     assert follower.delay_s == pytest.approx(0.005, abs=5e-4)
@@ -57,8 +56,8 @@ def test_contact_is_left_out_and_another_clock_begins_anew() -> None:
     assert follower.delay_s == pytest.approx(0.007, abs=3e-4)
 
 
-def test_a_tool_at_rest_shows_nothing() -> None:
-    follower = DelayFollower(load(), 0.001, 30.0, 0.005)
+def test_delay_is_constant_at_rest() -> None:
+    follower = DelayTracker(load(), 0.001, 30.0, 0.005)
     rest, rng = truth(0.3)[1], np.random.default_rng(0)
     rest[3:] = 0.0
     still = non_contact_wrench(*np.split(rest, 3), PHI) + OFFSETS
@@ -69,9 +68,9 @@ def test_a_tool_at_rest_shows_nothing() -> None:
     assert follower.delay_s == 0.005
 
 
-def test_what_waits_for_its_motion_gets_the_right_one() -> None:
-    """Without being told that poses are stamped 4 ms late."""
-    assembly = Assembly(Parts(Told(WRENCH, POSE)), X_FS=X_FS, follow=load())
+def test_assembly_tracks_an_unknown_delay() -> None:
+    """Poses are stamped 4 ms late."""
+    assembly = Assembly(Parts(StreamStub(WRENCH, POSE)), X_FS=X_FS, track=load())
     good = [each for each in played(assembly, 1.6, later=0.004) if not each.flags]
     assert assembly.delay_s == pytest.approx(0.004, abs=2e-4)
     assert good[-1].t > 1.6 - 0.035 - WRENCH_DT

@@ -1,8 +1,4 @@
-"""What `compensator` does with the numbers of a sample, in compiled code.
-
-The order of operations is that of `eliminate --causal`, to the last bit: elimination, then the
-low-pass as `scipy.signal.lfilter` has it.
-"""
+"""Compiled operations of `compensator`, bit-equal to those of `eliminate --causal`."""
 
 from __future__ import annotations
 
@@ -15,13 +11,13 @@ NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
 
 
 @njit(cache=True)
-def doubts(values, largest, limits):
-    """What speaks against the numbers of a reading: `NOT_FINITE`, or `TOO_LARGE`, or `AT_RANGE`.
+def value_problem(values, largest, limits):
+    """Return 0, `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
 
     Args:
         values: (15,) of the reading.
-        largest: (15,) above which it is none.
-        limits: (6,) the sensor's range.
+        largest: (15,) maximum valid magnitudes.
+        limits: (6,) range of the sensor.
     """
     for i in range(15):
         if not math.isfinite(values[i]):
@@ -36,18 +32,18 @@ def doubts(values, largest, limits):
 
 
 @njit(cache=True)
-def low_passed_into(x, low_pass, memory):
-    """One sample through a low-pass of second order, in place.
+def low_pass_into(x, low_pass, memory):
+    """Filter a sample in place, by a second-order low-pass as in `scipy.signal.lfilter`.
 
     Args:
-        x: (n,) the sample.
-        low_pass: (7,) b, a_1, a_2 and the memory that is settled at 1.
-        memory: (2, n), NaN if it is to settle.
+        x: (n,).
+        low_pass: (7,) b, a_1, a_2 and the steady-state memory at input 1.
+        memory: (2, n); NaN starts in the steady state.
     """
-    anew = math.isnan(memory[0, 0])
+    start = math.isnan(memory[0, 0])
     for i in range(len(x)):
         u = x[i]
-        if anew:
+        if start:
             memory[0, i], memory[1, i] = low_pass[5] * u, low_pass[6] * u
         y = memory[0, i] + low_pass[0] * u
         memory[0, i] = memory[1, i] + u * low_pass[1] - y * low_pass[3]
@@ -56,17 +52,15 @@ def low_passed_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
-    """Contact and scaled wrench of a good reading.
+def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
+    """Write contact and scaled wrench of a good reading to out (12,).
 
     Args:
         values: (15,) of the reading.
-        offsets: (6,) of the sensor.
         phi, nothing: (10,) the load, and zeros.
-        scales: (3,) of what is scaled, see `scaled_wrench_into`.
-        low_pass, memory: see `low_passed_into`; the former is empty without one.
-        rest: (rows, 21) whose row `at` becomes the reading and its contact, not filtered.
-        out: (12,) contact and scaled.
+        scales: (3,) see `scaled_wrench_into`.
+        low_pass, memory: see `low_pass_into`; low_pass may be empty.
+        rest: (rows, 21); row `at` receives the reading and its unfiltered contact wrench.
     """
     wrench, s, omega, alpha = values[:6], values[6:9], values[9:12], values[12:]
     contact, scaled = out[:6], out[6:]
@@ -76,12 +70,12 @@ def eliminated_into(values, offsets, phi, nothing, scales, low_pass, memory, res
     rest[at, :15] = values
     rest[at, 15:] = contact
     if len(low_pass) > 0:
-        low_passed_into(out, low_pass, memory)
+        low_pass_into(out, low_pass, memory)
 
 
 @njit(cache=True)
-def clipped(wrenches, limits):
-    """Limits (12,) wrenches to the sensor's range (6,), and says whether one was beyond."""
+def clip(wrenches, limits):
+    """Limit wrenches (12,) to the sensor's range (6,); return whether one exceeded it."""
     beyond = False
     for i in range(12):
         limit = limits[i % 6]
