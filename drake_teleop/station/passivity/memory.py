@@ -1,7 +1,7 @@
-"""The places of what every method remembers at one end of the channel, and of its parameters.
+"""Places of the values in the memory and parameter vectors of one end of the channel.
 
-Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. What a
-method alone needs it names at the head of its file, with `own_memory` and `own_parameters`.
+Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. A
+method names its own places at the head of its file with `own_memory` and `own_parameters`.
 """
 
 from __future__ import annotations
@@ -11,25 +11,24 @@ PARAMETERS = 26  #: length of the parameters, packed by `methods.parameters`
 
 
 class Slots:
-    """Gives out the places of a vector one after the other: each gets a name, none a number.
+    """Allocator of named places in a vector, one after the other.
 
     Args:
-        size: of the vector.
-        first: place that is given out first.
+        size: length of the vector.
+        first: first place.
     """
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """The place of a number."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """The place of a vector, of which ``array[place]`` is a view.
+        """Return the place of a vector; ``array[place]`` is a view of it.
 
         Raises:
-            IndexError: if that is more than is left.
+            IndexError: if the vector does not fit.
         """
         first, self._next = self._next, self._next + length
         if self._next > self._size:
@@ -37,7 +36,6 @@ class Slots:
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """All that is left."""
         return self.vector(self._size - self._next)
 
 
@@ -75,10 +73,10 @@ _METHOD = _parameters.rest()
 
 
 def own_memory() -> Slots:
-    """Of the memory of an end, what is left for a method of its own. All zeros at the start."""
+    """Return an allocator for the method's own part of the memory, zero at the start."""
     return Slots(MEMORY, _OWN.start)
 
 
 def own_parameters() -> Slots:
-    """Of the parameters, what is left for those of a method."""
+    """Return an allocator for the method's own part of the parameters."""
     return Slots(PARAMETERS, _METHOD.start)
