@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 
-SUMS = 5  #: numbers to remember for each contact, all zeros at the start
-# Added to the sum of the squared changes of speed. Where speed and way go together nothing tells
-# the two apart, and what is found is stiffness.
+SUMS = 5  #: length of the sums of a contact, zero at the start
+# Relative increase of the squared speed changes: where speed and displacement are proportional, the
+# fit then assigns the force to stiffness.
 _RIDGE = 0.05
 
 
@@ -41,7 +41,7 @@ def fit(sums, more, way, faster, keep):
     square = (1.0 + _RIDGE) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
-    if not damping > 0.0:  # and so the determinant is not 0 below
+    if not damping > 0.0:  # below, the determinant is not 0
         return max(sums[3] / sums[0], 0.0), 0.0
     return max(square * sums[3] - sums[1] * sums[4], 0.0) / determinant, damping / determinant
 

@@ -23,7 +23,7 @@ from drake_teleop.station.passivity.packet import difference_into, dot
 
 Array = NDArray[np.float64]
 
-#: Pair -> share of f_k; the rest is f_(k-1).
+#: Pair -> weight of f_k; f_(k-1) has the rest.
 PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 

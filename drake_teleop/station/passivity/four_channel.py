@@ -37,11 +37,10 @@ from drake_teleop.station.passivity.packet import (
     moved_into,
 )
 
-# Parameters; those of two numbers are for translation and rotation.
+# Parameters; pairs are for translation and rotation.
 _places = own_parameters()
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 _SLAVE, _HAND = _places.number(), _places.number()
-# Memory.
 _DIFFERENCE = own_memory().vector(6)
 
 

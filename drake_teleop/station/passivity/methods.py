@@ -84,9 +84,9 @@ _FILES: dict[str, Any] = {"none": none} | {
     name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
 }
 METHODS = tuple(_FILES)
-"""The names of all methods."""
+"""Names of all methods."""
 AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_THE_MOTOR"))
-"""Those that act at the port of the slave's motors."""
+"""Methods with an energy balance at the port of the slave's motors."""
 
 
 _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
@@ -246,7 +246,7 @@ def master_step(
         wrench: (6,) written: wrench to render until the next step; 0 if an input is not finite.
         packet: (PACKET_SIZE,) written: packet to send.
     """
-    packet[:] = 0.0  # a method writes only what it uses
+    packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
     if not healthy:
         wrench[:] = 0.0
@@ -272,7 +272,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. The last pose, at
             rest, if an input is not finite.
     """
-    packet[:] = 0.0  # a method writes only what it uses
+    packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
         memory[COMMAND_TWIST] = 0.0

@@ -18,7 +18,7 @@ PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
 SEQUENCE = _places.number()
-#: 1 if the sender's inputs were finite, else 0 (all else is then its last good packet).
+#: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
 HEALTHY = _places.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
 POSE = _places.vector(7)
@@ -26,19 +26,19 @@ POSE = _places.vector(7)
 VELOCITY = _places.vector(6)
 #: Its wrench [f; tau], in W, in the master's power units.
 WRENCH = _places.vector(6)
-#: Cumulative integral, of the method's choice.
+#: Cumulative integral; the method defines it.
 INTEGRAL = _places.vector(6)
-#: Cumulative energy that the receiver may use, for each group [J].
+#: Cumulative energy that the receiver may use, by group [J].
 ENERGY = _places.vector(2)
-#: A second counter of energy, for each group [J].
+#: Second energy counter, by group [J].
 OTHER_ENERGY = _places.vector(2)
-#: 1 while the slave's detector says that something is touched.
+#: 1 while the slave's detector reports contact.
 CONTACT = _places.number()
-#: What weight and inertia of the slave's load add to its wrench, likewise. The last, because only
-#: `ledger` tells the two apart, and other lines need not carry it.
+#: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
+#: field, because only `ledger` uses it; other lines omit it.
 LOAD = _places.vector(6)
 
-#: What force and torque at the hand may change by without being felt as a blow [N/s, N m/s].
+#: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
 GENTLE = (450.0, 4.5)
 
 
@@ -92,7 +92,7 @@ def finite(a):
     """Return whether every number of the vector is finite."""
     rest = 0.0
     for x in a:
-        rest += x - x  # not a number as soon as one x is not finite
+        rest += x - x  # NaN if any x is not finite
     return rest == 0.0
 
 

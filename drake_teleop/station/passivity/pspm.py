@@ -52,11 +52,11 @@ from drake_teleop.station.passivity.packet import (
 _places = own_parameters()
 _INITIAL, _CEILING = _places.vector(2), _places.vector(2)
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
-# Memory: the set position less the position, and what is wanted of it.
+# Memory: set position minus position; its requested value.
 _places = own_memory()
 _OFFSET, _WANTED = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the port of its account, see `methods`
+AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
 
 @settings

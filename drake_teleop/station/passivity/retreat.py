@@ -13,7 +13,7 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD, MASS, RETREAT
 from drake_teleop.station.passivity.packet import dot, length, scale
 
-_FILTER = 4e-3  # s, of velocity: encoders have steps
+_FILTER = 4e-3  # s, of the velocity: encoders have steps
 
 
 @njit(cache=True)

@@ -15,23 +15,23 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import Slots
 from drake_teleop.station.passivity.packet import difference_into, length, moved_into
 
-STOP = 0.05  #: s, in which a silent end comes to rest
-RESUME = 0.5  #: s, in which it goes over to normal again
+STOP = 0.05  #: time in which a silent end comes to rest [s]
+RESUME = 0.5  #: time of the transition to normal operation [s]
 
-MASTER_WATCH, SLAVE_WATCH = 6, 30  #: their lengths
-# Watch of the master.
+MASTER_WATCH, SLAVE_WATCH = 6, 30  #: lengths of the monitor states
+# Monitor state of the master.
 _places = Slots(MASTER_WATCH)
-SILENT = _places.number()  #: time without packets [s], of the slave's watch too
+SILENT = _places.number()  #: time without packets [s], also at the slave
 _LIMIT = _places.vector(2)  # present limits
-_FALL = _places.vector(2)  # what they fall by per second
+_FALL = _places.vector(2)  # their decrease per second
 _HEARD = _places.number()  # time since the last silence
-# Watch of the slave.
+# Monitor state of the slave.
 _places = Slots(SLAVE_WATCH, SILENT + 1)
 _STOPPING = _places.number()  # time since it began to stop
 _RESUMING = _places.number()  # time since it began to resume
 _FROM = _places.vector(7)  # command when it began to stop
-_VELOCITY = _places.vector(6)  # velocity there
-_LAST, _BEFORE = _places.vector(7), _places.vector(7)  # the last command, the one before
+_VELOCITY = _places.vector(6)  # its velocity
+_LAST, _BEFORE = _places.vector(7), _places.vector(7)  # last command and the one before
 
 
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -123,8 +123,8 @@ def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
     if watch[_RESUMING] == RESUME:
         put(command, 0, wanted, 0, 7)
     else:
-        # Where it stops or has stopped; and from there, with a share that rises smoothly from 0 to
-        # 1, to what is wanted. So velocity is continuous even if it resumes before it has stopped.
+        # A blend from the stopping motion to the requested command keeps the velocity continuous
+        # even if the end resumes before it has stopped.
         watch[_STOPPING] += T
         u = min(watch[_STOPPING] / STOP, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3

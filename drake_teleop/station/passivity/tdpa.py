@@ -55,17 +55,17 @@ from drake_teleop.station.passivity.packet import (
     scale,
 )
 
-# Of what the hand puts in, until the reserve is full: all of it would leave a soft wall too little.
+# Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _SHARE_KEPT = 0.5
-_QUICK = 0.1  # s, in which a wrench comes or goes that need not wait: slower than hand and servo
-_GONE = 0.1  # a wrench below this share of the filtered one is on its way to zero
-_COMPLETE = 0.98  # share of a quick onset at which it ends
-# Of each group: travel in which the stiffness of a contact is learned [m, rad], and the speed below
-# which the drag fades [m/s, rad/s].
+_QUICK = 0.1  # s, onset and end of a wrench that needs no delay filter: slower than hand and servo
+_GONE = 0.1  # a wrench below this share of the filtered one ends
+_COMPLETE = 0.98  # share at which a quick onset is complete
+# By group: travel over which the contact stiffness is averaged [m, rad]; speed below which the drag
+# fades [m/s, rad/s].
 _TRAVEL = (1e-3, 1e-2)
 _FADING = (0.02, 0.2)
 
-# In the packet: number of the newest packet that the master has; what the slave may give out.
+# In the packet: number of the master's newest packet; the slave's ledger.
 _ECHO, _SLAVES_LEDGER = INTEGRAL.start, OTHER_ENERGY
 
 # Parameters.
@@ -73,11 +73,11 @@ _places = own_parameters()
 _RELEASE, _DRAIN, _DRIFT_RATE = _places.number(), _places.number(), _places.number()
 _RESERVE, _DRAG, _HAND = _places.vector(2), _places.vector(2), _places.vector(2)  # in power units
 _SPEED = _places.vector(2)
-# Memory of the master: share of the wrench that is withheld, energy kept.
+# Memory of the master: withheld share of the wrench, kept energy.
 _places = own_memory()
 _WITHHELD_SHARE, _KEPT = _places.vector(2), _places.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
-# filtered wrench; stiffness of the contact; number of the packet with the end of a quick onset.
+# filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _places = own_memory()
 _IN, _OUT = _places.vector(2), _places.vector(2)
 _IN_COMMAND, _OUT_COMMAND = _places.vector(2), _places.vector(2)
@@ -234,7 +234,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         paid = _paid(memory, g)
         credit = min(memory[_IN][g], memory[_IN_COMMAND][g]) + min(paid, 0.0)
-        # What was given out without payment is repaid before anything is sent.
+        # Unpaid output is repaid before energy is sent.
         memory[SENT][g] = max(memory[SENT][g], credit)
         memory[LEDGER][g] = paid
         packet[ENERGY][g] = memory[SENT][g]

@@ -49,17 +49,17 @@ from drake_teleop.station.passivity.packet import (
     scale,
 )
 
-# Parameters; those of two numbers are for translation and rotation.
+# Parameters; pairs are for translation and rotation.
 _places = own_parameters()
 _SEND, _DRAIN = _places.number(), _places.number()
 _INITIAL, _LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
 _DAMPER, ACCELERATION = _places.vector(2), _places.vector(2)
 _RESERVE = 0.01  # share of the capacity
-# Memory of the slave: pull of the spring, pull of the damper.
+# Memory of the slave: wrench of the spring, wrench of the damper.
 _places = own_memory()
 _SPRING, _BRAKE = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the port of its account, see `methods`
+AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
 
 @settings
@@ -165,7 +165,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
             pull[i] = spring[i] + brake[i]
-        # The spring is shortened first and leaves the reserve, so that an empty tank brakes.
+        # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
         room = max(memory[LEDGER][g] - _RESERVE * p[_CAPACITY][g], 0.0)
         most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
         if _cost(pull, dx, g, most, T) > room:

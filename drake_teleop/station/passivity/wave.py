@@ -54,11 +54,11 @@ _places = own_parameters()
 IMPEDANCE = _places.vector(2)
 _FILTER, _MATCHING = _places.number(), _places.number()
 _PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
-# Memory: integral of the wave played out, of the wave sent, the wave of this step; silence [s].
+# Memory: integrals of the played and the sent wave; wave of this step; silence [s].
 _places = own_memory()
 _PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
 _SILENT, _DRIFT = _places.number(), _places.vector(6)
-# At the master: 1 from a step without a packet until all is made up for; number of the newest one.
+# At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
 _MISSING, _NEWEST = _places.number(), _places.number()
 
 
@@ -126,7 +126,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         b = p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
-            # As if it could all be displayed, so that no momentum is missing on the line.
+            # The integral ignores the wrench limit, so that no momentum is missing on the line.
             integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
             sent[i] = integral[i]
         limit(wrench, g, limits[g])
@@ -136,7 +136,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             if _approach(g, energy, dx, most, memory[HELD], wrench):
                 memory[_MISSING] = 1.0
             limit(wrench, g, limits[g])
-        # Not negative: of a wrench that was shortened even more is left than the wave going back.
+        # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
