@@ -1,9 +1,8 @@
-"""What lies between master and slave (long: a network, both ends of it, and their block).
+"""Channel between master and slave: a network, both of its ends, and their block (long: one step).
 
-At every period both ends take one step of the method that keeps the station passive
-(`drake_teleop.station.passivity`), and their packets pass one line of the network each
-(`drake_teleop.station.channel.network`). The block works in world axes and in the master's power
-units, see `drake_teleop.station.passivity.methods`.
+In every period both ends run one step of the passivity method (`station.passivity`). Their packets
+pass one line of the network each (`network`). The step works in world axes and in the master's
+power units, see `passivity.methods`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -54,15 +53,15 @@ from drake_teleop.station.passivity.safe_state import (
 
 _NETWORKS = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
-#: Of a time-out that follows from the network [s], and of any.
+#: Smallest default and largest timeout [s].
 SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 0.1, 1.0
-_AFTER = 1.5  # times the longest silence that a minute has
+_AFTER = 1.5  # default timeout over the longest silence of a minute
 
 
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """The network between master and slave; its own fields are those of `custom`."""
+    """Network between master and slave; its own fields are those of `custom`."""
 
     network: str = choice("custom", _NETWORKS, "a preset, or the network that these fields say")
     backward: NetworkConfig | None = plain(
@@ -78,10 +77,10 @@ class Channel(NetworkConfig):
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
-        """The two directions, forward (master to slave) and backward.
+        """Return the two directions, forward (master to slave) and backward.
 
         Raises:
-            DrakeTeleopError: if a preset is asked for and changed at the same time.
+            DrakeTeleopError: if a preset is combined with other fields.
         """
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
@@ -96,7 +95,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def silent_after(self, period: float) -> float:
-        """After how long an end goes into its safe state [s], with packets each `period` [s]."""
+        """Return the silence [s] that starts the safe state, for packets each `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -106,32 +105,32 @@ class Channel(NetworkConfig):
         return min(max(_AFTER * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
 
 
-# The state of both ends, one array.
+# State of both ends in one array.
 _SIZE = 2 + 2 * (8 + 6 + MEMORY) + MASTER_WATCH + SLAVE_WATCH
 _places = Slots(_SIZE)
-_STEP = _places.number()  # the step's number
-_POSE_M = _places.vector(8)  # command at the master, a step ago; 1 if unknown, then the one before
-_POSE_S = _places.vector(8)  # slave, likewise
-_WRENCH_M = _places.vector(6)  # what the hand feels since then
-_WRENCH_S = _places.vector(6)  # the slave's wrench then
-_TRUSTED = _places.number()  # for how long the wrench was good without a break [s]
+_STEP = _places.number()  # number of the step
+_POSE_M = _places.vector(8)  # last finite command; 1 if the last one was not
+_POSE_S = _places.vector(8)  # pose of the slave, likewise
+_WRENCH_M = _places.vector(6)  # wrench rendered since then
+_WRENCH_S = _places.vector(6)  # the slave's wrench at that time
+_TRUSTED = _places.number()  # time with valid wrenches [s]
 _WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
 MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
-# What turns a wrench at the hand into one in the world, one array.
+# Transformation of a wrench at the hand to the world, one array.
 _places = Slots(11)
 _ROTATION = _places.vector(9)  # R_WB by rows
 _SCALES = _places.vector(2)  # of translation and rotation
-# What the station records of the channel, one array: see `channel_step`.
+# Recorded values, see `ports` of `TeleopChannel`.
 PORTS = 8
 _places = Slots(PORTS)
 _WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vector(2)
 _WORK_C = _places.vector(2)
-# What the hand's end makes of the newest packet.
+# Received values at the master.
 _places = Slots(7)
 _FELT, _TOLD = _places.vector(6), _places.number()
 
-# Steps that a packet is on its way at least. Forward: the slave sees the command a step later.
-# Backward: the master has taken its step when the slave takes its own.
+# Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
+# takes its step before the slave.
 _LEAST_DELAY = 1
 _NO_LOAD = np.zeros(6)
 
@@ -139,7 +138,7 @@ _NO_LOAD = np.zeros(6)
 def initial_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The state of both ends before their first step.
+    """Return the state of both ends before their first step.
 
     Args:
         method: one of `METHODS`.
@@ -179,29 +178,20 @@ def channel_step(
     ports,
     wrench_received,
 ):
-    """One step of both ends and of the lines between them.
+    """Run one step of both ends and of the lines between them.
 
     Args:
-        steps: of the method, `methods.steps_of(method)`.
-        pose_command: (7,) X_WS before the channel.
-        wrench_B: (6,) F_E_B, what the hand should feel of the slave's wrench [N, N m].
-        load_B: (6,) its load's share of that: weight and inertia.
-        hand_B: (6,) of the hand on the stylus, in B [N, N m].
-        slave_pose: (7,) X_WS, actual.
-        saturated: whether the wrench is not to be trusted: the last good one is kept.
-        contact: the flag of the slave's detector, 0 or 1; it travels with the slave's packets.
+        steps: result of `methods.steps_of(method)`.
+        pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
+            `TeleopChannel`.
         T, timeout: [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
         parameters: of the method.
         forward_parameters, backward_parameters: of the lines.
-        forward, backward: their states, updated.
-        ends: of both ends, updated.
-        pose_received: (7,) X_WS that the slave shall follow, written.
-        ports: (PORTS,) energy that hand and slave have put in, by group [J], updated; for how long
-            master and slave have heard nothing [s], written; what the slave's wrench would have
-            put in along the command, by group [J], updated.
-        wrench_received: (7,) F_E_B that the hand shall feel, and the flag of the newest packet,
-            written.
+        forward, backward, ends: states of lines and ends, updated.
+        pose_received: (7,) written.
+        ports: (PORTS,) work updated, silence written.
+        wrench_received: (7,) F_E_B to render, and the contact flag of the newest packet, written.
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
@@ -252,7 +242,7 @@ def channel_step(
     elif saturated:
         ends[_TRUSTED] = 0.0
     else:
-        # From a wrench that was kept to the measured one, all of the way at last.
+        # Blend from the kept wrench to the measured one.
         _to_world(wrench_B, frame, wrench)
         share = T / max(STOP - ends[_TRUSTED], T)
         for i in range(6):
@@ -283,11 +273,11 @@ def channel_step(
 
 @njit(cache=True)
 def _moved(pose, before, dx):
-    """Writes the increment since the last step, none from or to a pose that is not finite.
+    """Write the pose increment since the last step; 0 from or to a pose that is not finite.
 
     Args:
         pose: (7,) now.
-        before: (8,) the last pose that was finite; 1 if the last pose was not. Updated.
+        before: (8,) last finite pose; 1 if the last pose was not finite. Updated.
         dx: (6,) written.
 
     Returns:
@@ -305,7 +295,7 @@ def _moved(pose, before, dx):
 
 @njit(cache=True)
 def _to_world(wrench_B, frame, out):
-    """The wrench in W and in the master's power units."""
+    """Write the wrench in W and in the master's power units."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -317,7 +307,7 @@ def _to_world(wrench_B, frame, out):
 
 @njit(cache=True)
 def _to_master(wrench, frame, out):
-    """The inverse of `_to_world`."""
+    """Write the inverse of `_to_world`."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -328,36 +318,33 @@ def _to_master(wrench, frame, out):
 
 
 class TeleopChannel(LeafSystem):
-    """The network, and at both of its ends the method that keeps the station passive.
+    """Network with a passivity method at both ends.
 
-    A packet takes at least one period. Both ends have a safe state for silence and for data that
-    are not finite, see `drake_teleop.station.passivity.safe_state`. While the wrist sensor is
-    saturated, its last valid wrench is used.
+    A packet takes at least one period. Both ends have a safe state, see
+    `drake_teleop.station.passivity.safe_state`. The last valid wrench is used while the wrist
+    sensor is saturated.
 
-    The wrench that follows from a pose acts at once, while the device leaves that pose, so that
-    wrench times increment of the command is the work of the device's port: exactly for translation,
-    and for rotation that is scaled by 1 (a scaled turn whose axis moves has not the scaled angular
-    velocity of the hand). Hence it is an output that depends on the inputs, and means something at
-    the instants of the period only.
+    The rendered wrench depends on the inputs without delay, so that wrench times increment of the
+    command is the work at the device. This is exact for translation, and for rotation with scale 1.
+    The output is valid only at the instants of the period.
 
     .. pydrake_system::
 
         name: TeleopChannel
         input_ports:
         - pose_command: (7,) X_WS, after kinematic scaling
-        - wrench_B: (6,) F_E_B, what the hand should feel, from force scaling [N, N m]
+        - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
         - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
         - pose_slave: (7,) X_WS, actual
-        - saturated: (1,) 1 while the wrench is not to be trusted
-        - contact: (1,) whether the slave's detector notices a contact; unconnected 0
-        - load_wrench_B: (6,) the load's share of wrench_B, for `ledger`; unconnected 0
+        - saturated: (1,) 1 while the wrench is invalid
+        - contact: (1,) flag of the slave's contact detector; unconnected 0
+        - load_wrench_B: (6,) the load's part of wrench_B, for `ledger`; unconnected 0
         output_ports:
-        - pose_received: (7,) X_WS that the slave shall follow
-        - wrench_received: (6,) F_E_B that the hand shall feel [N, N m]
-        - ports: (8,) energy that the hand has put in by translation and by rotation, and what the
-          slave has [J]; for how long master and slave have heard nothing [s]; what the slave's
-          wrench would have put in along the command [J]
-        - contact_at_hand: (1,) the flag that the master's end has received last
+        - pose_received: (7,) X_WS command of the slave
+        - wrench_received: (6,) F_E_B to render at the hand [N, N m]
+        - ports: (8,) energy input of the hand by translation and rotation, and of the slave [J];
+          silence at master and slave [s]; input of the slave's wrench along the command [J]
+        - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
         channel: the network.
@@ -384,7 +371,7 @@ class TeleopChannel(LeafSystem):
         seed: int,
     ) -> None:
         super().__init__()
-        # Where motion is scaled to zero there is no energy, and any unit will do.
+        # A motion scale of zero transfers no energy; any unit is valid.
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
             network.parameters(line, seed, direction, period, least=_LEAST_DELAY)
@@ -417,12 +404,12 @@ class TeleopChannel(LeafSystem):
         received = np.zeros(7)
         groups = [self.DeclareDiscreteState(part) for part in state]
         self._groups = [int(group) for group in groups]  # faster than Drake's own indices
-        # What is in flight is part of the context, and cloned with it, but no discrete state: Drake
-        # would copy all of it several times a step, 1.5 MB on the way from the moon.
+        # Packets in transit are abstract parameters, which a context clones. Drake would copy a
+        # discrete state several times a step: 1.5 MB for `lunar`.
         self._flying = [self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in flying]
         self.DeclareStateOutputPort("pose_received", groups[3])
         self.DeclareStateOutputPort("ports", groups[4])
-        # The step is taken once, for the wrench that acts now and for the state after it.
+        # One step computes the present wrench and the next state.
         step = self.DeclareCacheEntry(
             "step",
             ValueProducer(
@@ -444,14 +431,14 @@ class TeleopChannel(LeafSystem):
         slave: NDArray[np.float64],
         fills: float,
     ) -> None:
-        """Begins in a running station: nothing is on its way yet, and the slave keeps its command.
+        """Start in a running station, with no packets in transit and a constant slave command.
 
         Args:
             context: of this block.
-            command: (7,) X_WS that the slave follows now; the master's command has to be the same.
+            command: (7,) X_WS present command of the slave; the master's command must be the same.
             slave: (7,) X_WS of the slave, actual.
-            fills: for how long the clutch is open [s]. The slave of `wave` keeps its command
-                until then, and reflects the wrench that stands.
+            fills: time with the clutch open [s]. The slave of `wave` keeps its command until then
+                and reflects the present wrench.
         """
         ends = initial_ends(*self._begin, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILLS] = slave, fills
@@ -462,11 +449,11 @@ class TeleopChannel(LeafSystem):
         *state, received = step.get_mutable_value()
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
-        # A step that is taken again, with other inputs, writes there at the same places.
+        # A repeated step with other inputs overwrites the same places.
         flying = [context.get_abstract_parameter(k).get_value() for k in self._flying]
         forward, backward = zip(state[:2], flying, strict=True)
         load = _NO_LOAD
-        if self._tells_apart and self._load.HasValue(context):  # to work it out takes time
+        if self._tells_apart and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
         channel_step(
             self._steps,
@@ -485,7 +472,7 @@ class TeleopChannel(LeafSystem):
         )
 
     def _taken(self, context: Context) -> list[NDArray[np.float64]]:
-        """The state after the step, and what the hand's end received."""
+        """Return the state after the step, and the master's received values."""
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

@@ -1,30 +1,14 @@
-"""A network: which packet is the newest that the receiver has, at every step.
+"""Simulated network: the newest packet at the receiver for every step; theory (T26), (T27).
 
-One packet leaves at each step k. It is lost, or it travels d steps, and so may a second copy of it.
-All counters and integrals in a packet are cumulative, so the receiver only ever needs the newest:
-a ring of slots holds the newest packet that arrives at each step, newest_at[k + d] = k, and what is
-older than a packet received before is dropped. Loss, reordering and duplicates then change nothing
-but which packet is the newest.
+* Delay: `jitter` j gives the standard deviation j D / sqrt(3) about the mean D: uniform from
+  (1 - j) D to (1 + j) D; normal, at least 0; or (1 - j) D plus a gamma distribution of shape 3
+  (Mukherjee 1992; Chen et al., ROBIO 2008). Delays are rounded to whole steps and independent, so
+  jitter reorders packets. Use a recorded trace for a queue that keeps the order.
+* Loss: Gilbert-Elliott chain in continuous time. `rate_hz` sends at even intervals.
+* Playout buffer: a packet is used at the earliest `playout` after it was sent. `redundant` packets
+  repeat earlier samples, so a sufficient `playout` makes a constant delay, bit by bit.
 
-* Delay. `jitter` j spreads it about its mean D with standard deviation j D / sqrt(3), whatever the
-  distribution: uniform from (1 - j) D to (1 + j) D; normal; or (1 - j) D, the way through an empty
-  network, plus a gamma distribution of shape 3, the wait in queues (shifted gamma: Mukherjee 1992;
-  for teleoperation Chen et al., ROBIO 2008). A normal delay that would be negative is 0: at j = 1
-  that raises the mean by 1 %. Delays are rounded to whole steps.
-* Reordering follows from jitter. Delays are independent of one another, so at a high packet rate
-  some packet of many is always early and the newest one is not much older than (1 - j) D. A queue
-  that keeps the order is better played from a recorded trace.
-* Loss. Gilbert and Elliott's chain (Gilbert 1960) in continuous time, so that it means the same at
-  every packet rate: in the good state nothing is lost, in the bad one the share `burst_loss`; bad
-  states last `burst` on average, and as often as makes the mean loss `loss`. burst = 0 makes the
-  losses independent.
-* Rate limit. The sender keeps to `rate_hz`, evenly; the steps between send nothing.
-* Playout buffer. A packet is used no sooner than `playout` after it was sent. If the packets are
-  `redundant`, each repeats the samples that may still be waited for, and a lost sample is played in
-  time from a later packet: with `playout` above the age of the newest packet at every step, loss
-  included, the network is a constant delay, bit by bit.
-
-Everything random is a hash of (seed, direction, step): no generator, no hidden state.
+All random numbers are hashes of (seed, direction, step).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -44,17 +28,17 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
 
 FORWARD, BACKWARD = 0, 1  # master to slave, slave to master
-LONGEST_DELAY = 10.0  # [s], which bounds the memory
+LONGEST_DELAY = 10.0  # [s], bounds the memory
 LONGEST_TRACE = 36000.0  # [s]
-LONGEST_EXTRAPOLATION = 0.1  # [s]; what is not known after that stands still
+LONGEST_EXTRAPOLATION = 0.1  # [s]; then the pose stands still
 
-# Distribution -> how far after the mean the last packet comes, in units of jitter times delay. What
-# would come later comes then: one packet in 1e7.
+# Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
+# of one packet in 1e7.
 _TAILS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE = ("hold", "zero", "extrapolate")
 _ZERO, _EXTRAPOLATE = 1, 2
-_TRACE_STEP = 1e-3  # [s], as fine as a mean needs
-_MINUTE, _OTHER_SEED = 60.0, 20090101  # [s], and a seed, with which a network is looked at
+_TRACE_STEP = 1e-3  # [s], for mean and maximum of a trace
+_MINUTE, _OTHER_SEED = 60.0, 20090101  # [s]; seed for the silence of a network
 
 
 @settings
@@ -89,10 +73,10 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        """Checks every value, but not the trace, which is read by `parameters`.
+        """Check every value except the trace, which `parameters` reads.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         check_ranges(self, where)
         if self.loss > self.burst_loss:
@@ -115,19 +99,19 @@ PRESETS: dict[str, NetworkConfig] = {
     ),
     "lunar": NetworkConfig(delay=1.3, jitter=0.01, distribution="gamma", loss=0.01, burst=0.1),
 }
-"""Networks by name, the same in both directions. The delays have grounds, the rest is plausible.
+"""Networks by name, the same in both directions. Only the delays have sources.
 
-lan: a switched network, RTT 1 ms, most of it in the hosts. wan: 1500 km of fibre at 5 us/km (ITU-T
-G.114) and as much again for detours and routers, RTT 30 ms; loss at the bound of the classes 0 to 4
-of ITU-T Y.1541. internet: an ocean, 5000 km with the same overhead, RTT 100 ms; best effort, hence
-loss in bursts. geostationary: up and down 240 to 279 ms (RFC 2488, section 2), the rest is coding
-and the way on the ground, RTT 600 ms. lunar: 384 400 km are 1.28 s; with the stations RTT 2.6 s.
+lan: switched network, round trip 1 ms, most of it in the hosts. wan: 1500 km of fibre at 5 us/km
+(ITU-T G.114), doubled for detours and routers, 30 ms; loss at the bound of classes 0 to 4 of ITU-T
+Y.1541. internet: 5000 km, doubled likewise, 100 ms; best effort with loss in bursts.
+geostationary: up and down 240 to 279 ms (RFC 2488, section 2), with coding and ground 600 ms.
+lunar: 384 400 km are 1.28 s; with the ground stations 2.6 s.
 """
 
-# The parameters of a line as one array: these, then the trace in steps, -1 where it lost a packet.
+# Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
 _KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
 _BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _LEAST, _TRACE = range(8, 17)
-# What a receiver has: these, then the packet received last. In flight: the slots, the packets sent.
+# State of a receiver: these, then its last packet. In transit: slots, then sent packets.
 _BAD, _ARRIVED, _RECEIVED, _SILENT, _LAST = range(5)
 
 
@@ -139,19 +123,20 @@ def parameters(
     least: int = 0,
     delays: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float64]:
-    """The parameters of one direction of a network, for the compiled functions below.
+    """Return the parameters of one direction for the compiled functions below.
 
     Args:
         config: of this direction.
         seed: of the scenario.
-        direction: FORWARD or BACKWARD, which are random independently of each other.
+        direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
-        least: steps that any packet takes at least.
-        delays: (M,) steps that each packet travels, -1 where it is lost, in the place of the
-            config's trace; after its end it starts again.
+        least: smallest delay of a packet [steps].
+        delays: (M,) delay of each packet [steps], -1 if lost, instead of the config's trace;
+            repeated after its end.
 
     Raises:
-        DrakeTeleopError: for a value out of range, or naming file, column and row of a bad trace.
+        DrakeTeleopError: for a value out of range, or with file, column and row of an invalid
+            trace.
     """
     config.check()
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
@@ -178,7 +163,7 @@ def parameters(
 
 
 def mean_delay(config: NetworkConfig) -> float:
-    """How long a packet that is used has been on its way, on average [s]; lost ones left out."""
+    """Return the mean age of a used packet [s], without lost packets."""
     if config.trace is None:
         return max(config.delay, config.playout)
     delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
@@ -187,7 +172,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 
 def longest_delay(config: NetworkConfig) -> float:
-    """How long a packet that is not lost has been on its way at most, when it is used [s]."""
+    """Return the largest age of a packet when it is used [s]."""
     longest = config.delay * (1 + _TAILS[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_trace(Path(config.trace), _TRACE_STEP).max()) * _TRACE_STEP
@@ -195,8 +180,8 @@ def longest_delay(config: NetworkConfig) -> float:
 
 
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
-    """(N,) delays in steps, for packets sent one a period; -1 where the packet is lost."""
-    # The reader of tables is not needed by those who have no trace, and takes its time to start.
+    """Return the delays (N,) in steps, for one packet a period; -1 for a lost packet."""
+    # The table reader starts slowly and is needed only for a trace.
     from drake_teleop.logs.read.tables import read_table
 
     table = read_table(path)
@@ -224,13 +209,13 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _uniform(p, k, draw):
-    """The random number of the packet k, uniform in (0, 1]; `draw` tells its 16 numbers apart."""
+    """Return the random number `draw` (0 to 15) of packet k, uniform in (0, 1]."""
     return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
 @njit(cache=True)
 def _travel(p, k, draw):
-    """How many steps the packet k travels, -1 if the trace has lost it. Takes three numbers."""
+    """Return the delay of packet k in steps, -1 if the trace lost it. Uses three draws."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
         return int(max(steps, p[_LEAST])) if steps >= 0.0 else -1
@@ -243,7 +228,7 @@ def _travel(p, k, draw):
     elif p[_DISTRIBUTION] == 1:  # Box and Muller
         angle = 2.0 * math.pi * _uniform(p, k, draw + 1)
         delay = mean + spread / math.sqrt(3.0) * math.sqrt(-2.0 * math.log(u)) * math.cos(angle)
-    else:  # three exponential waits one after the other
+    else:  # sum of three exponential waits
         u *= _uniform(p, k, draw + 1) * _uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
     return int(min(max(delay + 0.5, p[_LEAST]), p[_LONGEST]))
@@ -251,9 +236,9 @@ def _travel(p, k, draw):
 
 @njit(cache=True)
 def _fate(p, k, bad):
-    """The chain's state at step k, the steps that its packet travels, and its copy; -1 for none.
+    """Return the chain's state at step k, and the delays of packet and copy in steps (-1: none).
 
-    `bad` is the state a step before: 0 good, 1 bad; before step 0 the probability of the bad one.
+    `bad` is the state one step before: 0 good, 1 bad; before step 0 the probability of bad.
     """
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
@@ -272,17 +257,16 @@ def _fate(p, k, bad):
 def initial_state(
     p: NDArray[np.float64], neutral: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The state of a line before step 0.
+    """Return the state of a line before step 0.
 
     Args:
         p: the line's `parameters`.
-        neutral: (N,) what the receiver reads before the first packet arrives. The line carries
-            so many numbers of a packet, the first ones.
+        neutral: (N,) values at the receiver before the first packet. The line carries the first N
+            numbers of a packet.
 
     Returns:
-        The receiver's (4 + N,), with the packet that it read last, and what is in flight, which is
-        long: step k writes there only what belongs to packet k, and writes the same if it is
-        taken again with the same packet.
+        Receiver (4 + N,) with the last packet, and the packets in transit. Step k writes only the
+        places of packet k there, so a repeated step writes the same.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -291,10 +275,7 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Sends the packet (N,) of step k. Steps count up from 0, none is left out.
-
-    `state` is as `initial_state` makes it, and updated.
-    """
+    """Send the packet (N,) of step k; steps count from 0 without gaps."""
     receiver, flying = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
     receiver[_BAD], first, second = _fate(p, k, receiver[_BAD])
@@ -302,27 +283,27 @@ def send(p, state, k, packet):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
                 travel = max(travel, int(p[_PLAYOUT]))
-            # What the slot held was sent before.
+            # The previous content of the slot is older.
             flying[(k + travel) % slots] = k
-    # What is lost is written too: a redundant packet after it may bring it.
+    # A lost packet is written too, because a later redundant packet may contain it.
     put(flying, slots + size * (k % slots), packet, 0, size)
 
 
 @njit(cache=True)
 def receive(p, state, k, packet):
-    """What the receiver has at step k, after `send` of the same step.
+    """Read the newest packet at step k, after `send` of the same step.
 
     Args:
-        p, state, k: as of `send`.
-        packet: (N,) the newest packet, with what the policy `silence` makes of it while nothing
-            new comes; written.
+        p, state, k: as for `send`.
+        packet: (N,) written: the newest packet, changed by the policy `silence` without a new
+            packet.
 
     Returns:
-        The step at which the newest packet was sent, -1 before there is one; whether it is new.
+        The step at which the newest packet was sent, or -1; whether it is new.
     """
     receiver, flying = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
-    # What a slot still holds from a round ago is older, and changes nothing.
+    # An old entry of the slot is smaller and has no effect.
     receiver[_ARRIVED] = max(receiver[_ARRIVED], flying[k % slots])
     newest = receiver[_ARRIVED]
     if p[_REDUNDANT] != 0.0:
@@ -341,7 +322,7 @@ def receive(p, state, k, packet):
 
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
-    """What to read `silent` seconds after the newest packet came; see `NetworkConfig.silence`."""
+    """Apply the policy `NetworkConfig.silence` after `silent` seconds without a packet."""
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0
@@ -355,7 +336,7 @@ def _fill_silence(policy, silent, packet):
 def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """(steps, 2) how many steps each packet travels, and its copy; -1 for none.
+    """Return the delays of each packet and its copy (steps, 2) [steps]; -1 for none.
 
     Args:
         config, seed, direction, period: as for `parameters`.
@@ -374,9 +355,7 @@ def _fates(p, steps):
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """(steps,) which packet is the newest at each step, -1 before there is one.
-
-    The same as `receive` says, for all steps at once.
+    """Return the number of the newest packet at each step (steps,), as `receive` does; -1 for none.
 
     Args:
         config, seed, direction, period: as for `parameters`.
@@ -392,11 +371,10 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """For how long no new packet comes, at the longest in a minute after the first [s].
+    """Return the longest time without a new packet in a minute after the first [s].
 
     Args:
-        config, direction, period: as for `parameters`. The seed is one of its own, so that nobody
-            is told what comes in a run.
+        config, direction, period: as for `parameters`. The seed is fixed, not the scenario's.
     """
     steps = math.ceil((_MINUTE + longest_delay(config)) / period)
     newest = newest_packets(config, _OTHER_SEED, direction, steps, period)

@@ -1,1 +1,1 @@
-"""What the tool can touch."""
+"""Objects that the tool can touch."""

@@ -1,7 +1,7 @@
-"""A block on a table, to be pushed: it slides, turns, tips over and falls as a rigid body does.
+"""Movable block on a table, a rigid body that slides, turns, tips and falls.
 
-Drake's point contact makes one point of the contact of two boxes, on which no box can stand. So the
-block stands on balls of 2 mm in its corners, inside its faces; the tool touches the box.
+Drake's point contact reduces the contact of two boxes to one point, which cannot carry a box. So
+the block stands on balls of 2 mm radius in its corners; the tool touches the box.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -36,7 +36,7 @@ _COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 @settings
 @dataclass
 class Block(Surface):
-    """Where the block stands at first, its size and mass, and the table below it."""
+    """Initial pose, size, mass and surface of a block, and the table below it."""
 
     position: list[float] = quantity(
         [0.6, 0.0, 0.2], "m", -2.0, 2.0, "the middle of its underside at the start, in W"
@@ -49,7 +49,7 @@ class Block(Surface):
     )
 
     def check(self, where: str) -> None:
-        """Refuses a table on which the block does not stand."""
+        """Check that the table carries the block."""
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
                 "the table is smaller than the block",
@@ -59,13 +59,12 @@ class Block(Surface):
 
     @property
     def stand(self) -> Stand | None:
-        """From the floor to the table."""
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return Stand(across, across, x, y, top - _TABLE) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """The block, at rest on its table; without a scene graph they have no shapes."""
+        """Add the block at rest on its table; without a scene graph they have no shapes."""
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE / 2]
             AddFixedBox(plant, "table", RigidTransform(below), [*self.table, _TABLE], self)
@@ -88,7 +87,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """The tool touches the box alone, everything else the balls alone."""
+        """Let the tool touch only the box, and all other bodies only the balls."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         blocks = [body for body in map(plant.get_body, bodies) if body.name() == _NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]

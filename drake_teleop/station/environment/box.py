@@ -1,4 +1,4 @@
-"""A box that stands still: a table, a bench, a part to feel along."""
+"""Fixed box: a table, a bench, a part."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
 @settings
 @dataclass
 class Box(Surface):
-    """Where the box is and how large."""
+    """Pose, size and surface of a fixed box."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, the middle of the box, in W"
@@ -31,7 +31,6 @@ class Box(Surface):
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """See `AddFixedBox`."""
         X_WBox = RigidTransform(RollPitchYaw(self.rotation), self.position)
         AddFixedBox(plant, "box", X_WBox, self.size, self)
 
@@ -39,14 +38,14 @@ class Box(Surface):
 def AddFixedBox(
     plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
 ) -> None:
-    """Welds a box to the world; without a scene graph it has no shape.
+    """Weld a box to the world; without a scene graph it has no shape.
 
     Args:
         plant: not finalized.
-        name: of the body; of the model instance with a number, if there is one already.
-        X_WBox: its pose.
+        name: of the body, and of the model instance (with a number if the name exists).
+        X_WBox: pose of the box.
         size: (3,) lengths of its edges [m].
-        surface: what it is to touch.
+        surface: its surface.
     """
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)

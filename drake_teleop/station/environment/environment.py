@@ -1,4 +1,4 @@
-"""What every environment is asked: to be built, how it is touched, and what of it moves."""
+"""Base class of all environments, and helpers for their bodies and contacts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from pydrake.multibody.tree import (
 
 
 class Stand(NamedTuple):
-    """A box on the floor that a replay shows below an environment; all in m, in W."""
+    """Box on the floor that a replay shows below an environment; [m], in W."""
 
     along_x: float
     along_y: float
@@ -34,95 +34,90 @@ class Stand(NamedTuple):
 
 
 class Environment(ABC):
-    """Something to touch: a dataclass that derives from this, of which a scenario may have several.
+    """Object to touch; a scenario may have several. Subclasses are dataclasses.
 
-    Its bodies may stand still or move, and have any shape that Drake knows. The wrist sensor's own
-    contact law is the faster one; it knows boxes that stand or move, and a `moving_part` by itself.
+    Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
+    contact law is faster; it supports boxes and a single `moving_part`.
     """
 
     @property
     @abstractmethod
     def slip(self) -> float:
-        """At which friction is complete [m/s]; of several environments the least counts."""
+        """Slip at which friction is complete [m/s]; the smallest of all environments applies."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Adds it, as model instances of its own, to a plant with the tool, not yet finalized."""
+        """Add it as its own model instances to a plant with the tool, before Finalize."""
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Changes what touches what and how, of the tool's shapes too, once the plant is final."""
+        """Change contact pairs and materials, also of the tool, after Finalize."""
         return
 
     def check(self, where: str) -> None:
-        """Checks what no range of one field can say.
+        """Check rules across fields.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         return
 
     @property
     def parts(self) -> tuple[Environment, ...]:
-        """Itself, or what it is made of."""
+        """Itself, or its parts."""
         return (self,)
 
     @property
     def hydroelastic(self) -> bool:
-        """Whether contacts have a pressure over an area, where both shapes allow for it."""
+        """Whether contacts use a pressure field where both shapes support it."""
         return False
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of what moves along a prismatic joint.
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic joint.
 
-        Its position is 0 at rest. None if nothing does, or otherwise.
+        Its position is 0 at rest. None without such a body.
         """
         return None
 
     @property
     def stand(self) -> Stand | None:
-        """What it stands on in a replay."""
+        """Stand below it in a replay."""
         return None
 
 
 class Several(Environment):
-    """Several things to touch at once."""
+    """Several objects to touch."""
 
     def __init__(self, parts: Iterable[Environment]) -> None:
         self._parts = tuple(parts)
 
     @property
     def parts(self) -> tuple[Environment, ...]:
-        """See `Environment`."""
         return self._parts
 
     @property
     def slip(self) -> float:
-        """The least of all: the plant knows but one."""
         return min(part.slip for part in self._parts)
 
     @property
     def hydroelastic(self) -> bool:
-        """Of any."""
         return any(part.hydroelastic for part in self._parts)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Adds all of them."""
         for part in self._parts:
             part.AddTo(plant)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Of all of them."""
         for part in self._parts:
             part.PrepareContact(plant, scene_graph, tool)
 
 
 def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
-    """A model instance of that name, or with a number behind it if there is one."""
+    """Add a model instance with this name, numbered if the name exists, and return it."""
     number, free = 2, name
     while plant.HasModelInstanceNamed(free):
         free, number = f"{name}_{number}", number + 1
@@ -130,7 +125,7 @@ def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
 
 
 def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
-    """Lets a body fall and be pushed, from that pose on; the plant is not yet finalized."""
+    """Add a free joint for a body with this initial pose, before Finalize."""
     name, world = f"{body.name()}_floats", plant.world_frame()
     joint = plant.AddJoint(QuaternionFloatingJoint(name, world, body.body_frame()))
     turn = X_WBody.rotation().ToQuaternion().wxyz()
@@ -138,14 +133,14 @@ def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) ->
 
 
 def OnSensor(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
-    """The tool and what is welded to it, in a finalized plant."""
+    """Return the tool's body and the bodies welded to it, after Finalize."""
     return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
 
 
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """What of it may touch, by body; shapes of the arm are no longer for contact."""
+    """Return the shapes with contact properties of the tool and the bodies welded to it."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [
@@ -163,7 +158,7 @@ def ExcludeContact(
     shapes: Iterable[GeometryId],
     bodies: Iterable[BodyIndex],
 ) -> None:
-    """Lets some shapes and those of some bodies go through each other."""
+    """Exclude contact between some shapes and those of some bodies."""
     others = [
         shape
         for body in bodies

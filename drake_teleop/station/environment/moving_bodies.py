@@ -1,7 +1,7 @@
-"""Where bodies are that move, from the plant's state, compiled: for contact between its steps.
+"""Poses of moving bodies from the plant's state, compiled, for contact between its steps.
 
-They hang on each other and on the world by joints that turn, slide, are free or do not move at all:
-all that a scene may have. From parent to child, with F on the parent P and M on the body B,
+The bodies are connected to each other and the world by revolute, prismatic, free or fixed joints.
+From parent to child, with F on the parent P and M on the body B,
 
     X_WB = X_WP X_PF X_FM(q) X_MB,   and velocities likewise, expressed in W.
 """
@@ -35,24 +35,24 @@ _FIXED, _TURNS, _SLIDES, _FLOATS = range(4)
 _PARENT, _KIND, _Q, _V, _AXIS, _F, _M = 0, 1, 2, 3, 4, 7, 14
 #: Columns of the table of joints.
 JOINT_WIDTH = 21
-#: Of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
+#: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 POSE_AND_TWIST = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
-    """By which joints bodies hang on the world.
+    """Return the joints between the bodies and the world, and the bodies of the rows.
 
     Args:
         plant: finalized.
-        bodies: that are not anchored.
+        bodies: bodies that are not anchored.
 
     Returns:
         (m, 21) table, parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
-        and 3 where its positions and velocities begin in the plant's state [q; v]; 4-6 its axis;
-        7-13 and 14-20 X_PF, or X_WF, and X_MB, a quaternion and a place each. And the body of each
-        row, as a number; besides `bodies` those on which they hang.
+        and 3 first index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 and 14-20
+        X_PF, or X_WF, and X_MB, a quaternion and a position each. The index of the body of each
+        row; `bodies` and their parents.
     """
-    # Numbers alone: a joint that is held would hold the plant, and that the joint.
+    # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above: dict[int, tuple[int, int]] = {}
     anchored: set[int] = set()
     for index in plant.GetJointIndices():
@@ -104,7 +104,7 @@ def _quaternion(x, i):
 
 @njit(cache=True)
 def bodies_into(joints, state, out):
-    """Pose and twist of each body (m, 13), see `POSE_AND_TWIST`, in a state of the plant [q; v]."""
+    """Write pose and twist (m, 13), see `POSE_AND_TWIST`, for the plant's state [q; v]."""
     still = (0.0, 0.0, 0.0)
     for k in range(joints.shape[0]):
         row = joints[k]
@@ -147,7 +147,7 @@ def bodies_into(joints, state, out):
 
 @njit(cache=True)
 def _hermite(h, u, a, a_dot, b, b_dot):
-    """Value and rate at the part u of h of what goes from a to b, by a cubic."""
+    """Return value and rate at the fraction u of h on a cubic from a to b."""
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))
@@ -156,16 +156,16 @@ def _hermite(h, u, a, a_dot, b, b_dot):
 
 @njit(cache=True)
 def _rate(spin, turn):
-    """Of a quaternion at an angular velocity."""
+    """Return the rate of a quaternion for an angular velocity."""
     return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
 
 
 @njit(cache=True)
 def interpolate_bodies(joints, h, u, start, end, out):
-    """State of the joints at the part u of a step of h [s], from that at its start and its end.
+    """Write the joints' state at the fraction u of a step of h [s] into `out`.
 
-    Positions by cubics, velocities as theirs: to the third order, as the integrator. The rest of
-    the plant's state is left as it is.
+    Positions are cubics, velocities their rates: third order, as the integrator. The rest of `out`
+    is unchanged.
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]

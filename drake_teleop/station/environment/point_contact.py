@@ -1,10 +1,9 @@
 """Drake's compliant point contact between the tool's spheres and boxes, compiled.
 
-The wrist sensor samples at instants between the steps of the plant, where the plant's own contact
-results are not to be had. The law is that of Drake for continuous plants (Hunt and Crossley 1975
-along the normal, regularised Coulomb friction across it); a test ties it to the plant.
+The wrist sensor samples between the steps of the plant, where Drake has no contact results. The law
+is that of Drake for continuous plants (Hunt and Crossley 1975; regularised Coulomb friction):
 
-    f_n = k x (1 + d x'), never pulling;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+    f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
 """
 
 from __future__ import annotations
@@ -36,28 +35,27 @@ from drake_teleop.common.vectors import (
 
 Array = NDArray[np.float64]
 
-#: Columns of the table of pairs: stiffness; static and dynamic friction; which body it moves with.
+#: Columns of `Pairs.known`: stiffness; static and dynamic friction; row of the body.
 STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
-#: Their number, and that of pairs that are watched.
+#: Number of columns of `Pairs.known` and `Pairs.watched`.
 WIDTH, WATCHED_WIDTH = 28, 40
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
 _NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class Pairs(NamedTuple):
-    """What may touch.
+    """Pairs of shapes that may touch.
 
     Attributes:
-        known: (k, 28), for the kernel. Of each pair of a sphere of the tool and a box: 0-2 centre
-            of the sphere in S [m], 3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest, or
-            of the box in its body if that moves, 16-18 half the box's edges, 19-21 direction in W
-            in which it moves as a leaf (zero if it does not), 22 stiffness k [N/m], 23 dissipation
-            d [s/m], 24 and 25 static and dynamic friction, 26 slip at which it is complete [m/s],
-            27 the row of its body in a `JointTable`, or -1.
-        watched: (l, 40), of the others: boxes around both. They do not touch as long as these do
-            not, see `apart`. As above, with 0-2 the middle of the tool's box, 3 unused; 28-36
-            R_SBox of that by rows, 37-39 half its edges.
-        unknown: of the first of the others, why it is one.
+        known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
+            3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest, or of the box in its body if
+            that moves, 16-18 half the box's edges, 19-21 direction of motion in W as a leaf (zero
+            if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and dynamic
+            friction, 26 slip at which it is complete [m/s], 27 the row of its body in a
+            `JointTable`, or -1.
+        watched: (l, 40), bounding boxes of all other pairs, see `apart`. As above, with 0-2 the
+            centre of the tool's box, 3 unused; 28-36 R_SBox of that by rows, 37-39 half its edges.
+        unknown: reason for the first of the other pairs.
     """
 
     known: Array
@@ -73,18 +71,18 @@ def ContactPairs(
     slip: float,
     moving: Sequence[int] = (),
 ) -> Pairs:
-    """The pairs of a shape of the tool and one of the environment.
+    """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
         plant: finalized; a leaf of the environment is at 0 by default.
-        inspector: of the scene graph, with the shapes and their compliance.
-        tool: its shapes, and where their bodies are in S.
-        environment: what it may touch.
+        inspector: of the scene graph.
+        tool: the tool's shapes, and the poses of their bodies in S.
+        environment: model instances that it may touch.
         slip: at which friction is complete [m/s]; the plant's stiction tolerance.
-        moving: the bodies of a `JointTable`, row by row.
+        moving: bodies of a `JointTable`, row by row.
 
     Raises:
-        DrakeTeleopError: for a shape that no box is around.
+        DrakeTeleopError: for an unbounded shape.
     """
     context = plant.CreateDefaultContext()
     known: list[Array] = []
@@ -153,7 +151,7 @@ def _sphere_and_box(
 
 
 def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
-    """In which the body moves for a unit of the environment's one speed, in W."""
+    """Return the body's velocity in W for a unit speed of its prismatic joint."""
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
     direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -164,9 +162,9 @@ def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Arra
 
 
 def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    """k, d and friction of a pair, as in Drake.
+    """Return k, d, static and dynamic friction of a pair, as in Drake.
 
-    Springs in series, dissipation by what each deforms, the harmonic mean of friction.
+    Springs are in series, dissipation is weighted by deformation, friction is the harmonic mean.
     """
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
@@ -186,18 +184,18 @@ def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
 
 @njit(cache=True)
 def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal: Array) -> float:
-    """How deep a sphere is in its box [m], below 0 if it is not.
+    """Return the depth of a sphere in its box [m], below 0 if they are apart.
 
     Args:
         pair: (28,) row of `Pairs`.
         p_WS: (3,) origin of the tool's frame in W [m].
         R_WS: (3, 3) its rotation.
         deflection: of the environment [m].
-        normal: (6,) filled, if the result is not below 0: out of the box in W (3), and the point
+        normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
     """
     radius = pair[3]
-    # The sphere's centre, from the box's, in the box.
+    # Centre of the sphere relative to the box, in W.
     w0 = p_WS[0] + R_WS[0, 0] * pair[0] + R_WS[0, 1] * pair[1] + R_WS[0, 2] * pair[2]
     w1 = p_WS[1] + R_WS[1, 0] * pair[0] + R_WS[1, 1] * pair[1] + R_WS[1, 2] * pair[2]
     w2 = p_WS[2] + R_WS[2, 0] * pair[0] + R_WS[2, 1] * pair[1] + R_WS[2, 2] * pair[2]
@@ -236,13 +234,13 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
 @njit(cache=True)
 def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
-    """How far two boxes are apart at least [m], below 0 if they may touch.
+    """Return a lower bound of the distance of two boxes [m], below 0 if they may touch.
 
-    The largest gap along the edges of either (Gottschalk 1996, without the cross products).
+    It is the largest gap along the edges of either (Gottschalk 1996, without the cross products).
 
     Args:
         pair: (40,) row of `Pairs.watched`, for the tool's box.
-        box: (28,) the same row with the other box where it is.
+        box: (28,) the same row with the present pose of the other box.
         p_WS, R_WS: of the tool's frame in W.
         deflection: of the environment [m].
     """
@@ -251,7 +249,7 @@ def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) 
     between = minus(between, times(deflection, three(box, 19)))
     edges, halves, largest = np.empty((6, 3)), np.empty(6), -np.inf
     for i in range(3):
-        k = WIDTH + i  # columns of a rotation: directions of edges
+        k = WIDTH + i  # columns of R_SBox: directions of the edges
         edge = apply(R, (pair[k], pair[k + 3], pair[k + 6]))
         edges[i, 0], edges[i, 1], edges[i, 2] = edge
         edges[3 + i, 0], edges[3 + i, 1], edges[3 + i, 2] = box[4 + i], box[7 + i], box[10 + i]
@@ -267,7 +265,7 @@ def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) 
 
 @njit(cache=True)
 def _friction(static: float, dynamic: float, slip: float) -> float:
-    """The regularised coefficient at a slip in units of v_s (Drake's StribeckModel)."""
+    """Return the regularised coefficient at a slip in units of v_s (Drake's StribeckModel)."""
     if slip < 1.0:
         return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
     if slip < 3.0:
@@ -278,14 +276,14 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 
 @njit(cache=True)
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
-    """The force on the sphere that is `x` [m] deep in its box.
+    """Write the force on a sphere at depth `x` in its box.
 
     Args:
         pair: (28,) row of `Pairs`.
-        x: its indentation [m].
+        x: depth [m].
         normal: (3,) out of the box.
         velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
-        force: (3,) filled [N].
+        force: (3,) written [N].
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

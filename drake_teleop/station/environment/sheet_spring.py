@@ -1,7 +1,7 @@
-"""The sheet spring of the paper's Fig. 5: a clamped-free leaf that the ball tip runs into.
+"""Sheet spring of the paper's Fig. 5: a clamped-free leaf that the ball tip hits.
 
-The leaf's first bending mode is one degree of freedom (Euler-Bernoulli stiffness, Rayleigh mass);
-the contact between ball and leaf is Drake's compliant point contact.
+The first bending mode is one degree of freedom (Euler-Bernoulli stiffness, Rayleigh mass). Contact
+of ball and leaf is Drake's compliant point contact.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -31,7 +31,7 @@ _BENCH = 0.15  # from the lower face of the model's bench to the leaf [m]
 @settings
 @dataclass
 class SheetSpring(Environment):
-    """Where the leaf is and what it is made of. Lengths in m, SI throughout."""
+    """Position and material of the leaf, in SI units."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WLeaf, middle of the leaf's top at rest, in W"
@@ -64,7 +64,7 @@ class SheetSpring(Environment):
 
     @property
     def largest_small_deflection(self) -> float:
-        """10 % of the length [m]: beyond it the linear leaf is no longer a good model."""
+        """10 % of the length [m], the limit of the linear leaf model."""
         return 0.1 * self.length
 
     @property
@@ -74,18 +74,16 @@ class SheetSpring(Environment):
 
     @property
     def stand(self) -> Stand:
-        """From the floor to the model's bench."""
         x, y, z = self.position
         return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """See `AddSheetSpring`."""
         AddSheetSpring(plant, self)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """The tool alone touches the leaf, whose shape reaches down to where others may stand."""
+        """Exclude contact of the leaf's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
         on_sensor = OnSensor(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in on_sensor]
@@ -94,14 +92,14 @@ class SheetSpring(Environment):
 
 
 def AddSheetSpring(plant: MultibodyPlant, sheet: SheetSpring) -> ModelInstanceIndex:
-    """Adds the leaf to a plant that is registered with a scene graph and not yet finalized.
+    """Add the leaf to a plant that is registered with a scene graph, before Finalize.
 
     Its one degree of freedom, "bending", is the deflection of its end along z_W [m], 0 at rest.
     """
     tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
-    # A body's mass is fixed once it is parsed, so it goes into the file's text.
+    # Drake fixes a body's mass when it parses it, so the mass is written into the text.
     tree.find(".//link[@name='leaf']/inertial/mass").text = repr(sheet.effective_mass)  # type: ignore[union-attr]
-    # Without this the prefix becomes ns0 and Drake drops the leaf's contact properties.
+    # Otherwise the prefix becomes ns0 and Drake drops the leaf's contact properties.
     ElementTree.register_namespace("drake", "drake.mit.edu")
     text = ElementTree.tostring(tree.getroot(), encoding="unicode")
     (instance,) = Parser(plant).AddModelsFromString(text, "sdf")

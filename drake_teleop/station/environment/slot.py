@@ -1,17 +1,14 @@
-r"""A chamfered slot that the tool is put into as a peg: walls, chamfers, floor, nothing that moves.
+r"""Chamfered slot for the tool as a peg; all parts are fixed.
 
-Seen along the slot, M being the middle of its mouth, z up::
+Section across the slot, M is the middle of its mouth, z up::
 
-    top                       top        2 sides of y_M, 3 boxes each, and the floor. A box is
-    ------.       M       .------        convex and the contact of a ball with it is a spring; where
-           \.     |     ./  chamfer      two boxes meet in an edge that sticks out, a ball on the
-             |    |    |                 edge is in contact with both, which makes the edge up to
-             |  width  |  wall           twice as stiff as a face. The slot is open at its ends.
-             |_________|
+    top                       top        2 sides of y_M with 3 boxes each, and the floor. A ball
+    ------.       M       .------        on an edge of two boxes touches both, so an edge is up to
+           \.     |     ./  chamfer      twice as stiff as a face. The slot is open at its ends.
+             |    |    |
+             |  width  |  wall           The peg is the tool's ball and a second one up its shank:
+             |_________|                 two balls can jam between parallel walls, as a cylinder.
                 floor
-
-The tool's ball and a second one further up its shank, of the same radius, are the peg: between two
-parallel walls two balls can be jammed, as a cylinder can, and one cannot.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -34,20 +31,20 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
 from drake_teleop.station.environment.environment import Environment, Stand
 
-#: The peg's balls [m]: their radius, and z_S of their centres. The first is that of tool.sdf; where
-#: the second sits is E: as far up as leaves the nut above it outside the deepest slot.
+#: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
+#: (E) is as high as the nut above it permits in the deepest slot.
 PEG_RADIUS, TIP_BALL, UPPER_BALL = 0.012, 0.188, 0.158
-#: The blocks on both sides [m]: along the slot, and across it beyond the mouth's edge (E).
+#: Blocks on both sides [m]: length along the slot, width beyond the mouth's edge (E).
 LENGTH, _SIDE = 0.10, 0.04
 _FLOOR = 0.02
-_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # the peg is seen through them
+_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 0.55])  # transparent, so that the peg is visible
 _BALL_COLOUR = np.array([0.86, 0.20, 0.12, 1.0])
 
 
 @settings
 @dataclass
 class Slot(Environment):
-    """Where the slot is, its shape, and how the balls of the peg touch it."""
+    """Pose and shape of the slot, and its contact with the balls of the peg."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WM, middle of the slot's mouth, in W"
@@ -68,49 +65,46 @@ class Slot(Environment):
 
     @property
     def width(self) -> float:
-        """From wall to wall [m]."""
+        """Distance of the walls [m]."""
         return 2 * PEG_RADIUS + self.clearance
 
     @property
     def slip(self) -> float:
-        """At which friction is complete [m/s] (E).
+        """Slip at which friction is complete [m/s] (E).
 
-        A peg that stands on the floor or sticks creeps, more slowly than this. A tenth of it, as
-        on the leaf, would make every second of that three times as long to simulate.
+        A peg at rest creeps more slowly. A tenth of this value makes its simulation three times as
+        long.
         """
         return 1e-3
 
     @property
     def foot(self) -> float:
-        """z_W of the floor's lower face [m], on which the slot stands."""
+        """z_W of the floor's lower face [m]."""
         return self.position[2] - self.depth - _FLOOR
 
     @property
     def X_WM(self) -> RigidTransform:
-        """M is the middle of the mouth, x along the slot, z up."""
+        """Pose of the middle of the mouth, x along the slot, z up."""
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
 
     @property
     def stand(self) -> Stand:
-        """From the floor to the slot's foot."""
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """See `AddSlot`."""
         AddSlot(plant, self)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """See `TouchAsSlot`."""
         TouchAsSlot(plant, scene_graph, self, tool)
 
 
 def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
-    """Adds the slot and the tool's second ball to a plant that has the tool, and is not finalized.
+    """Add the slot and the tool's second ball to a plant with the tool, before Finalize.
 
-    The body "slot" is welded to the world. The second ball has shape only: the mass of the tool is
-    what it was. Without a scene graph there are no shapes, as when a model is parsed.
+    The body "slot" is welded to the world. The second ball has no mass. Without a scene graph there
+    are no shapes.
     """
     instance = plant.AddModelInstance("slot")
     body = plant.AddRigidBody("slot", instance, SpatialInertia.Zero())
@@ -130,14 +124,14 @@ def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
 def TouchAsSlot(
     plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot, tool: BodyIndex
 ) -> None:
-    """Gives the tool's balls the slot's contact, so that of both it is what the slot says."""
+    """Give the tool's balls the slot's material."""
     source = plant.get_source_id()
     for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
         scene_graph.AssignRole(source, ball, _material(slot), RoleAssign.kReplace)
 
 
 def _material(slot: Slot) -> ProximityProperties:
-    """Of either side: two springs in series, the means of dissipation and of friction."""
+    """Return the material of either side: springs in series, equal dissipation and friction."""
     properties = ProximityProperties()
     friction = CoulombFriction(slot.friction, slot.friction)
     AddContactMaterial(properties, slot.dissipation, 2 * slot.stiffness, friction)
@@ -145,18 +139,18 @@ def _material(slot: Slot) -> ProximityProperties:
 
 
 def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
-    """The boxes in M, by name."""
+    """Return the boxes in M, by name."""
     edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
     boxes = {}
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """From `inner` outwards, from `top` down to the floor."""
+            """Return a box from `inner` outwards, from `top` down to the floor."""
             across, height = edge + c + _SIDE - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(LENGTH, across, height)
 
-        # Its upper face is the chamfer; it is as thick as fills what wall and top leave open.
+        # Its upper face is the chamfer; its thickness fills the gap of wall and top.
         tilt, thick = RotationMatrix.MakeXRotation(side * np.pi / 4), c / np.sqrt(2)
         face = np.array([0.0, side * (edge + c / 2), -c / 2])
         into = RigidTransform(tilt, face - tilt.matrix()[:, 2] * thick / 2)

@@ -1,4 +1,4 @@
-"""What the surface of a thing is like: how stiff, how lossy, how rough."""
+"""Surface of an object: stiffness, dissipation and friction."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from drake_teleop.station.environment.environment import Environment
 @settings
 @dataclass
 class Surface(Environment):
-    """Of the thing alone; what touches it has its own, and Drake combines the two.
+    """Surface of the object alone; Drake combines it with that of the other object.
 
-    Stiffnesses are springs in series, k1 k2 / (k1 + k2), and of friction it is the harmonic mean,
+    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean,
     2 mu1 mu2 / (mu1 + mu2). The tool's ball has 4e5 N/m and 0.2.
     """
 
@@ -32,11 +32,11 @@ class Surface(Environment):
 
     @property
     def slip(self) -> float:
-        """At which friction is complete [m/s] (E)."""
+        """Slip at which friction is complete [m/s] (E)."""
         return 1e-3
 
     def material(self) -> ProximityProperties:
-        """For Drake's point contact."""
+        """Return the properties for Drake's point contact."""
         properties = ProximityProperties()
         friction = CoulombFriction(self.friction, self.friction)
         AddContactMaterial(properties, self.dissipation, self.stiffness, friction)

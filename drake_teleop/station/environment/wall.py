@@ -1,4 +1,4 @@
-"""A flat wall, or a table, to run into, to press on and to slide along."""
+"""Flat wall or table."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from drake_teleop.common.quantities import quantity
 from drake_teleop.station.environment.box import AddFixedBox
 from drake_teleop.station.environment.surface import Surface
 
-_THICK = 0.1  # m: however deep a tool gets, it comes out at the face
+_THICK = 0.1  # m; deep enough that a tool leaves through the face
 
 
 @settings
 @dataclass
 class Wall(Surface):
-    """Where the wall is, and which way it faces."""
+    """Pose, size and surface of a flat wall."""
 
     position: list[float] = quantity(
         [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
@@ -30,7 +30,7 @@ class Wall(Surface):
     size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:
-        """Refuses a normal without a direction."""
+        """Check that the normal has a direction."""
         if np.linalg.norm(self.normal) < 1e-3:
             raise DrakeTeleopError(
                 "has no direction",
@@ -39,7 +39,7 @@ class Wall(Surface):
             )
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """A box behind the face; z of it is the normal."""
+        """Add a box behind the face, with z along the normal."""
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
         behind = RigidTransform([0.0, 0.0, -_THICK / 2])

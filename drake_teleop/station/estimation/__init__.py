@@ -1,1 +1,1 @@
-"""What the slave finds out from its sensor."""
+"""Estimation at the slave from its wrist sensor: load and contact."""

@@ -1,8 +1,7 @@
-"""Contact at the slave: noticed in the eliminated wrench, sample by sample, and told to the hand.
+"""Contact detection at the slave from the wrench without the load's part, for the operator.
 
-What is noticed, and why fast motion is not contact, says `drake_teleop.load.contact`. The
-noise floor and the threshold come from free motion of the same load with the same sensor: the
-identification run that precedes the station.
+`drake_teleop.load.contact` describes the statistic. Noise floor and threshold come from the
+identification run before: free motion of the same load with the same sensor.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -35,7 +34,7 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_into
 @settings
 @dataclass
 class ContactDetectionConfig:
-    """How contact is noticed; a scenario without this block has no detector."""
+    """Settings of the contact detector; a scenario without this block has none."""
 
     statistic: str = choice("glr", STATISTICS, "what is compared with the threshold")
     margin: float = quantity(
@@ -52,7 +51,7 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _detected(memory, sample, estimate, arm, settings):
-    """Takes one sample; whether there is contact, as before if there is a fault."""
+    """Update the detector with one sample and return its flag; a fault keeps the flag."""
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
     contact, acceleration = np.empty(6), np.empty(3)
@@ -64,10 +63,9 @@ def _detected(memory, sample, estimate, arm, settings):
 
 
 class ContactDetection(LeafSystem):
-    """Says whether the slave touches something.
+    """Detector of contact between slave and environment.
 
-    While the wrist sensor is saturated, and while that shows in its low-pass, nothing is known, and
-    the flag stays as it is.
+    The flag keeps its value while the wrist sensor is saturated and while its low-pass recovers.
 
     .. pydrake_system::
 
@@ -79,8 +77,8 @@ class ContactDetection(LeafSystem):
         - contact: (1,) 1 in contact, else 0
 
     Args:
-        config: how contact is noticed.
-        floor: of the free motion, fitted at the rate of this block.
+        config: settings of the detector.
+        floor: noise floor of the free motion, fitted at the rate of this block.
         arm: the slave's kinematics.
         period: between samples [s].
 
@@ -107,7 +105,7 @@ class ContactDetection(LeafSystem):
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
         self._recovery = round(config.recovery / period)
-        self._blind = self.DeclareDiscreteState(1)  # samples for which nothing will be known
+        self._blind = self.DeclareDiscreteState(1)  # remaining samples without detection
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

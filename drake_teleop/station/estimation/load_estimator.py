@@ -1,13 +1,8 @@
-"""The estimator of Fig. 2: recursive, for the load and the offsets, in the loop.
+"""Recursive estimator of load and offsets in the loop (Fig. 2 of the paper).
 
-The same kernels work on logs (`drake_teleop.load.online.recursive`, `recursive_tls`). It sees the
-sensor's samples only. There is no choice of instrumental variables: instruments would be the
-accelerations of the encoders' readings, and a sample has the readings alone.
-
-With `watch` it freezes what it has learnt once that is settled, keeps the offsets, and notices
-another load (`drake_teleop.load.online.watched`). That needs variances that can be believed, hence
-"rtls": noise of the accelerations biases "rls" by many of its standard deviations, and every motion
-would look like another load.
+It uses the sensor's samples and the kernels for logs (`drake_teleop.load.online.recursive`,
+`recursive_tls`). With `watch` it freezes a settled load, tracks the offsets, and detects another
+load (`drake_teleop.load.online.watched`). This needs the unbiased variances of "rtls".
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -33,7 +28,7 @@ from drake_teleop.load.online.watched import (
 )
 from drake_teleop.load.regressor import SATURATED
 
-# Samples between two looks at whether it has settled.
+# Samples between two checks for settling.
 _CHECK = 16
 
 
@@ -62,7 +57,11 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Raises DrakeTeleopError, naming `where`, if what it would watch cannot be trusted."""
+        """Check that the method suits `watch`.
+
+        Raises:
+            DrakeTeleopError: with `where`, if its covariance is too small.
+        """
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
                 f"the covariance of '{self.method}' is too small to notice a change by",
@@ -72,7 +71,7 @@ class LoadEstimatorConfig:
 
 
 class LoadEstimator(LeafSystem):
-    """Holds the load estimate; improves it with every sample, or watches it, or first one.
+    """Load estimate that is constant, updated with every sample, or monitored.
 
     .. pydrake_system::
 
@@ -82,23 +81,21 @@ class LoadEstimator(LeafSystem):
         output_ports:
         - load_estimate: (16,) Eq. (7), [offsets (6); phi (10)] in S about So
         - load_state: (1,) index into `drake_teleop.load.online.watched.LOAD_STATES`; 1, settled,
-          once every parameter is predicted to be known within the config's bound
+          once the predicted uncertainty of every parameter is within the config's bound
 
     Args:
-        config: whether to learn, how, and how fast to forget; whether to watch.
+        config: settings.
         noise_std: (6,) weights, 1 sigma of the wrench channels [N, N m].
         motion_std: (9,) 1 sigma of s [m/s^2], omega [rad/s] and alpha [rad/s^2], for "rtls" and for
-            watching. For learning only the ratios among all of them matter, so they may be those
-            before a filter.
+            `watch`. For learning only their ratios matter.
         period: sampling period [s].
         sample_size: length of the sample.
         initial: (16,) the estimate to start from.
-        covariance: (16, 16) of it, or None if nothing is known about it. With it, watching begins
-            at once.
-        fallback: (10,) what remains known of phi when the load has changed.
+        covariance: (16, 16) of it, or None if unknown. With it, monitoring begins at once.
+        fallback: (10,) phi after a change of load.
 
     Raises:
-        DrakeTeleopError: if it shall watch, and neither learns nor is given a covariance.
+        DrakeTeleopError: for `watch` without `enabled` and without a covariance.
     """
 
     __slots__ = ONE_DICT
@@ -152,7 +149,7 @@ class LoadEstimator(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
-        if sample[SATURATED] > 0.0:  # the wrench is not the load's
+        if sample[SATURATED] > 0.0:  # the wrench contains more than the load's
             return
         estimate = discrete_state.get_mutable_value(0)
         if self._state(discrete_state) == LEARNING:
@@ -169,7 +166,7 @@ class LoadEstimator(LeafSystem):
     ) -> None:
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
-        # To know whether it has settled takes longer than to learn from a sample.
+        # The check for settling takes longer than the update.
         due = self._watches and round(time / self._period) % _CHECK == 0
         if due and self._estimator.settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)

@@ -1,33 +1,32 @@
-"""What a contact pushes with, over its depth and its speed: stiffness and damping together.
+"""Stiffness and damping of a contact from force, depth and speed.
 
-Of stretches of the way into it, each from the end of the last one,
+Over successive stretches of the displacement into the contact,
 
-    change of force = k way + b change of speed
+    change of force = k displacement + b change of speed
 
-by least squares that forget. A wall that damps would else be taken for a stiffer one on the way in
-and for a softer one on the way out.
+is solved by least squares with forgetting.
 """
 
 from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 
-SUMS = 5  #: numbers to remember for each contact, all zeros at the start
-# Added to the sum of the squared changes of speed. Where speed and way go together nothing tells
-# the two apart, and what is found is stiffness.
+SUMS = 5  #: length of the sums of a contact, zero at the start
+# Relative increase of the squared speed changes: where speed and displacement are proportional, the
+# fit then assigns the force to stiffness.
 _RIDGE = 0.05
 
 
 @njit(cache=True)
 def fit(sums, more, way, faster, keep):
-    """Takes up a stretch, and returns what is found now.
+    """Add a stretch to the sums and return the present estimate.
 
     Args:
-        sums: (SUMS,) changed: of way^2, way faster, faster^2, more way, more faster.
-        more: change of the force [N] (or of a torque, [N m], likewise below).
-        way: way into the contact [m], not 0.
+        sums: (SUMS,) updated: of way^2, way faster, faster^2, more way, more faster.
+        more: change of the force [N].
+        way: displacement into the contact [m], not 0.
         faster: change of the speed into it [m/s].
-        keep: share of what was known that is kept, 0 to 1.
+        keep: share of the old sums that is kept, 0 to 1.
 
     Returns:
         stiffness [N/m] and damping [N s/m], neither below 0.
@@ -42,25 +41,24 @@ def fit(sums, more, way, faster, keep):
     square = (1.0 + _RIDGE) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
-    if not damping > 0.0:  # and so the determinant is not 0 below
+    if not damping > 0.0:  # below, the determinant is not 0
         return max(sums[3] / sums[0], 0.0), 0.0
     return max(square * sums[3] - sums[1] * sums[4], 0.0) / determinant, damping / determinant
 
 
 @njit(cache=True)
 def steadied(push, size, explained, share, turned):
-    """What is shown along a mean direction that friction has tilted.
+    """Return the rendered force along a mean direction that friction has tilted [N].
 
-    A tip that is held sideways by f tilts the mean of its wrench w by f / |w| at most. Where it
-    slips, what there is along the mean changes by f^2 / |w|, though nobody presses otherwise. So a
-    step of up to that which depth and speed do not explain is shown gradually; the rest is at once.
+    A slip changes the component by up to f^2 / |w|, although the contact force is the same. A step
+    of up to that size which depth and speed do not explain is rendered gradually (S3).
 
     Args:
-        push: what was shown [N].
-        size: what there is along the mean now, not negative [N].
-        explained: what it should have changed by [N].
-        share: of the rest that is shown now.
-        turned: f^2 / |w|, of the largest friction of late [N].
+        push: previous result [N].
+        size: present component along the mean, not negative [N].
+        explained: change that depth and speed explain [N].
+        share: share of the remaining change that is rendered now.
+        turned: f^2 / |w|, with the largest recent friction [N].
     """
     push += explained
     push += min(share, 1.0) * (size - push)
@@ -69,14 +67,13 @@ def steadied(push, size, explained, share, turned):
 
 @njit(cache=True)
 def slipped(more, most, turned):
-    """What of a stretch's change of force friction explains, and so no stiffness.
+    """Return the part of a stretch's force change that friction explains [N].
 
-    A tip that slips changes the force where there is hardly any way. What a stiffness from 0 to a
-    certain one does not explain is friction's, up to what that can do.
+    It is the part outside the range from stiffness 0 to the largest stiffness, bounded by `turned`.
 
     Args:
         more: change of the force [N].
-        most: what the stiffest would have changed it by, with the sign of the way [N].
+        most: change by the largest stiffness, with the sign of the displacement [N].
         turned: as in `steadied` [N].
     """
     rest = more - min(max(more, min(most, 0.0)), max(most, 0.0))

@@ -1,12 +1,12 @@
-"""Observers of energy: what flowed through a port, from recorded wrenches and poses.
+"""Energy observers: energy through a port from recorded wrenches and poses.
 
-A sampled product of power times T is not the energy of a port. Which pair is depends on the wrench:
+The pair of wrench and displacement depends on the port:
 
-- `held`: the wrench of sample k acts until the next one. Its work is f_(k-1) . (x_k - x_(k-1)),
-  exactly, whatever the motion does between the samples: the hand's port, and a motor's.
-- `backward`: f_k . (x_k - x_(k-1)). This is what a method at the port can know when it chooses f_k,
-  so it is the pair in which TDPA and waves are exact.
-- `mean`: the mean of both, of second order for a wrench that changes steadily: contact.
+- `held`: f_(k-1) . (x_k - x_(k-1)), exact for a wrench that is held between samples: the hand's
+  port and a motor's.
+- `backward`: f_k . (x_k - x_(k-1)), known when a method selects f_k. TDPA and waves are exact in
+  it.
+- `mean`: mean of both, of second order for a steadily changing wrench such as contact.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from drake_teleop.station.passivity.packet import difference_into, dot
 
 Array = NDArray[np.float64]
 
-#: Pair -> share of f_k; the rest is f_(k-1).
+#: Pair -> weight of f_k; f_(k-1) has the rest.
 PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
 def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
-    """Work of a wrench at a port up to each sample, translation and rotation apart.
+    """Return the cumulative work of a wrench at a port for translation and rotation.
 
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
@@ -36,12 +36,11 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
         pair: one of `PAIRS`.
 
     Returns:
-        (N, 2) sum of f . dx, of tau . log(R_k R_(k-1)^T) [J]; zero at the first sample. At the
-        master's port the hand puts in the negative of it, at the slave's port the environment puts
-        in this.
+        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample. The hand puts
+        in the negative at the master's port; the environment puts in this at the slave's port.
 
     Raises:
-        DrakeTeleopError: for a pair that does not exist, or arrays that do not fit.
+        DrakeTeleopError: for an unknown pair or arrays of wrong shape.
     """
     if pair not in PAIRS:
         raise DrakeTeleopError(
@@ -71,25 +70,24 @@ def _work_into(wrench, pose, share, work):
 
 
 def created(energy: Array) -> Array:
-    """What had been created up to each sample, at the least: max(0, -energy), never falling again.
+    """Return the least energy that was created up to each sample: max(0, -energy), monotonic.
 
     Args:
-        energy: (N, ...) that was put into something passive with nothing stored at the start [J].
+        energy: (N, ...) put into a passive element without stored energy at the start [J].
     """
     return np.maximum.accumulate(np.maximum(-np.asarray(energy), 0.0), axis=0)
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """What the method at one end of the channel has on its books, each (..., 2) [J].
+    """Energy balance of the method at one end of the channel, each field (..., 2) [J].
 
     Attributes:
-        stored: it may still give out.
-        received: of the other end's counter.
-        sent: its own counter, for the other end.
-        lost: it took out of the loop. `tdpa`: work that was withheld, a measure of its activity.
-            `two_layer`, `pspm`, `ledger`: what overflowed a store. `wave`: what the matching
-            damper took.
+        stored: energy that the end may still release.
+        received: counter of the other end, as accounted.
+        sent: counter of this end.
+        lost: energy removed from the loop. `tdpa`: withheld work, a measure of its activity;
+            `two_layer`, `pspm`, `ledger`: overflow; `wave`: dissipation of the matching damper.
     """
 
     stored: Array
@@ -99,7 +97,7 @@ class Ledger:
 
 
 def ledger(memory: Array) -> Ledger:
-    """The ledger in the memory (..., MEMORY) of an end; zero for methods that keep none."""
+    """Return the energy balance in the memory (..., MEMORY) of an end; zero for methods without."""
     if memory.shape[-1] != MEMORY:
         raise DrakeTeleopError(
             f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"
@@ -111,5 +109,5 @@ def ledger(memory: Array) -> Ledger:
 
 
 def in_flight(master: Ledger, slave: Ledger) -> Array:
-    """Energy that was sent and has not arrived yet, both ways, (..., 2) [J]."""
+    """Return the energy that is sent and has not arrived, both directions, (..., 2) [J]."""
     return (master.sent - slave.received) + (slave.sent - master.received)

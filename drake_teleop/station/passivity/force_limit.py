@@ -1,8 +1,7 @@
-"""Local force limit: what is felt never exceeds a force that the hand can hold by itself.
+"""Local force limit: the rendered wrench never exceeds a force that the hand can hold.
 
-It keeps no account of energy. A loop that is unstable stays so, but its limit cycle is no stronger
-than the limit, and it ends where the hand and the device's friction take more than the limited
-wrench can give. This is the ceiling that safety standards ask for, whatever the other end says.
+The method keeps no energy balance. An unstable loop stays unstable, but the limit bounds its limit
+cycle. Safety standards require such a ceiling independent of the other end.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -31,13 +30,13 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[_OWN_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit(wrench, g, p[_OWN_LIMIT][g])
@@ -46,5 +45,5 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)

@@ -1,15 +1,9 @@
 """Lawrence's four-channel architecture with local force feedback, tuned for transparency.
 
-Both ends send motion and force (Lawrence 1993; Hashtrudi-Zaad and Salcudean 2001):
-
-    (1 + C6) F_h = Z_cm V_m + C4 V_s + C2 F_e        Z_cs V_s = C1 V_m + C3 F_h - (1 + C5) F_e
-
-with C1 = C_s, C4 = -C_m, C2 = 1 + C6, C3 = 1 + C5: transparent without delay but for the masses,
-whose accelerations are not fed forward. The master's controller C_m is a spring and damper between
-hand and slave; the slave's is its servo, to which force comes as a shift of the command by F / K.
-C5 and C6 are local force feedback at slave and hand; C6 needs a sensor of the hand's force, and so
-does C3. There is no account of energy, and any delay makes it active; but C_m, which holds the hand
-to where the slave was, damps it, at the price of a drag in free motion.
+Equations and sources: docs/theory.md, "Over a network", (T39). C_m is a spring and damper between
+hand and slave. The slave's controller is its servo; a force shifts its command by F / K. C5 and C6
+are local force feedback at slave and hand; C3 and C6 need a sensor of the hand's force. There is no
+energy balance: any delay makes the channel active. C_m damps the hand, with drag in free motion.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -43,11 +37,10 @@ from drake_teleop.station.passivity.packet import (
     moved_into,
 )
 
-# Parameters; those of two numbers are for translation and rotation.
+# Parameters; pairs are for translation and rotation.
 _places = own_parameters()
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 _SLAVE, _HAND = _places.number(), _places.number()
-# Memory.
 _DIFFERENCE = own_memory().vector(6)
 
 
@@ -68,14 +61,14 @@ class FourChannelConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
         p[_SLAVE], p[_HAND] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`. It sends the hand's wrench."""
+    """Run one step of the master's end, which sends the hand's wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     behind = arrived(received)
@@ -95,7 +88,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     if arrived(received):
         shift = memory[_DIFFERENCE]
         for i in range(6):

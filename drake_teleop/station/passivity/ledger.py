@@ -1,101 +1,7 @@
-"""Energy ledgers at the slave's actual motion, and motors that are held to them. (long: one law)
+"""Energy ledger at the slave's actual motion: parameters and the master's end.
 
-With the hand's held wrench f, the contact's wrench w and the slave's *actual* motion x_s, hand and
-contact have put in E_act = -sum f_(k-1) . dx_m + integral w . dx_s. The hand's ledger L_m counts
-the work at the hand, the slave's ledger L_s that at the contact, each with what came and less what
-was sent; and the account A leaves out what the slave's own mass holds, A = L_s - m v^2 / 2. Then
-
-    dA/dt = -f_motor . v   (+ what comes, - what is sent, + friction):
-
-the motors alone change A, whatever the wall does. So they are held to what A can pay for, and
-L_s >= m v^2 / 2 >= 0 against every environment. E_act = -E_0 + L_m + L_s + what is on its way or
-lost, where E_0 is what the ledgers hold at the start: `initial`. With 0 there, drag has to earn it,
-and the slave hardly moves until the hand has gone about 0.1 m.
-
-===================  ====================================  ========================================
-port                 promise                               assumption
-===================  ====================================  ========================================
-hand (held), actual  E_act >= -E_0, whatever network,      the slave has at most the mass that was
-motion of the slave  hand and environment do               told; K and D of its servo are within
-                                                           20 %; w is the wrench at the contact; a
-                                                           step each millisecond
-hand, motors of the  E_mot >= -E_0 - friction's work       the same
-slave
-hand, command        none: it lies beyond the servo's
-                     spring, and means no energy
-hand alone           let go, it gets no more than          the device displays what it is told
-                     R_m + 0.7 R_s, and no faster than
-                     about twice `passivity.retreat`
-what is felt         at rest, what is pressed              a wall that is a spring and a damper; a
-                                                           stiff one is shown softer, by k_d of
-                                                           step S3
-===================  ====================================  ========================================
-
-Before an unknown wall a slave that moves at v can give out m v^2 / 2: its reserve R_s, which limits
-its speed, is the price of the promise, and is not used up. Nothing is asked about the hand. A force
-that is predicted as in M2 makes hand and wall a loop that is stable for every hand and round trip
-if k_c exceeds half of the wall's stiffness.
-
-At each step of the master, with the slave's steps S1 to S6 in `ledger_slave`:
-
-:M1: L_m -= f_(k-1) . dx; below zero it is a debt, never written off. While something is touched,
-    and L_m has half of R_m, what the hand pays is sent instead: the slave presses with it.
-    L_m += what came.
-:M2: What is touched pushes along one unit wrench n, the mean of w over two round trips and 3 s
-    at least: force and torque together, so that a point that is touched far from So is one spring
-    and not two. With w_n = w . n and x_n = n . x, where a torque counts as a force at 0.1 m,
-
-        u_n = w_n - 1.1 k_c (x_m - z - o)_n - b (v_m - z')_n   >= 0
-
-    of the newest packet, where k_c and b are the wall's stiffness and damping along n, z where the
-    slave would be without a wall, and o fades: how far hand and slave were apart at the onset, or 0
-    if the wall was known. x_m is led by two steps, because a spring that is held over a step is
-    active by k T / 2 (Colgate and Schenkel 1997). Across n there is friction. One that is felt late
-    drives the hand, so the hand has a friction h of its own there, as in Dahl's model (1968):
-
-        h' = -k_h v_m + (w - w_n n - h) / tau,    |h| <= h_m u_n / w_n,
-
-    at rest what is measured too. What is shown is led by a step, h - k_h dx, for the same reason as
-    x_m: a light hand that turned by 0.5 mrad kept itself shaking at 58 Hz. As n turns, what of h's
-    force comes to lie along n's is dropped, of the force alone: a press that a torque hides in
-    n . h would else be felt for as long as h lasts. k_h is 2.5 kN/m, h_m the largest |w - w_n n| of
-    about a second or of tau, tau thirty round trips, but 0.6 s at least: friction that fades while
-    the hand rests lets it move, and a round trip later the tip slips. Both means are so slow
-    because what they pass on of the slave's friction, a round trip late, moves the hand, and that
-    turns the friction round: with 0.8 s and ten round trips the tip stuck and slipped on for good
-    over 100 ms. Of w_n, what friction alone explains is shown gradually, see S3.
-:M3: The wall is remembered, so that fast taps are felt: while nothing else is heard,
-    u_n = -k_c (x_m - x_w)_n. It is dropped when the slave says that it was the wall that went: a
-    force of 0.3 N and twice what its motion explains was over within a step. Also when the slave
-    was so deep in it that it should have met 1 N, 1 to 3 mm, and met nothing: a hard wall that has
-    gone stops the hand before 3 mm; or when it missed 0.03 N s beyond 0.3 mm: a light hand leans on
-    a wall by less than 1 N.
-:M4: A hand that moves fast along u, as one that has let go, is pushed less: module `retreat`,
-    after M6. The next step counts what was held.
-:M5: u may spend a share of L_m; what was shortened comes back in 20 ms. With L_m at its end there
-    is a force only at steps in which the hand is seen to move against it, likewise for M6: a
-    reversal is seen late, by a step of the encoder at least, and nothing could pay for it.
-:M6: Drag on the hand, from where a reserve is below 0.3 of itself (in contact: L_m below R_m) until
-    both are full; what was sent counts as there. A wall that goes keeps what was put into it, and
-    is to be felt no longer than the news takes. Drag, too, on a hand that was pushed since it last
-    rested, while it is fast.
-:M7: What L_m has beyond its reserve R_m (in contact R_m + 0.7 R_s) is sent.
-
-Translation and rotation are two groups with a ledger each; what is touched is one for both. Where
-packets were missing, or it has changed, the wrench goes over gradually. Not for a wall that goes:
-that would be felt for longer than the news takes, and a hand that falls into it is not braked for
-what pushed it before. A wrench against n is another contact. In a station the mass is that of its
-arm at the start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg,
-since it may turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs
-R_s = k_f m v^2 / 2. With sigma > 0 weight and inertia of the slave's load are felt as well, and are
-no contact: what is touched, its direction, stiffness and prediction are of the contact's wrench w
-alone. The load's is sent beside it, smoothed over a round trip, and added to u after M3. The
-ledgers take the work of both, so that E_act is that of contact and load, which gives back what was
-put into it. A hand that lowers the load is paid by L_m until the slave has done so too, and feels
-it fade when that is spent: after 11 mm, of 1.75 N and R_m = 20 mJ. M4 fades it where the hand goes
-down fast.
-The account is behind the safe state, on whose command the motors' clamp has the last word, and
-behind whatever else changes a command: it uses what the slave did. The packet's pose is z.
+docs/theory.md, section "The energy ledger", contains the law, its promises and the purpose of each
+constant. M1 to M7 and S1 to S6 are the steps there. `ledger_slave` is the slave's end.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -237,7 +143,7 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[INITIAL], p[RESERVE], p[HAND_RESERVE] = self.initial, self.reserve, self.hand_reserve
         p[DRAG] = np.divide(self.drag, p[MOTION_SCALE])
         p[TOUCH] = np.divide(self.touch, p[MOTION_SCALE])
@@ -245,16 +151,16 @@ class LedgerConfig:
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
-    """Half of the initial energy for each end; the servo's model rests where the slave does."""
+    """Give half of the initial energy to an end; place the servo model at the slave's pose."""
     memory[LEDGER] = p[INITIAL] / 2.0
     memory[MODEL] = memory[COMMAND_POSE]
 
 
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2,) what full reserves let the slave go at most, as S4 says [m/s, rad/s].
+    """Return the largest speed of the slave with full reserves, step S4 (2,) [m/s, rad/s].
 
     Args:
-        config: with the reserves, which grow with the square of the speed.
+        config: contains the reserves, which grow with the square of the speed.
         mass: (2,) of the slave, in the master's power units [kg, kg m^2].
     """
     left = (1.0 - MARGIN) * np.asarray(config.reserve)
@@ -263,7 +169,7 @@ def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     velocity, ahead = memory[VELOCITY_HERE], wrench  # where it is, the wrench will be written
     smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
     memory[_DEPTH] += over_way(memory[_INWARD], dx)
@@ -301,7 +207,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _account_of_hand(g, dx, touched, p, memory):
-    """M1, but for what came."""
+    """Step M1."""
     work, ledger = dot(memory[HELD], dx, g), memory[LEDGER]
     memory[_GIVEN][g] = max(memory[_GIVEN][g] + work, 0.0)
     if work < 0.0 and touched and ledger[g] > _OWN * p[HAND_RESERVE][g]:
@@ -312,7 +218,10 @@ def _account_of_hand(g, dx, touched, p, memory):
 
 @njit(cache=True)
 def _predict(received, dx, T, p, memory, ahead, wrench):
-    """M2, M3: the wrench is written, to where x_m - z is."""
+    """Write the predicted contact wrench (M2, M3) into `wrench`.
+
+    `ahead` contains x_m - z; it may be the same array as `wrench`.
+    """
     shown, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_OVER * received[CONTACT_STIFFNESS], _STIFFEST)
     if not touches(shown, p):
@@ -379,7 +288,7 @@ def _predict(received, dx, T, p, memory, ahead, wrench):
 
 @njit(cache=True)
 def _rub(g, T, size, pressed, shown, received, dx, p, memory):
-    """M2, h: what there is across the contact's direction."""
+    """Step M2, (T68)."""
     normal, rubbing, most = memory[NORMAL], memory[_RUBBING], memory[_FRICTION]
     # A torque's share of the metric is 0 where rotation is not passed on.
     metric, way, total = max(p[METRIC][g], 1e-12), over_way(normal, dx), 0.0
@@ -397,7 +306,7 @@ def _rub(g, T, size, pressed, shown, received, dx, p, memory):
 
 @njit(cache=True)
 def _show_rubbing(dx, pressed, p, memory, wrench):
-    """M2: h, led by a step, is written."""
+    """Write the friction h, advanced by one step (M2)."""
     normal, way = memory[NORMAL], over_way(memory[NORMAL], dx)
     for g in range(2):
         metric = max(p[METRIC][g], 1e-12)
@@ -409,7 +318,7 @@ def _show_rubbing(dx, pressed, p, memory, wrench):
 
 @njit(cache=True)
 def _approach(g, T, p, memory, wrench):
-    """The wrench goes over from the last one, without a blow."""
+    """Bound the change of the wrench after missing packets or a change of contact."""
     last, missing = memory[_LAST], memory[_MISSING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -425,7 +334,7 @@ def _approach(g, T, p, memory, wrench):
 
 @njit(cache=True)
 def _afford(g, dx, T, p, memory, wrench):
-    """M5: the wrench is shortened to what the ledger can pay for until the next step."""
+    """Shorten the wrench so that its cost until the next step is within the ledger (M5)."""
     size, cost = length(wrench, g), 0.0
     if size > 0.0:
         way = dot(wrench, memory[VELOCITY_HERE], g) / size * T
@@ -444,10 +353,9 @@ def _afford(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _earning(g, dx, T, p, memory):
-    """What an empty ledger leaves of a force that the hand pays for, 0 to 1.
+    """Return the share of an energy-absorbing force that an empty ledger permits, 0 to 1.
 
-    The filter is late for a reversal, by a step of the encoder at least. Nothing is earned yet that
-    this could cost, so there is a force only where the hand is seen to move.
+    The velocity filter detects a reversal at least one encoder step late (M5).
     """
     if memory[LEDGER][g] >= MARGIN * p[RESERVE][g]:
         return 1.0
@@ -458,7 +366,7 @@ def _earning(g, dx, T, p, memory):
 
 @njit(cache=True)
 def _drag(g, received, dx, T, p, memory, wrench):
-    """M6: adds drag."""
+    """Step M6."""
     velocity, drag, charging = memory[VELOCITY_HERE], 0.0, memory[_CHARGING]
     speed, own = length(velocity, g), memory[LEDGER][g] / p[HAND_RESERVE][g]
     # What has been sent counts as there: to hear of it takes a round trip.

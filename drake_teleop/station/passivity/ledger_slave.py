@@ -1,34 +1,6 @@
-"""The slave's end of `ledger`, see `drake_teleop.station.passivity.ledger`. (long: one end's steps)
+"""Slave's end of the energy ledger (long: all steps of one end).
 
-At each step, w the contact's wrench, l what is felt of the load, x and v the slave's actual motion,
-m, K, D mass and servo as they are believed, all in the master's power units:
-
-:S1: L_s += min((w + l)_k . dx, (w + l)_(k-1) . dx) + what came; likewise Q, from zero at each
-    contact's onset; A = L_s - m v^2 / 2.
-:S2: To the master goes what is above the reserve R_s, if it is short; in contact and nearly at rest
-    what is above 0.3 R_s, because pushing back takes energy then and moving does not; above 0.1 R_s
-    as long as R_m is not full. A hand that nothing pushes back goes deeper, and that costs more.
-:S3: The contact's direction n is the mean of w, as in M2; its stiffness k and damping b follow from
-    w_n, way and speed along n, over the last 1 to 10 mm of way since the onset. Of k the slave
-    shows the share rho = min(1, k_d / k), k_d = max(k_0, 2 c R_m / (v_p R)^2) with the largest
-    round trip R: a hand goes v_p R deep before it feels anything, and R_m has to push it back. A
-    hand that stays feels at once how deep it goes, and in contact its end has 4.5 R_m (S2): c goes
-    from 1 to 10 in about a second, for k_d up to 1200 N/m; but not over a network that falls silent
-    for half a round trip, or 60 ms (20 ms at least), and only by the share of R_m that the hand's
-    end has. Without that it feels 2 N where the slave presses with 16. At a contact's onset k is
-    that of the last one, so that a bounce does not stiffen the wall. Beyond the wall x_w the target
-    is x_w + rho (x_received - x_w), along n. rho is left alone while it would change by less than a
-    tenth: it moves the slave, and friction makes a new k of that. Friction that lasts tilts n, and
-    where it lets go w_n steps by as much as f^2 / |w|, f the largest across n of about a second. A
-    step up to that which k and b do not explain is shown in 0.6 s, or over 1 mm of way. It is no
-    stiffness either: of a stretch's change of force what neither 0 nor 2 k explains.
-:S4: The command follows the target with bounded acceleration, and m v^2 / 2 <= L_s.
-:S5: Motors that push with the motion, f . v > 0, spend at most what A holds in 4 ms; pressing on
-    the wall what was paid since the onset, Q, and c F_u^2 / 2 k that nobody paid. With A at its end
-    they brake. Standing still may always hold. It is done through the command, x + (f + D v) / K.
-:S6: Sent: w, L_s, z and z' = the servo's model of the received pose, k_c = rho k / (1 + k / K)
-    along n, or 0 once it was the wall that went, see M3; b, R; and l, smoothed over R and the
-    servo's lag: inertia that is felt late drives a hand.
+See docs/theory.md, section "The energy ledger": steps S1 to S6, promises, constants.
 """
 
 from __future__ import annotations
@@ -146,7 +118,6 @@ _PUSH, _BEFORE, _ACROSS = (_places.number() for _ in range(3))
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    """Filters the velocity of this end."""
     velocity = memory[VELOCITY_HERE]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -154,25 +125,28 @@ def smooth_velocity(twist, share, memory):
 
 @njit(cache=True)
 def touches(wrench, p):
-    """Whether a wrench is a contact's."""
+    """Return whether a wrench exceeds the contact threshold."""
     return length(wrench, 0) > p[TOUCH][0] or length(wrench, 1) > p[TOUCH][1]
 
 
 @njit(cache=True)
 def along(a, b, p):
-    """What there is of the wrench a along the unit wrench b [N]; of any with itself its square."""
+    """Return the component of the wrench `a` along the unit wrench `b` [N]."""
     return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
 
 
 @njit(cache=True)
 def over_way(wrench, way):
-    """The work of a wrench over a way; of a unit wrench it is the way along it [m]."""
+    """Return the work of a wrench over a displacement; for a unit wrench the component [m]."""
     return dot(wrench, way, 0) + dot(wrench, way, 1)
 
 
 @njit(cache=True)
 def find_direction(wrench, trip, T, p, memory):
-    """The contact's direction, a unit wrench, from its wrench; and what there is along it [N]."""
+    """Update the contact's direction, a unit wrench, and return the component along it [N].
+
+    A much larger wrench or the opposite direction is a new contact and replaces the mean at once.
+    """
     pushed, normal = memory[PUSHED], memory[NORMAL]
     rate = 1.0
     if memory[TOUCHED] > 0.0:
@@ -193,7 +167,7 @@ def find_direction(wrench, trip, T, p, memory):
 
 @njit(cache=True)
 def receive(g, received, memory):
-    """Adds what has come to the ledger, and returns it."""
+    """Add newly received energy to the ledger of group `g` and return it."""
     more = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
     memory[LEDGER][g] += more
     memory[RECEIVED][g] += more
@@ -202,7 +176,7 @@ def receive(g, received, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     gap, now, going = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     heard = arrived(received)
     memory[_PERIOD] = T
@@ -253,7 +227,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory):
-    """S1, S2."""
+    """Update the slave's ledger and return surplus energy (S1, S2)."""
     # The wrench went from the last one to this one: of both works the smaller is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD], dx, g))
     more = receive(g, received, memory)
@@ -280,13 +254,13 @@ def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memo
 
 @njit(cache=True)
 def _lag(p):
-    """How late the servo is [s]."""
+    """Return the servo's delay [s]."""
     return 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])
 
 
 @njit(cache=True)
 def _shown_at_most(received, T, p, memory):
-    """k_d, of S3."""
+    """Return the largest displayed stiffness k_d (S3) [N/m]."""
     normal, paid = memory[NORMAL], 0.0
     depth, first = _PRESS * (memory[_ROUND_TRIP] + _lag(p)), math.inf
     for g in range(2):
@@ -305,7 +279,7 @@ def _shown_at_most(received, T, p, memory):
 
 @njit(cache=True)
 def _learn(received, touched, dx, wrench, T, p, memory):
-    """S3 but for the target: direction, stiffness, damping, share, how deep the slave is."""
+    """Identify direction, stiffness, damping, displayed share and depth of the contact (S3)."""
     normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
     if not touched:
         if memory[TOUCHED] > 0.0 and _goes(dx, memory):
@@ -358,7 +332,7 @@ def _learn(received, touched, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _goes(dx, memory):
-    """Whether it is the wall that goes, not the slave, of a contact that ends with the way dx."""
+    """Return whether the contact ended with the step `dx` because the wall was removed (S6)."""
     normal = memory[NORMAL]
     faster = over_way(normal, memory[VELOCITY_HERE]) + memory[_BEFORE]
     explained = abs(memory[_STIFFNESS] * over_way(normal, dx)) + abs(memory[_DAMPER] * faster)
@@ -367,7 +341,7 @@ def _goes(dx, memory):
 
 @njit(cache=True)
 def _turns(wrench, size, T, p, memory):
-    """f^2 / |w| of S3: what friction that lets go changes the wrench along n by at most [N]."""
+    """Return f^2 / |w| of S3: the largest change along n that a slip can cause [N]."""
     pushed = memory[PUSHED]
     mean = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
     rubs = math.sqrt(max(along(wrench, wrench, p) - size * size, 0.0))
@@ -377,7 +351,10 @@ def _turns(wrench, size, T, p, memory):
 
 @njit(cache=True)
 def _generate(received, heard, T, p, memory, gap):
-    """S3, S4: the command's velocity; `gap` is from the command to the received pose, changed."""
+    """Compute the command's velocity (S3, S4).
+
+    `gap` contains the pose difference from the command to the received pose and is overwritten.
+    """
     going, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
     yields, over, fast = 0.0, 0.0, 0.0
     if memory[TOUCHED] > 0.0:
@@ -407,9 +384,9 @@ def _generate(received, heard, T, p, memory, gap):
 
 @njit(cache=True)
 def _clamp(command, pose, twist, p, memory):
-    """S5: moves the command (7,) so that the motors' pull is paid for; whether it had to.
+    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved.
 
-    The generator goes on from there, no faster than the slave.
+    The command generator then continues from there, at most as fast as the slave.
     """
     pull, changed = memory[_PULL], False
     difference_into(command, pose, pull)
@@ -432,7 +409,7 @@ def _clamp(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _hold_back(g, damping, twist, p, memory):
-    """Shortens the motors' pull to what is paid for, or brakes; whether it did."""
+    """Limit the motors' wrench to the available energy, or brake; return whether it changed."""
     pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[_CONTACT]
     size, speed, mass = length(pull, g), length(twist, g), HEAVY * p[MASS][g]
     still = length(velocity, g) < _STILL * ARM[g]
@@ -463,7 +440,7 @@ def _hold_back(g, damping, twist, p, memory):
 
 @njit(cache=True)
 def _model(received, heard, T, p, memory, gap):
-    """S6: a step of the servo's model; implicit Euler is stable with every servo."""
+    """Advance the servo model (S6) by implicit Euler, which is stable for every servo."""
     model, going = memory[MODEL], memory[_MODEL_TWIST]
     gap[:] = 0.0
     if heard:
@@ -477,7 +454,7 @@ def _model(received, heard, T, p, memory, gap):
 
 @njit(cache=True)
 def command_left(wanted, command, pose, twist, p, memory):
-    """Has the last word on what the safe state has made of the command; see `methods.Methods`."""
+    """Limit the command after the safe state changed it (S5); see `methods.Methods`."""
     for i in range(7):
         if command[i] != wanted[i]:
             if _clamp(command, pose, twist, p, memory):

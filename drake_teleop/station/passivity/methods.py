@@ -1,14 +1,14 @@
-"""The methods by name, their parameters, and one step of either end of the channel.
+"""Methods by name, their parameters, and one step of either end of the channel.
 
-The two ports of the station's bilateral part are
+Ports of the bilateral part of the station:
 
-- the master's: the wrench that the hand shall feel, and the motion of the slave's command before
-  the channel (after kinematic scaling);
-- the slave's: the contact wrench, and the actual motion of the slave.
+- master: the wrench to render, and the motion of the command before the channel (after kinematic
+  scaling);
+- slave: the contact wrench, and the actual motion of the slave.
 
-Motion and wrenches are in world axes. Wrenches are in the *master's power units*: scaled so that
-wrench times motion of the slave's command is the work at the hand. The hand puts -f . dx into the
-channel, the environment f . dx; what comes out of a passive channel never exceeds what was put in.
+Motion and wrenches are in world axes. Wrenches are in the *master's power units*: wrench times
+motion of the slave's command is the work at the hand, docs/theory.md (T29). The hand puts in
+-f . dx, the environment f . dx.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -57,14 +57,14 @@ from drake_teleop.station.passivity.wave import WaveConfig
 @settings
 @dataclass
 class Methods:
-    """The methods and the parameters of each: a line here enters one, by its field's name.
+    """Parameters of each method; a field registers its method by the field's name.
 
-    The file of a method is that of its parameters' class, which has `pack_into(p)`. It holds the
-    compiled `master_step` and `slave_step`, called with the arguments of those below but for the
-    first. It may hold `initialize(p, memory)`, which changes the memory of an end before its first
-    step; and the compiled `command_left(wanted, command, pose, twist, p, memory)`, which tells a
-    method how the safe state has changed what it `wanted` (7,). One whose account is of the slave's
-    motors, and not of its command, says `AT_THE_MOTOR = True`.
+    The module of the field's class is the method. Its config has `pack_into(p)`. The module
+    contains the compiled `master_step` and `slave_step`, with the arguments of those below except
+    the first. Optional: `initialize(p, memory)` prepares the memory of an end; the compiled
+    `command_left(wanted, command, pose, twist, p, memory)` receives the command after the safe
+    state; `AT_THE_MOTOR = True` marks an energy balance at the slave's motors instead of its
+    command.
     """
 
     wave: WaveConfig = field(default_factory=WaveConfig)
@@ -84,9 +84,9 @@ _FILES: dict[str, Any] = {"none": none} | {
     name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
 }
 METHODS = tuple(_FILES)
-"""The names of all methods."""
+"""Names of all methods."""
 AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_THE_MOTOR"))
-"""Those that act at the port of the slave's motors."""
+"""Methods with an energy balance at the port of the slave's motors."""
 
 
 _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
@@ -123,11 +123,10 @@ class _Common:
 @settings
 @dataclass
 class PassivityConfig(Methods, _Common):
-    """Which method keeps the station passive, and the parameters of each.
+    """Method that keeps the station passive, and the parameters of each method.
 
-    The servo is what the methods that act at the slave's motor port (`two_layer`, `pspm`, `ledger`)
-    and `four_channel` believe of it: it pulls the slave with K (x_command - x) - D v. The mass is
-    what `two_layer` and `ledger` believe.
+    The servo pulls the slave with K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
+    `four_channel` use these K and D. `two_layer`, `ledger` and `retreat` use the mass.
     """
 
 
@@ -136,17 +135,16 @@ def parameters(
     power_scale: Sequence[float] = (1.0, 1.0),
     motion_scale: Sequence[float] = (1.0, 1.0),
 ) -> NDArray[np.float64]:
-    """The parameters of the chosen method as one vector for the compiled steps.
+    """Return the parameters of the selected method as one vector for the compiled steps.
 
     Args:
-        config: the method and its parameters.
+        config: method and parameters.
         power_scale: (2,) the master's power units over the slave's, for translation and rotation:
             force scale over kinematic scale.
-        motion_scale: (2,) kinematic scale, slave over master, of translation and rotation: a wrench
-            at the hand over one in the master's power units.
+        motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
 
     Returns:
-        (PARAMETERS,) packed as `drake_teleop.station.passivity.memory` says.
+        (PARAMETERS,) in the layout of `drake_teleop.station.passivity.memory`.
     """
     p = np.zeros(PARAMETERS)
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
@@ -163,15 +161,15 @@ def parameters(
 def initial_memory(
     method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(MEMORY,) the memory of an end before its first step.
+    """Return the memory (MEMORY,) of an end before its first step.
 
     Args:
         method: one of `METHODS`.
-        parameters: of `parameters`.
-        pose: (7,) X_WS where this end starts: the slave's command until a packet arrives.
+        parameters: result of `parameters`.
+        pose: (7,) X_WS at the start: the slave's command until a packet arrives.
 
     Raises:
-        DrakeTeleopError: for a method that does not exist.
+        DrakeTeleopError: for an unknown method.
     """
     if method not in METHODS:
         raise DrakeTeleopError(
@@ -189,7 +187,7 @@ def initial_memory(
 
 @njit(cache=True)
 def _as_wanted(wanted, command, pose, twist, p, memory):
-    """What a method does that need not know which command has left."""
+    """Do nothing, for a method without `command_left`."""
 
 
 _ROW = types.Array(types.float64, 1, "C")
@@ -201,13 +199,9 @@ _master_step, _slave_step, _command_left = map(call_at, (_MASTER, _SLAVE, _LEFT)
 
 @cache
 def steps_of(method: str) -> tuple[int, int, int]:
-    """The addresses of a method's `master_step`, `slave_step` and `command_left`, compiled here.
+    """Return the addresses of a method's `master_step`, `slave_step` and `command_left`.
 
-    By these a channel calls them. By name it would contain all methods, and take nine times as long
-    to compile.
-
-    Args:
-        method: one of `METHODS`.
+    A channel calls them by address: a channel with all methods would compile nine times as long.
     """
     file = _FILES[method]
     return (
@@ -219,7 +213,7 @@ def steps_of(method: str) -> tuple[int, int, int]:
 
 @njit(cache=True)
 def _finish(healthy, memory, packet):
-    """Numbers the packet; one of an end whose inputs are not finite repeats the last good one."""
+    """Number the packet; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[HEALTHY] = 1.0
         put(memory, PACKET.start, packet, 0, PACKET_SIZE)
@@ -234,26 +228,25 @@ def _finish(healthy, memory, packet):
 def master_step(
     steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
 ):  # fmt: skip
-    """One step of the master's end, allocation-free: what the hand feels, and what is sent.
+    """Run one step of the master's end without allocation: wrench at the hand and packet.
 
     Args:
-        steps: of the method, `steps_of(method)`.
-        received: (PACKET_SIZE,) the newest packet of the slave; zeros before the first.
-        fresh: whether it is seen for the first time.
+        steps: result of `steps_of(method)`.
+        received: (PACKET_SIZE,) newest packet of the slave; zeros before the first.
+        fresh: whether the packet is new.
         pose: (7,) X_WS of the command, after kinematic scaling, before the channel.
         twist: (6,) its twist [v; omega], in W.
         dx: (6,) its increment since the last step [dp; log(R_k R_(k-1)^T)], in W.
         hand: (6,) wrench of the hand on the device, in W and master power units (0 if it is not
-            measured; `four_channel` alone uses it).
-        limits: (2,) that force and torque keep, in the master's power units [N, N m].
+            measured; only `four_channel` uses it).
+        limits: (2,) of force and torque, in the master's power units [N, N m].
         T: time between steps [s].
-        p: (PARAMETERS,) of `parameters`.
-        memory: (MEMORY,) of `initial_memory`, changed.
-        wrench: (6,) written: what the hand shall feel until the next step. Zero if an input is
-            not finite.
-        packet: (PACKET_SIZE,) written: what is sent.
+        p: (PARAMETERS,) result of `parameters`.
+        memory: (MEMORY,) result of `initial_memory`, updated.
+        wrench: (6,) written: wrench to render until the next step; 0 if an input is not finite.
+        packet: (PACKET_SIZE,) written: packet to send.
     """
-    packet[:] = 0.0  # a method writes only what it uses
+    packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(hand)
     if not healthy:
         wrench[:] = 0.0
@@ -267,19 +260,19 @@ def master_step(
 
 @njit(cache=True)
 def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end, allocation-free: where the slave shall go, and what is sent.
+    """Run one step of the slave's end without allocation: command of the slave and packet.
 
     Args:
-        steps, received, fresh, T, p, memory, packet: as for `master_step`; the newest packet is
-            the master's.
+        steps, received, fresh, T, p, memory, packet: as for `master_step`, with the master's
+            packet.
         pose: (7,) X_WS of the slave, actual.
         twist: (6,) its twist [v; omega], in W.
         dx: (6,) its increment since the last step, in W.
         wrench: (6,) contact wrench, scaled, in W and master power units.
-        command: (13,) written: pose (7,) and twist (6,) that the slave shall follow. The last one,
-            at rest, if an input is not finite.
+        command: (13,) written: pose (7,) and twist (6,) of the slave's command. The last pose, at
+            rest, if an input is not finite.
     """
-    packet[:] = 0.0  # a method writes only what it uses
+    packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
     if not healthy:
         memory[COMMAND_TWIST] = 0.0
@@ -293,5 +286,5 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 
 @njit(cache=True)
 def command_left(steps, wanted, command, pose, twist, p, memory):
-    """Tells a method which command has left; see `Methods`."""
+    """Pass the command after the safe state to the method; see `Methods`."""
     _command_left(steps[2], wanted, command, pose, twist, p, memory)

@@ -1,6 +1,6 @@
-"""No method: the wrench and the pose are passed on as they come.
+"""No passivity method: wrench and pose are passed on unchanged.
 
-Energy is created in the channel as soon as there is delay or loss. It is the baseline.
+Delay or loss creates energy in this channel. It is the baseline.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrive
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     wanted = received[WRENCH]
     for i in range(6):
         wrench[i] = wanted[i]
@@ -25,7 +25,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     if arrived(received):
         put(memory, COMMAND_POSE.start, received, POSE.start, 7)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)

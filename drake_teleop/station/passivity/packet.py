@@ -1,11 +1,9 @@
-"""What a packet holds, and the small vector operations that the methods share.
+"""Contents of a packet, and the small vector operations that all methods use.
 
-One layout serves every method and both directions: (38,) float64. Counters and integrals are
-cumulative, so a receiver takes differences to the newest packet that it has, and lost, late or
-doubled packets do no harm.
-
-Vectors of six are two *groups* of three, translation first: a ledger is one number for each group
-and a limit shortens a group without turning it, so that no result depends on the world's axes.
+One layout, (38,) float64, serves every method and both directions. Counters and integrals are
+cumulative, so lost, late or duplicate packets do no harm. A vector of six has two *groups* of
+three, translation first. A ledger is one number for each group; a limit shortens a group without
+rotation.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
 #: Number of the packet, counted by its sender.
 SEQUENCE = _places.number()
-#: 1 if the sender's inputs were finite, else 0 (all else is then its last good packet).
+#: 1 if the sender's inputs were finite; else 0, with the contents of its last good packet.
 HEALTHY = _places.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
 POSE = _places.vector(7)
@@ -28,32 +26,32 @@ POSE = _places.vector(7)
 VELOCITY = _places.vector(6)
 #: Its wrench [f; tau], in W, in the master's power units.
 WRENCH = _places.vector(6)
-#: Cumulative integral, of the method's choice.
+#: Cumulative integral; the method defines it.
 INTEGRAL = _places.vector(6)
-#: Cumulative energy that the receiver may use, for each group [J].
+#: Cumulative energy that the receiver may use, by group [J].
 ENERGY = _places.vector(2)
-#: A second counter of energy, for each group [J].
+#: Second energy counter, by group [J].
 OTHER_ENERGY = _places.vector(2)
-#: 1 while the slave's detector says that something is touched.
+#: 1 while the slave's detector reports contact.
 CONTACT = _places.number()
-#: What weight and inertia of the slave's load add to its wrench, likewise. The last, because only
-#: `ledger` tells the two apart, and other lines need not carry it.
+#: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
+#: field, because only `ledger` uses it; other lines omit it.
 LOAD = _places.vector(6)
 
-#: What force and torque at the hand may change by without being felt as a blow [N/s, N m/s].
+#: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
 GENTLE = (450.0, 4.5)
 
 
 @njit(cache=True)
 def arrived(received):
-    """Whether anything was received yet: before that a receiver has zeros."""
+    """Return whether any packet was received: a receiver contains zeros before."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
 
 
 @njit(cache=True)
 def fill(pose, twist, wrench, packet):
-    """Writes pose, twist and wrench of the sender into its packet."""
+    """Write pose, twist and wrench of the sender into its packet."""
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
         now[i] = pose[i]
@@ -63,28 +61,27 @@ def fill(pose, twist, wrench, packet):
 
 @njit(cache=True)
 def dot(a, b, g):
-    """a . b of group g: 0 translation, 1 rotation."""
+    """Return a . b of group g: 0 translation, 1 rotation."""
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
 def length(a, g):
-    """|a| of group g; does not overflow."""
+    """Return |a| of group g without overflow."""
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
 def scale(a, g, s):
-    """a <- s a in group g."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
 
 @njit(cache=True)
 def limit(a, g, most):
-    """Shortens group g of `a` to the length `most`."""
+    """Shorten group g of `a` to at most the length `most`."""
     size = length(a, g)
     if size > most:
         scale(a, g, most / size)
@@ -92,16 +89,16 @@ def limit(a, g, most):
 
 @njit(cache=True)
 def finite(a):
-    """Whether every number of the vector is finite."""
+    """Return whether every number of the vector is finite."""
     rest = 0.0
     for x in a:
-        rest += x - x  # not a number as soon as one x is not finite
+        rest += x - x  # NaN if any x is not finite
     return rest == 0.0
 
 
 @njit(cache=True)
 def difference_into(a, b, e):
-    """e (6,) = [p_a - p_b; log(R_a R_b^T)] of two poses (7,), in W."""
+    """Write [p_a - p_b; log(R_a R_b^T)] of two poses (7,), in W, into e (6,)."""
     turn = logarithm(multiply((a[0], a[1], a[2], a[3]), conjugate((b[0], b[1], b[2], b[3]))))
     for i in range(3):
         e[i] = a[4 + i] - b[4 + i]
@@ -110,7 +107,7 @@ def difference_into(a, b, e):
 
 @njit(cache=True)
 def moved_into(pose, e, out):
-    """out (7,) = the pose moved by e (6,): [exp(e_r) R; p + e_p]. It may be `pose` itself."""
+    """Write the pose [exp(e_r) R; p + e_p] into out (7,), which may be `pose` itself."""
     turn = exponential((e[3], e[4], e[5]))
     q = normalized(multiply(turn, (pose[0], pose[1], pose[2], pose[3])))
     for i in range(4):

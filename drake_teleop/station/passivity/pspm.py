@@ -1,28 +1,13 @@
-"""Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010).
+"""Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring K pulls each end towards a set position y, and the set position may jump only as far as the
-end can pay. An end stores the energy E; its account is
+A spring K pulls each end to a set position y. The set position moves as near to the requested one
+as the stored energy E permits. The master sends energy above a ceiling to the slave (energy
+shuffling); the slave discards it, because a limit cycle could live on circulating energy.
 
-    E_k = E_(k-1) + received - sent + d_k - (K / 2) (|x_k - y_k|^2 - |x_k - y_(k-1)|^2)
-
-where d_k is what its damper took since the last step, and y_k is the set position nearest to the
-wanted one with E_k >= 0. Energy above a ceiling is sent from the hand to the slave (energy
-shuffling) and lost at the slave: if it went round, a limit cycle could live on it for long. Neither
-the delay nor a bound of the acceleration has to be known.
-
-Lee and Huang take d_k >= B |dx|^2 / T of a damper in continuous time. Here a wrench is held over
-a step, which makes a spring active; so d_k is what was put into the port, -f_(k-1) . dx_k, less
-what the spring has gained by the motion. Then E plus the spring's energy is the energy of the true
-port, to rounding. A step that costs more than was stored leaves E negative until it is paid back.
-
-The port is that of hand and slave's *motors*, and so no energy comes out at the slave's actual
-motion either, as long as the servo's K and D are those that were told: with 20 % more or less a
-third of an adversary's runs create some. By default that is the servo of the reference of one
-degree of freedom; a station's is stiffer (`drake_teleop.station.slave.servo`), and has to be told.
-
-At the slave spring and damper are the servo's, and the wanted position is the received pose. At the
-hand the wanted position is where a spring K_h shows the received wrench, x + f / K_h, next to a
-damper.
+The balance is exact at the ports of hand and slave's *motors*. It also holds at the actual motion
+if K and D of the servo are configured correctly. The default is the servo of the reference with one
+degree of freedom; a station's servo is stiffer. At the hand the requested position is x + f / K_h,
+with a damper in parallel.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -67,11 +52,11 @@ from drake_teleop.station.passivity.packet import (
 _places = own_parameters()
 _INITIAL, _CEILING = _places.vector(2), _places.vector(2)
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
-# Memory: the set position less the position, and what is wanted of it.
+# Memory: set position minus position; its requested value.
 _places = own_memory()
 _OFFSET, _WANTED = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the port of its account, see `methods`
+AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
 
 @settings
@@ -91,24 +76,22 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Stores the energy of the start."""
     memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    """Moves the set position of group g as far towards the wanted one as can be paid for.
+    """Move the set position of group g as near to the requested one as the energy permits.
 
-    In memory the wrench held since the last step and the set position less the position, now;
-    `before` is the square of the latter at the last step. What is above the ceiling is sent, or
-    (not `shuffle`) lost.
+    `before` is the squared offset of the set position at the last step. Energy above the ceiling is
+    sent (`shuffle`) or discarded.
     """
     offset, wanted = memory[_OFFSET], memory[_WANTED]
     stored, needed = dot(offset, offset, g), dot(wanted, wanted, g)
@@ -135,7 +118,7 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     offset, wanted, shown = memory[_OFFSET], memory[_WANTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
@@ -156,7 +139,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     offset, wanted = memory[_OFFSET], memory[_WANTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
@@ -176,9 +159,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_left(wanted, command, pose, twist, p, memory):
-    """Notes how the servo pulls at the command that has left; see `methods.Methods`.
+    """Account for the command after the safe state; see `methods.Methods`.
 
-    What the spring has more of than was wanted is paid for.
+    The ledger pays for additional energy of the spring.
     """
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD]
     K, D = p[STIFFNESS], p[DAMPING]

@@ -1,14 +1,9 @@
-"""What every method but `none` does to the wrench at last: a hand that retreats is not chased.
+"""Limit of the wrench on a retreating hand, for every method except `none`.
 
-A hand that lets go while it presses leaves the device alone with the wrench, which goes on until
-the slave's news have come, a round trip later: 4 N take a device of 0.15 kg to 2.7 m/s in 0.1 s.
-So where the hand moves along the wrench faster than `retreat`, the wrench fades, and at twice that
-speed it is gone. It does no work then, and no method need know: each counts what was really held,
-or counts more.
-
-A wrench along the motion may also be inertia that is felt (sigma > 0), of a hand that slows down.
-So as much of it stays as the slave's believed mass takes for that. A device of less mass is not
-driven by it: whoever is pushed does not slow down.
+A released hand leaves the device alone with the wrench for a round trip: 4 N accelerate 0.15 kg to
+2.7 m/s in 0.1 s. So the wrench fades where the hand moves along it faster than `retreat`, and is
+zero at twice that speed. The methods account for the wrench that is held. It keeps the inertial
+part (sigma > 0) that the slave's configured mass explains while the hand decelerates.
 """
 
 from __future__ import annotations
@@ -18,19 +13,19 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD, MASS, RETREAT
 from drake_teleop.station.passivity.packet import dot, length, scale
 
-_FILTER = 4e-3  # s, of velocity: encoders have steps
+_FILTER = 4e-3  # s, of the velocity: encoders have steps
 
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Shortens the wrench (6,) at the hand, that is held from now on; in master power units.
+    """Shorten the wrench (6,) at the hand in the master's power units.
 
     Args:
         twist: (6,) of the command before the channel [v; omega], in W.
         T: time between steps [s].
         p: parameters of the method.
-        memory: of the master's end, changed.
-        wrench: (6,) in W, changed.
+        memory: of the master's end, updated.
+        wrench: (6,) in W, updated.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _FILTER, 1.0)
     for i in range(6):

@@ -1,46 +1,13 @@
-"""Time-domain passivity approach (TDPA) for a delayed two-port, with its controllers in clip form.
+"""Time-domain passivity approach (TDPA) of a delayed two-port, with clipping controllers.
 
-Each end observes the work at its port in both directions apart and sends what was put in, as a
-counter. What an end gives out may never exceed what it has received of the other end's input
-(Ryu, Artigas, Preusche 2010): then the channel is passive whatever the network does, between the
-hand and the slave's *command*, by the backward pair f_k . (x_k - x_(k-1)). A wrench that is held
-does other work at the hand, and the slave does not follow its command at once: see below.
+See docs/theory.md, (T31), (T32), (T44). The promise is at the hand and the slave's *command*, for
+the backward pair. A shortened wrench recovers slowly (force-jump filter), a step drains only a
+share of the ledger, and the master keeps a part of the hand's input so that the hand can yield.
 
-The controllers do no more than that asks for. The master's shortens the wrench until what it drains
-is covered; it never lengthens a wrench and divides by no velocity. The slave's shortens the step of
-the command that would press further than the hand has paid for; what it withholds is made up for
-later, as the energy allows (drift compensation).
+`charged_tdpa` adds a drag on the hand that earns energy in free motion (level controller of Franken
+et al. 2011, with bounded force), and a filter of the slave's wrench against the delayed loop.
 
-Three things keep the force from chopping. A shortened wrench comes back slowly (force-jump filter);
-of what the ledger holds a step may drain only a share, or all before the wrench falls by a blow;
-and the master keeps a little of what the hand puts in for itself. With that it can give way a
-little, the slave follows, and what it returns pays for the next little: without it a hand that
-pressed too deep stays there, before a wall that pushes at every other sample.
-
-That account is too strict for a long delay. A hand that feels nothing on its way into a wall does
-no work, so nothing is there for the slave to press with, nor to push back the hand that went in too
-deep. `charged_tdpa` is the same law with two additions, off in `tdpa`:
-
-- A little drag on the hand earns the energy beforehand, wherever either end holds less than the
-  reserve (the tank's level controller of Franken et al. 2011, here with a bounded force). The hand
-  feels it in free motion; then |f_out| <= |f_in| + drag, and the energy's bound is the same. What
-  the master's end holds beyond the reserve goes back to the slave's.
-- The slave sends its wrench filtered. Hand, delay and a wall that is g times as stiff as the hand
-  are the loop 1 + tau s + g e^(-s R) with the round trip R. Its fastest answer without an overshoot
-  has ln(g R / tau) + R / tau + 1 = 0, which tau = (1 + e g) R meets within 4 % from g = 1 on; for
-  softer walls it is slower than that. R is measured from the numbers of the packets, g from wrench
-  and motion in contact. The share 1 / (1 + g) of the wrench need not wait, because with it the
-  loop's gain is below one whatever the delay is; before the hand has answered it is all of the
-  final wrench, so the filter goes on only when the answer is back. When the wrench is gone, what is
-  left of it goes at once.
-
-The slave's servo lags, and what it presses with after the command has stopped is paid by nobody. So
-the slave keeps accounts of its command, as it left after the safe state, and of its actual motion,
-charges the larger output and credits the smaller input. What was given out unpaid is a debt: it is
-repaid before anything is sent to the hand. The command goes no faster than `speed`, so that packets
-that come at once after a gap are no blow: what can be created at the actual motion is a debt, about
-the energy m v^2 / 2 of that speed, 0.43 J in power units with 15 kg; a shove by the wall adds to
-it. With the servo's lag that happens at most contacts; `ledger` has none of it.
+The energy created at the actual motion, behind the servo, is about m v^2 / 2 at `speed`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -88,17 +55,17 @@ from drake_teleop.station.passivity.packet import (
     scale,
 )
 
-# Of what the hand puts in, until the reserve is full: all of it would leave a soft wall too little.
+# Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _SHARE_KEPT = 0.5
-_QUICK = 0.1  # s, in which a wrench comes or goes that need not wait: slower than hand and servo
-_GONE = 0.1  # a wrench below this share of the filtered one is on its way to zero
-_COMPLETE = 0.98  # share of a quick onset at which it ends
-# Of each group: travel in which the stiffness of a contact is learned [m, rad], and the speed below
-# which the drag fades [m/s, rad/s].
+_QUICK = 0.1  # s, onset and end of a wrench that needs no delay filter: slower than hand and servo
+_GONE = 0.1  # a wrench below this share of the filtered one ends
+_COMPLETE = 0.98  # share at which a quick onset is complete
+# By group: travel over which the contact stiffness is averaged [m, rad]; speed below which the drag
+# fades [m/s, rad/s].
 _TRAVEL = (1e-3, 1e-2)
 _FADING = (0.02, 0.2)
 
-# In the packet: number of the newest packet that the master has; what the slave may give out.
+# In the packet: number of the master's newest packet; the slave's ledger.
 _ECHO, _SLAVES_LEDGER = INTEGRAL.start, OTHER_ENERGY
 
 # Parameters.
@@ -106,11 +73,11 @@ _places = own_parameters()
 _RELEASE, _DRAIN, _DRIFT_RATE = _places.number(), _places.number(), _places.number()
 _RESERVE, _DRAG, _HAND = _places.vector(2), _places.vector(2), _places.vector(2)  # in power units
 _SPEED = _places.vector(2)
-# Memory of the master: share of the wrench that is withheld, energy kept.
+# Memory of the master: withheld share of the wrench, kept energy.
 _places = own_memory()
 _WITHHELD_SHARE, _KEPT = _places.vector(2), _places.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
-# filtered wrench; stiffness of the contact; number of the packet with the end of a quick onset.
+# filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _places = own_memory()
 _IN, _OUT = _places.vector(2), _places.vector(2)
 _IN_COMMAND, _OUT_COMMAND = _places.vector(2), _places.vector(2)
@@ -155,7 +122,7 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
@@ -163,13 +130,13 @@ class TdpaConfig:
 
 
 def charged() -> TdpaConfig:
-    """The parameters of `charged_tdpa`: a normal grip, 0.28 N of drag that fills 60 mJ in 0.4 m."""
+    """Return the parameters of `charged_tdpa`: medium grip; 0.28 N of drag fill 60 mJ in 0.4 m."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
 
 @njit(cache=True)
 def receive(received, memory):
-    """Adds what the other end has put in since the last step to this end's ledger."""
+    """Add the other end's newly received input to this end's ledger."""
     ledger, accounted, counter = memory[LEDGER], memory[RECEIVED], received[ENERGY]
     for g in range(2):
         more = counter[g] - accounted[g]
@@ -180,7 +147,7 @@ def receive(received, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     receive(received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
     wanted = received[WRENCH]
@@ -209,9 +176,10 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _shortened(g, drained, drain, stored, share, T, p, held, wrench):
-    """The share of the wrench that a step may leave, of which all would drain `drained`.
+    """Return the share of the wrench that may be rendered in this step.
 
-    Less than `drain` of what is stored; more, even all of it, rather than a blow to the hand.
+    The full wrench would drain `drained`. The limit is the share `drain` of the stored energy, or
+    all of it where the wrench would otherwise drop abruptly.
     """
     least, size = length(held, g) - GENTLE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
     share = min(share, max(drain * stored / drained, least / size))
@@ -220,7 +188,7 @@ def _shortened(g, drained, drain, stored, share, T, p, held, wrench):
 
 @njit(cache=True)
 def _drag(g, slaves_ledger, dx, limits, T, p, memory, wrench):
-    """Adds the drag to the wrench; along dx, whose work is accounted: it never drains."""
+    """Add drag along -dx to the wrench, which never drains the ledger."""
     drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_KEPT][g]
     if drag > 0.0 and min(level, slaves_ledger) < p[_RESERVE][g]:
         damping = drag / max(length(dx, g), _FADING[g] * T)
@@ -231,7 +199,7 @@ def _drag(g, slaves_ledger, dx, limits, T, p, memory, wrench):
 
 @njit(cache=True)
 def _pass_on(g, p, memory):
-    """Sends back what the master's end has beyond the reserve: the slave's end may need it."""
+    """Send energy of the master beyond the reserve back to the slave."""
     ledger = memory[LEDGER]
     surplus = ledger[g] + memory[_KEPT][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
@@ -241,7 +209,7 @@ def _pass_on(g, p, memory):
 
 @njit(cache=True)
 def _account(g, drained, p, memory):
-    """Takes what the wrench drained from the ledger, then from what was kept; or sends input."""
+    """Subtract drained work from the ledger, then from the kept energy; or send the input."""
     ledger, kept = memory[LEDGER], memory[_KEPT]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
@@ -254,7 +222,7 @@ def _account(g, drained, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     receive(received, memory)
     put(memory, _BEFORE.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
@@ -266,7 +234,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         paid = _paid(memory, g)
         credit = min(memory[_IN][g], memory[_IN_COMMAND][g]) + min(paid, 0.0)
-        # What was given out without payment is repaid before anything is sent.
+        # Unpaid output is repaid before energy is sent.
         memory[SENT][g] = max(memory[SENT][g], credit)
         memory[LEDGER][g] = paid
         packet[ENERGY][g] = memory[SENT][g]
@@ -279,7 +247,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _filter(g, received, dx, wrench, T, p, memory):
-    """Filters the wrench that is sent."""
+    """Filter the wrench that is sent (T44)."""
     filtered, hand = memory[_FILTERED], p[_HAND][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
@@ -305,7 +273,7 @@ def _filter(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
-    """-df.dx / dx.dx of the contact, forgotten with the way travelled [N/m, N m/rad]."""
+    """Return the contact's -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
     size, stiffness = length(dx, g), memory[_CONTACT]
     if size > _TRAVEL[g] * T:
         change = dot(wrench, dx, g) - dot(memory[HELD], dx, g)
@@ -316,13 +284,13 @@ def _contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _paid(memory, g):
-    """What the hand has paid for and was not given out; negative if the servo gave too much."""
+    """Return the input of the hand minus the output; negative if the servo released too much."""
     return memory[RECEIVED][g] - max(memory[_OUT][g], memory[_OUT_COMMAND][g])
 
 
 @njit(cache=True)
 def _follow(received, wrench, T, p, memory):
-    """Moves the command towards the received pose, as far as it is paid for."""
+    """Move the command towards the received pose within the available energy."""
     now, withheld = memory[COMMAND_POSE], memory[_WITHHELD]
     step = memory[COMMAND_TWIST]
     later = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
@@ -346,7 +314,7 @@ def _follow(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _account_command(command, sign, memory):
-    """Counts the work along the step of the command that leads to `command`, or takes it back."""
+    """Add (`sign` 1) or remove (-1) the work of the command step that ends at `command`."""
     step = np.empty(6)
     difference_into(command, memory[_BEFORE], step)
     for g in range(2):
@@ -358,7 +326,7 @@ def _account_command(command, sign, memory):
 
 @njit(cache=True)
 def command_left(wanted, command, pose, twist, p, memory):
-    """Accounts for what the safe state has made of the command; see `methods.Methods`."""
+    """Account for the command after the safe state; see `methods.Methods`."""
     for i in range(7):
         if command[i] != wanted[i]:
             _account_command(wanted, -1.0, memory)

@@ -1,31 +1,12 @@
-"""Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011).
+"""Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The transparency layer wants the received wrench at the hand and the received pose at the slave. The
-passivity layer holds a tank of energy at each end: work done at its port flows in or out, a share
-of the level is sent to the other end in every step, and a wrench is shortened to what the tank can
-pay for. At the slave's end the port is that of its motors, whose pull K (x_command - x) - D v is
-shortened through the command.
+A tank of energy at each end must cover the cost of the wrench in the next step. At the slave the
+port is that of its motors. The tanks are never overdrawn if hand and walls accelerate less than
+`acceleration` and if servo and mass are configured correctly (the defaults are those of the
+reference with one degree of freedom).
 
-A wrench is held until the next step, so its work is f_(k-1) . (x_k - x_(k-1)): known only
-afterwards. The next step cannot differ from the last one by more than a T^2, so a wrench may
-cost f . dx + |f| a T^2 at most; this is what the tank must hold (Franken's |f| |dx| would
-forbid even a wrench that brakes). At the hand a is `acceleration`; at the slave it is that, which
-walls cause, and |f| / m, which its motors cause: they pull hard at a command that has jumped.
-What is sent leaves the tank *before* that is asked. So the tanks are never overdrawn, between hand
-and slave's *motors*, whatever the network does, as long as the hand and the walls accelerate no
-more than `acceleration`, and the servo's K, D and the slave's mass m (or more) are those that were
-told: by default those of the reference of one degree of freedom; a station's arm is stiffer and
-heavier (`drake_teleop.station.slave.servo`), so these values must be set. The energy at the actual
-motion is then never negative either: energy of the motors that the wall does not get moves the
-slave or is lost in friction. A tank that was overdrawn all the same carries its deficit.
-
-A slave that is slower than a T might pay even for its brake: with an empty tank it would coast
-on for ever. So the slave keeps a reserve that is neither sent nor spent on the spring; only the
-brake may use it.
-
-Where the tank of the master is below its level, a damper on the hand fills it. Of what the tank
-holds the wrench may drain only a share in a step, which takes the edge off an empty tank; small
-tanks end a limit cycle soon, because it lives on what they hold.
+Only the brake uses the slave's reserve: otherwise a slave slower than a T would coast with an empty
+tank. A damper on the hand fills the master's tank below its level.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -68,17 +49,17 @@ from drake_teleop.station.passivity.packet import (
     scale,
 )
 
-# Parameters; those of two numbers are for translation and rotation.
+# Parameters; pairs are for translation and rotation.
 _places = own_parameters()
 _SEND, _DRAIN = _places.number(), _places.number()
 _INITIAL, _LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
 _DAMPER, ACCELERATION = _places.vector(2), _places.vector(2)
 _RESERVE = 0.01  # share of the capacity
-# Memory of the slave: pull of the spring, pull of the damper.
+# Memory of the slave: wrench of the spring, wrench of the damper.
 _places = own_memory()
 _SPRING, _BRAKE = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: the port of its account, see `methods`
+AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
 
 @settings
@@ -105,7 +86,7 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
         p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
         p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
@@ -113,13 +94,12 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Fills the tank at the start."""
     memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _exchange(received, dx, T, p, memory, packet):
-    """Work of the held wrench, receiving and sending: all before a new wrench is limited."""
+    """Account for the held wrench, received and sent energy, before a new wrench is limited."""
     ledger, accounted, sent_so_far = memory[LEDGER], memory[RECEIVED], memory[SENT]
     held, capacity = memory[HELD], p[_CAPACITY]
     for g in range(2):
@@ -139,13 +119,13 @@ def _exchange(received, dx, T, p, memory, packet):
 
 @njit(cache=True)
 def _cost(f, dx, g, acceleration, T):
-    """The most that a wrench can cost until the next step [J]."""
+    """Return the largest energy that a wrench can use until the next step [J]."""
     return dot(f, dx, g) + length(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
 def _afford(f, dx, g, acceleration, T, memory):
-    """Shortens group g of a wrench to what the tank can pay for."""
+    """Shorten group g of a wrench to the energy in the tank."""
     cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
@@ -153,7 +133,7 @@ def _afford(f, dx, g, acceleration, T, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
     ledger, wanted = memory[LEDGER], received[WRENCH]
     for g in range(2):
@@ -172,7 +152,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     spring, brake = memory[_SPRING], memory[_BRAKE]
     _exchange(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
@@ -185,7 +165,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
             pull[i] = spring[i] + brake[i]
-        # The spring is shortened first and leaves the reserve, so that an empty tank brakes.
+        # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
         room = max(memory[LEDGER][g] - _RESERVE * p[_CAPACITY][g], 0.0)
         most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
         if _cost(pull, dx, g, most, T) > room:
@@ -208,7 +188,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_left(wanted, command, pose, twist, p, memory):
-    """Notes how the servo pulls at the command that has left; see `methods.Methods`."""
+    """Note the servo's wrench at the command after the safe state; see `methods.Methods`."""
     spring, held, K, D = memory[_SPRING], memory[HELD], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

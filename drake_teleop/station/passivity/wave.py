@@ -1,33 +1,13 @@
-"""Wave variables: what travels is u = (b v + F) / sqrt(2 b) and w = (b v - F) / sqrt(2 b).
+"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
 
-F = -f is the force that the hand puts into the port, and F v = (u^2 - w^2) / 2: an end gives out
-the energy of the wave that it received and nothing else, so a line of constant delay is passive
-(Anderson and Spong 1989; Niemeyer and Slotine 1991). With a step's increment v = dx / T this is
-exact for the backward pair f_k . (x_k - x_(k-1)) at the hand and at the slave's *command*; the
-servo between that and the actual motion is no part of it, and hard walls make it give out energy.
+Equations: docs/theory.md, (T33) to (T36). An end releases only the energy of the received wave, in
+the backward pair at the hand and the slave's *command*. It sends integral and energy of its wave,
+and the receiver plays the integral through a first-order filter within the received energy
+(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
+energy. Lost packets cause no drift. Uneven arrival slows the filter; a playout buffer avoids this.
 
-Over a network that is not constant an end sends the integral of its wave and the energy
-e = F dx + |wave received|^2 T / 2 that is its to pass on, both cumulative. The receiver plays out
-what has come of the integral through a filter of first order, and never more than has come of the
-energy (Yokokohji, Imaida, Yoshikawa 1999 and Niemeyer and Slotine 2004, joined). So nothing is
-created by jitter, loss or hold, nor by a wrench that the device cannot display; and nothing of the
-integral is ever missing for good, so neither lost packets nor a limited wrench cause drift. What
-long silence leaves is corrected in free motion, where that takes no work. Uneven arrival costs
-energy: the filter then becomes as slow as it must be to play all that has come out of what is in
-store. A playout buffer in the network keeps it fast.
-
-What comes after packets were missing would be a blow. Instead the wrench at the hand then goes over
-to the wave's at a bounded rate, but for what the wave does not pay for.
-
-The slave's end is matched to the line by a damper m b that its command acts against: with m = 1
-nothing is reflected in free motion, and the hand feels b v; with m = 0 it feels the mass b T of the
-line's content. In contact the slave stays behind by f (T + filter) / b. Neither a wall nor the
-spring of a hand takes much of a slow wave: at a round trip of 0.5 s what is left of a contact's
-beginning fades with a time constant of 1.5 s, at 1 s with one of 9 s.
-
-Without any wave a wall would push the slave away; in a silence it stays instead, and reflects. The
-contact comes back after it, but not quite as deep: the hand went on while it felt nothing, and to
-push it back takes energy that nobody has paid for. Pressed anew it is as deep as before.
+A damper at the slave's command matches the line: free motion then reflects nothing, and the hand
+feels b v. In silence the slave keeps its command and reflects.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -74,11 +54,11 @@ _places = own_parameters()
 IMPEDANCE = _places.vector(2)
 _FILTER, _MATCHING = _places.number(), _places.number()
 _PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
-# Memory: integral of the wave played out, of the wave sent, the wave of this step; silence [s].
+# Memory: integrals of the played and the sent wave; wave of this step; silence [s].
 _places = own_memory()
 _PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
 _SILENT, _DRIFT = _places.number(), _places.vector(6)
-# At the master: 1 from a step without a packet until all is made up for; number of the newest one.
+# At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
 _MISSING, _NEWEST = _places.number(), _places.number()
 
 
@@ -102,17 +82,17 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Writes the values to where the steps read them."""
+        """See `Methods`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """Writes the wave (6,) of this step: what is played out of the integral that has come.
+    """Write the wave (6,) of this step, played out of the received integral.
 
-    If a share a of what is left, d, is played in each step, that costs a |d|^2 / (2 T (2 - a)) in
-    all: a is the filter's, or so small that the energy in store pays for that.
+    Playing the share a of the rest d in each step costs a |d|^2 / (2 T (2 - a)) in all. a is that
+    of the filter, or small enough for the stored energy (T34).
     """
     ledger, accounted, played = memory[LEDGER], memory[RECEIVED], memory[_PLAYED]
     integral = received[INTEGRAL]
@@ -135,7 +115,7 @@ def _play(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """One step of the master's end; see `methods.master_step`."""
+    """See `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     missing, newest = memory[_MISSING], received[SEQUENCE]
@@ -146,7 +126,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         b = p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = math.sqrt(2.0 * b) * wave[i] - b * dx[i] / T
-            # As if it could all be displayed, so that no momentum is missing on the line.
+            # The integral ignores the wrench limit, so that no momentum is missing on the line.
             integral[i] += (b * dx[i] - wrench[i] * T) / math.sqrt(2.0 * b)
             sent[i] = integral[i]
         limit(wrench, g, limits[g])
@@ -156,7 +136,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             if _approach(g, energy, dx, most, memory[HELD], wrench):
                 memory[_MISSING] = 1.0
             limit(wrench, g, limits[g])
-        # Not negative: of a wrench that was shortened even more is left than the wave going back.
+        # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
@@ -166,10 +146,10 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _approach(g, energy, dx, most, held, wrench):
-    """Takes the wrench to within `most` of the one held, if that drains no more than `energy`.
+    """Limit the change of the wrench to `most` if that drains at most `energy`.
 
     Returns:
-        Whether it was beyond.
+        Whether the change was larger.
     """
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -187,7 +167,7 @@ def _approach(g, energy, dx, most, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """One step of the slave's end; see `methods.slave_step`."""
+    """See `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
     if memory[FILLS] > 0.0:
@@ -213,7 +193,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _reflect(received, wrench, T, p, memory):
-    """Step of the command under the wave and the contact wrench, and the wave that goes back."""
+    """Compute the command's step from wave and contact wrench, and the reflected wave."""
     wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_INTEGRAL]
     _play(received, T, p, memory, wave)
     for g in range(2):
@@ -229,9 +209,9 @@ def _reflect(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _rest(wrench, T, p, memory):
-    """Plays the wave that keeps the slave where it is, as long as the energy in store pays for it.
+    """Play the wave that keeps the slave at rest while the stored energy suffices.
 
-    It is reflected as by a rigid wall. What comes later has only to make up for the rest.
+    It is reflected as by a rigid wall.
     """
     wave, ledger = memory[_WAVE], memory[LEDGER]
     played, integral = memory[_PLAYED], memory[_INTEGRAL]
@@ -249,13 +229,10 @@ def _rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _stand(received, wrench, T, p, memory):
-    """Reflects as a rigid wall while a new line fills, and has in store what would play that on.
+    """Reflect as a rigid wall while a new line fills, and prepare the steady state.
 
-    What comes is not played but made up to what stands: a filter that has been playing the wave of
-    `wrench` for long is behind by its time constant of it, and a step more when the next has come:
-    a store of half of that lets it. So the line begins with the energy of a contact that stood
-    before there was a line, which nobody has put in: once, f^2 / 4 b for as long as a round trip
-    and both filters take, and no end can get more of it.
+    So the line begins with the energy of the present contact, f^2 / 4 b over a round trip and both
+    filter times, as if it had played the wave of `wrench` for long. This energy is given once.
     """
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED], memory[_INTEGRAL]
@@ -271,7 +248,7 @@ def _stand(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _correct(received, wrench, T, p, memory):
-    """Adds a step towards the received pose where it does not press on what the slave touches."""
+    """Add a step towards the received pose in a group where it does not increase contact force."""
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):

@@ -1,4 +1,4 @@
-"""The paper's 'Force scaling/elimination' block (Figs. 2 and 4)."""
+"""Force scaling and elimination (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ from drake_teleop.load.regressor import (
 from drake_teleop.station.scaling.wrench_mapping import wrench_to_master_into
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-#: sigma_gripper, sigma_object, gamma that leave the contact wrench alone, Eq. (13).
+#: sigma_gripper, sigma_object, gamma of the contact wrench alone, Eq. (13).
 _ELIMINATION = np.array([0.0, 0.0, 1.0])
 
-#: A sample that is older is none [s]; so is one that is younger than now by as much.
+#: Largest valid age of a sample, and of a time stamp in the future [s].
 OLDEST = 0.05
 _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
@@ -59,7 +59,7 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
-        """(sigma_gripper, sigma_object, gamma); `where` is the place for the message.
+        """Return (sigma_gripper, sigma_object, gamma); `where` is the place in the message.
 
         Raises:
             DrakeTeleopError: if eta is given and sigma is not 0 or gamma is not 1 (section V).
@@ -77,23 +77,26 @@ class ForceScalingConfig:
 
 @njit(cache=True)
 def scales_at(change, time, scales):
-    """Writes the four scales at `time` into `scales`: a minimum-jerk blend from old to new.
+    """Write the four scales at `time`: a minimum-jerk blend from old to new.
 
     Args:
-        change: (10,) old scales (4), new scales (4), start of the change [s], its length [s].
+        change: (10,) old scales (4), new scales (4), start of the change [s], duration [s].
         time: now [s].
         scales: (4,) written: sigma_gripper, sigma_object, gamma, force scale.
     """
     u = min(max((time - change[8]) / change[9], 0.0), 1.0) if change[9] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
     for i in range(4):
-        # Exact at both ends: the scales of a station that never changes them are as configured.
+        # Exact at both ends, so that unchanged scales equal the configured ones.
         scales[i] = (1.0 - share) * change[i] + share * change[4 + i]
 
 
 @njit(cache=True)
 def _scaled_into(sample, estimate, gripper, scales, out):
-    """F' of one sample; what of the load is not gripper is object. Both (16,) as the estimate."""
+    """Write F' of one sample; the object is the load without the gripper.
+
+    `estimate` and `gripper` are (16,) [offsets; phi].
+    """
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -106,13 +109,13 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, believed):
-    """What is wrong with the numbers that a wrench is to be made of, as a plain `Fault`.
+    """Return the `Fault` of sample and load estimate.
 
     Args:
         sample: of the wrist sensor, see `drake_teleop.load.regressor`.
         estimate: (16,) [offsets; phi].
         time: now [s].
-        believed: (7,) the largest wrench that is a reading [N, N m], the largest age [s].
+        believed: (7,) largest valid wrench [N, N m], largest age [s].
     """
     if not abs(time - sample[TIME]) <= believed[6]:
         return _STALE
@@ -128,7 +131,7 @@ def fault_of(sample, estimate, time, believed):
 
 @njit(cache=True)
 def _scaled_now_into(sample, estimate, gripper, change, time, out):
-    """F' of one sample with the scales of this time, see `scales_at`."""
+    """Write F' of one sample with the scales at `time`."""
     scales = np.empty(4)
     scales_at(change, time, scales)
     _scaled_into(sample, estimate, gripper, scales, out)
@@ -136,7 +139,7 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 @njit(cache=True, borrows=True)
 def _all_into(sample, estimate, gripper, change, time, elimination, believed, out):
-    """F' with the scales of this time, the contact wrench, and the fault."""
+    """Write F' with the scales at `time`, the contact wrench, and the fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
     _scaled_into(sample, estimate, gripper, elimination, out[6:12])
     out[12] = fault_of(sample, estimate, time, believed)
@@ -144,9 +147,9 @@ def _all_into(sample, estimate, gripper, change, time, elimination, believed, ou
 
 @njit(cache=True)
 def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, contact, out):
-    """What the hand shall feel of F'; the orientation of S comes from the same sample.
+    """Write the wrench to render from F'; the orientation of S is of the same sample.
 
-    `contact` is 1, or 0 for what the load alone has in it.
+    `contact` is 1, or 0 for the load's part alone.
     """
     if fault_of(sample, estimate, time, believed) != _NONE:
         out[:] = np.nan
@@ -160,11 +163,10 @@ def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, con
 
 
 class ForceScaling(LeafSystem):
-    """Removes or scales the non-contact wrench, then scales the rest down and turns it to the hand.
+    """Removal or scaling of the non-contact wrench, and transformation to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj). The scales are a numeric parameter of
-    the context, so that they may be changed while a simulation runs (`SetScales`), and without a
-    step of the force.
+    the context; `SetScales` changes them during a simulation without a step of the force.
 
     .. pydrake_system::
 
@@ -175,19 +177,18 @@ class ForceScaling(LeafSystem):
         output_ports:
         - scaled_wrench_S: F' of Fig. 2
         - contact_wrench_S: Eq. (13)
-        - fault: what is wrong with sample or estimate, a `Fault`
-        - scaled_contact_and_fault: the last three, one after the other, for a log
+        - fault: `Fault` of sample or estimate
+        - scaled_contact_and_fault: the three above in one vector, for a log
         - non_contact_wrench_S: Eq. (12)
-        - wrench_B: F_E_B, what the hand shall feel: -force_scale F', in the master's base B; not a
-          number while there is a fault
-        - load_wrench_B: what of that is weight and inertia of the load, zero for sigma = 0
+        - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
+        - load_wrench_B: its part from weight and inertia of the load, zero for sigma = 0
 
     Args:
         config: the scales.
         arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
-        largest_wrench: (6,) beyond which a reading is none [N, N m]; None for no end.
-        oldest: a sample that is older is none [s].
+        largest_wrench: (6,) largest valid reading [N, N m]; None for no limit.
+        oldest: largest valid age of a sample [s].
     """
 
     __slots__ = ONE_DICT
@@ -212,7 +213,7 @@ class ForceScaling(LeafSystem):
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
         self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
-        # Not time: a change of scales goes on with each new sample, which is soon enough.
+        # Without time: a change of scales advances with each new sample.
         inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         for name, calc in (
             ("scaled_wrench_S", self._calc_scaled),
@@ -237,10 +238,9 @@ class ForceScaling(LeafSystem):
         force_scale: float,
         duration: float = 0.25,
     ) -> None:
-        """Changes the scales in a running simulation, from now on, within `duration` [s].
+        """Change the scales from now on within `duration` [s] on a minimum-jerk ramp.
 
-        The scales go over on a minimum-jerk ramp (the force takes no step), from where they are if
-        an earlier change is not over yet.
+        A change in progress is replaced from its present values.
 
         Raises:
             DrakeTeleopError: for a scale or duration that is negative or not finite.
@@ -290,7 +290,7 @@ class ForceScaling(LeafSystem):
         _felt_into(*self._inputs(context), *constants, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
-        """The sample, the estimate, the gripper's part of it, and of the scales: change, time."""
+        """Return sample, estimate, gripper's part of it, change of the scales, and time."""
         estimate = self._estimate.Eval(context)
         return (
             self._sample.Eval(context),

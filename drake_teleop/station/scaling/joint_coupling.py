@@ -1,9 +1,7 @@
-"""A leader arm that leads joint by joint, instead of by the pose of the hand.
+"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home).
 
-    q_slave = q_start + (q_leader - q_home)
-
-Both arms have the same joints, in the same order, and may be of different sizes. What the hand
-feels is the wrench as ever, through the leader's own Jacobian.
+Both arms have the same joints in the same order. The wrench is rendered through the leader's
+Jacobian.
 """
 
 from __future__ import annotations
@@ -21,10 +19,10 @@ Array = NDArray[np.float64]
 
 
 class JointCoupling(LeafSystem):
-    """Where the slave's joints shall be, through a clutch.
+    """Joint positions of the slave from those of the leader, with a clutch.
 
-    While the clutch is open they stay where they are; when it closes, the slave goes back to the
-    posture of its leader, as fast as it may.
+    While the clutch is open the slave's joints are constant; when it closes they return to the
+    leader's posture within the joint limits.
 
     .. pydrake_system::
 
@@ -34,16 +32,16 @@ class JointCoupling(LeafSystem):
         - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
         output_ports:
         - leader_joints: (n,) of the slave [rad]
-        - pose_command: (7,) X_WS that they are
+        - pose_command: (7,) X_WS for these joints
 
     Args:
         slave: the slave's arm.
         start: (n,) its joints when the leader is at home [rad].
         home: (n,) of the leader [rad].
-        period: how often the clutch is looked at [s].
+        period: sampling period of the clutch [s].
 
     Raises:
-        DrakeTeleopError: if the arms have different joints.
+        DrakeTeleopError: if the numbers of joints differ.
     """
 
     __slots__ = ONE_DICT
@@ -59,7 +57,7 @@ class JointCoupling(LeafSystem):
         self._table, self._offset, n = slave.table, np.array(start) - home, len(start)
         self._state = self.DeclareVectorInputPort("master_state", 2 * n)
         self._clutch = self.DeclareVectorInputPort("clutch", 1)
-        self.DeclareDiscreteState(np.append(start, 0.0))  # where they stay; if the clutch is closed
+        self.DeclareDiscreteState(np.append(start, 0.0))  # joints; clutch closed
         sources = {self._state.ticket(), self.xd_ticket()}
         for name, size, calc in (
             ("leader_joints", n, self._calc_joints),

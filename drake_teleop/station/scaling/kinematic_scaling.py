@@ -1,7 +1,6 @@
-"""The paper's 'kinematic scaling' block (Fig. 4): the master's motion becomes the slave's command.
+"""Kinematic scaling (Fig. 4 of the paper): the master's motion becomes the slave's command.
 
-Translations are scaled, orientations by quaternions: since the clutch was closed the master has
-turned about one axis by one angle, and the slave turns about the same axis by the scaled angle.
+Translation is scaled. The rotation since the clutch was closed keeps its axis; its angle is scaled.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -30,7 +29,7 @@ from drake_teleop.common.vectors import put
 @settings
 @dataclass
 class KinematicScalingConfig:
-    """How the master's motion is scaled, and how the master's base lies in the world."""
+    """Scales of the master's motion, and alignment of its base with the world."""
 
     translation_scale: float = quantity(1.0, "1", 0.0, 100.0, "slave over master translation")
     rotation_scale: float = quantity(1.0, "1", 0.0, 10.0, "slave over master angle")
@@ -41,9 +40,9 @@ class KinematicScalingConfig:
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
-    """The quaternion of the same axis and `scale` times the angle (the shorter way round).
+    """Return the quaternion with the same axis and `scale` times the (shorter) angle.
 
-    With a scale that is not a whole number the result jumps where the angle passes 180 degrees.
+    For a scale that is not an integer the result jumps where the angle passes 180 degrees.
     """
     v = logarithm(rotation)
     return exponential((scale * v[0], scale * v[1], scale * v[2]))
@@ -51,7 +50,7 @@ def scaled_rotation(rotation, scale):
 
 @njit(cache=True)
 def scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out):
-    """Writes the commanded X_WS (7,) into `out`.
+    """Write the commanded X_WS (7,) into `out`.
 
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
@@ -78,7 +77,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 @njit(cache=True, borrows=True)
 def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
-    """The commanded X_WS (7,), see the state of `KinematicScaling`."""
+    """Write the commanded X_WS (7,); `references` is the state of `KinematicScaling`."""
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
@@ -87,12 +86,11 @@ def _command_into(pose, references, alignment, translation_scale, rotation_scale
 
 
 class KinematicScaling(LeafSystem):
-    """Scales the master's motion into the slave's commanded pose, through a clutch.
+    """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
-    While the clutch is open the command stays where it is; when it closes, motion goes on from
-    there with the master's pose of that instant as its new reference (re-indexing). Neither makes
-    a jump. A clutch that is engaged at the start is closed before the first sample. It neither
-    opens nor closes while the master's pose is no pose.
+    While the clutch is open the command is constant. When it closes, the master's present pose is
+    the new reference, so the command does not jump. A clutch that is engaged at the start closes
+    before the first sample. It keeps its state while the master's pose is not finite.
 
     .. pydrake_system::
 
@@ -105,7 +103,7 @@ class KinematicScaling(LeafSystem):
 
     Args:
         config: scales and alignment.
-        period: how often the clutch is looked at [s].
+        period: sampling period of the clutch [s].
         start: (7,) X_WS commanded at the start.
     """
 
@@ -125,11 +123,11 @@ class KinematicScaling(LeafSystem):
         sources = {self._pose.ticket(), self.xd_ticket()}
         self.DeclareVectorOutputPort("pose_command", 7, weak_callback(self._calc_command), sources)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
-        # The command follows from the first instant on.
+        # The command follows from the first sample on.
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def Open(self, context: Context, command: NDArray[np.float64]) -> None:
-        """Opens the clutch with the slave's command (7,) at `command`, X_WS."""
+        """Open the clutch with the slave's command (7,) at `command`, X_WS."""
         references = context.get_discrete_state(0).CopyToVector()
         references[:7], references[14] = command, 0.0
         context.SetDiscreteState(0, references)
@@ -144,7 +142,7 @@ class KinematicScaling(LeafSystem):
         if engage == (references[14] > 0.5):
             return
         pose = self._pose.Eval(context)
-        if not np.isfinite(pose).all():  # it would be the reference for good
+        if not np.isfinite(pose).all():  # the reference must be finite
             return
         _command_into(pose, references, *self._scaling, references[:7])
         references[7:14] = pose

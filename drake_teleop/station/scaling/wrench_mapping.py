@@ -1,4 +1,4 @@
-"""What the hand shall feel: the slave's wrench, turned into the master's frame and reversed."""
+"""Wrench to render at the hand: scaled, in the master's frame, as a reaction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drake_teleop.common.vectors import apply, rows, three, times, transposed
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    """Compiled `wrench_to_master` of one sample; writes the wrench at E in B (6,) into `out`."""
+    """Write `wrench_to_master` of one sample (6,) into `out`, compiled."""
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
@@ -27,14 +27,11 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """The wrench that the hand shall feel at the master for a wrench of the slave's sensor.
+    """Return the wrench to render at the master for a wrench of the slave's sensor.
 
-    Eq. (1)'s wrench is what the sensor exerts on the load, so what the operator feels is its
-    reaction, minus that wrench: holding up a load, the hand is pulled down.
-
-    The moment about the origin of S becomes the moment about E: the stylus stands for the sensor.
-    With the translation scale l, the force scale of equal power at both ends is l; the paper's
-    1/17.5 gives some of it away.
+    The operator feels the reaction of Eq. (1)'s wrench: for a load that is held up, the hand is
+    pulled down. The moment about the origin of S becomes the moment about E. Equal power at both
+    ends needs the translation scale as force scale; the paper's 1/17.5 is smaller.
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
