@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING.md, followed in a copy of the package."""
+"""The recipes of docs/extend.md, followed in a copy of the package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 
 ROOT = Path(__file__).parents[1]
-RECIPES = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+RECIPES = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
 
 
 def blocks(language: str) -> list[str]:

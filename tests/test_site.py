@@ -32,6 +32,7 @@ TESTED = {
     "analysis.md": "tests/test_analysis_doc.py",
     "delay.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",
+    "extend.md": "tests/test_recipes.py",
     "logs.md": "tests/logs/test_log_description.py",
     "station.md": "tests/test_sides.py",
     "studies.md": "tests/studies/test_study.py",
@@ -114,7 +115,7 @@ def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():
 def test_every_block_says_what_it_is():
     """Code in one of these languages is run; "text" is a drawing, a file, or what is printed."""
     assert len(BLOCKS) > 40
-    assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text"}
+    assert {language for _, language, _ in BLOCKS} == {"sh", "python", "yaml", "text", "diff"}
 
 
 def test_commands_that_cannot_be_typed_here_have_the_arguments_that_are_shown():
@@ -163,11 +164,11 @@ def test_who_is_said_to_run_it_reads_the_page():
         assert page in (ROOT / test).read_text(encoding="utf-8")
 
 
-def test_every_room_is_in_the_reference():
-    """Each with all that is public in it, which the site's build finds by itself."""
+def test_every_package_is_in_the_reference():
+    """The build of the site lists the public names of each package."""
     package = Path(drake_teleop.__file__).parent
-    rooms = {path.stem for path in package.iterdir() if path.suffix in ("", ".py")}
-    public = {room for room in rooms if not room.startswith("_")} - {"scenarios"}
+    entries = {path.stem for path in package.iterdir() if path.suffix in ("", ".py")}
+    public = {name for name in entries if not name.startswith("_")}
     text = (DOCS / "reference.md").read_text(encoding="utf-8")
     listed = set(re.findall(r"^   ([a-zA-Z_]+)$", text, re.M))
     assert (public | set(drake_teleop.__all__) - {"__version__"}) ^ listed == set(), (
