@@ -93,7 +93,7 @@ def explained_load(load: Identification, why: Explanation) -> Identification:
 
 def _explained_load(load: Identification, why: Explanation) -> Identification:
     if not why.causes and not why.given:
-        if why.explained:
+        if why.explained or not load.identifiable.any():
             return load
         stated = np.sqrt(np.diag(load.covariance))
         ratio = np.maximum(1.0, why.deviations / np.maximum(stated, 1e-300))

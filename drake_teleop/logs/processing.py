@@ -204,8 +204,8 @@ def _identified(
     if why is not None and log.gain_std > 0.0 and {x.name for x in why.causes} <= _GAIN_CAUSES:
         why = replace(why, causes=(), explained=True, loads=())
     causes: tuple[Cause, ...] = ()
-    errors: tuple[Finding, ...] = ()
-    if why is not None and why.causes and why.misfit:
+    errors = tuple(finding for finding in other if finding.name == "units")  # of the positions
+    if not errors and why is not None and why.causes and why.misfit:
         errors = errors_of_motion(check)
     if errors:
         why = None

@@ -132,9 +132,9 @@ LIMITS = {
     "read.reading._CHUNK_ROWS": 300,
     "read.alignment._CHUNK_ROWS": 170,
     "pose_motion.splines._CHUNK_ROWS": 260,
-    "posed_fit._SHOWN": 300,
+    "posed_fit._MIN_KEPT_SAMPLES": 300,
     "posed_fit._CHUNK": 70,
-    "posed_fit._BESIDE": 30,
+    "posed_fit._NEIGHBOURS": 30,
 }
 """What an hour at 1 kHz is too long for, so low that 10 s are."""
 

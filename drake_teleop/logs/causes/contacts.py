@@ -163,7 +163,7 @@ def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np
 
 
 def replace_steps_by_contact(state: State) -> State:
-    """Replace two changes of offsets by a contact between them if the residual requires it.
+    """Replace changes of the offsets by a contact if the residual requires it.
 
     Two changes explain the level of a contact, but with a wrong load.
     """
@@ -189,7 +189,7 @@ def replace_steps_by_contact(state: State) -> State:
 
 
 def shrink_contacts(state: State) -> State:
-    """Return rows at the ends of contacts to the fit, if their residual is small."""
+    """Reduce contacts to the rows with a large residual."""
     dt = state.data.dt
     spans = [_contact_span(state, span) for span in state.spans]
     return State.of(state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans))

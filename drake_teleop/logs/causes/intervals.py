@@ -49,7 +49,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """(16,) deviations of a rigid load without named cause."""
+    """(16,) deviations of [offsets; phi] for a record without named causes."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
