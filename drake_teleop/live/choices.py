@@ -19,7 +19,7 @@ from drake_teleop.station.channel.network import longest_delay
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.passivity.safe_state import RESUME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.payload import Payload
@@ -113,4 +113,4 @@ def filled_after(scenario: Scenario) -> float:
     """How long it takes until a new channel passes on all that it gets [s]."""
     if scenario.is_direct:
         return 0.0
-    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME
+    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME
