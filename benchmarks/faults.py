@@ -44,7 +44,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.master.phantom import FORCE_LIMIT
 from drake_teleop.station.operator.operator import MinimumJerk, Sine
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.passivity.safe_state import STOP
+from drake_teleop.station.passivity.safe_state import STOP_TIME
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance, read_log
@@ -354,7 +354,7 @@ class Count:
         largest = float(felt[later].max())
         step = float(np.linalg.norm(np.diff(force, axis=0), axis=1)[later[1:]].max())
         # The sample is too old after half of the timeout; what was sent before is on its way.
-        blind = (t > fault.start + TIMEOUT + STOP + LATE) & (t < fault.end - 1e-3)
+        blind = (t > fault.start + TIMEOUT + STOP_TIME + LATE) & (t < fault.end - 1e-3)
         left = float(felt[blind].max(initial=0.0)) if fault.blinds else 0.0
         self.not_finite += not np.isfinite(force).all()
         self.too_large += not largest <= FORCE_LIMIT * (1 + 1e-12)

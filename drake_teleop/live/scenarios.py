@@ -16,7 +16,7 @@ from drake_teleop.station.estimation.contact_detection import ContactDetectionCo
 from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.passivity.methods import METHODS
-from drake_teleop.station.passivity.safe_state import RESUME
+from drake_teleop.station.passivity.safe_state import RESUME_TIME
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
 from drake_teleop.station.slave.payload import Payload
@@ -145,4 +145,4 @@ def fill_time(scenario: Scenario) -> float:
     """Return the time until a new channel delivers all packets [s]."""
     if scenario.is_direct:
         return 0.0
-    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME
+    return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME

@@ -15,7 +15,7 @@ from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
 from drake_teleop.station.estimation.load_estimator import LoadEstimator
-from drake_teleop.station.scaling.force_scaling import OLDEST, ForceScaling
+from drake_teleop.station.scaling.force_scaling import MAX_SAMPLE_AGE, ForceScaling
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddWristSensor
@@ -111,7 +111,7 @@ def MakeSlaveSide(
             arm,
             R_WB,
             scenario.wrist_sensor.largest_wrench(),
-            max(OLDEST, 2 / scenario.rates.sensor_hz),
+            max(MAX_SAMPLE_AGE, 2 / scenario.rates.sensor_hz),
         ),
     )
     estimate = body.load_estimator.GetOutputPort("load_estimate")

@@ -13,9 +13,9 @@ from drake_teleop.station.channel.channel import MEMORY_S, Channel, channel_step
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
-from drake_teleop.station.passivity.memory import HELD, OF_LOAD
+from drake_teleop.station.passivity.memory import HELD_WRENCH, LOAD_WRENCH
 from drake_teleop.station.passivity.methods import PassivityConfig
-from drake_teleop.station.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
 from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import simulate
@@ -102,9 +102,9 @@ def test_what_the_load_has_in_the_wrench_is_told_as_the_wrench_is():
     for name, value in inputs.items():
         block.GetInputPort(name).FixValue(context, value)
     ends = block.EvalUniquePeriodicDiscreteUpdate(context).value(2)
-    held = ends[MEMORY_S][HELD]
+    held = ends[MEMORY_S][HELD_WRENCH]
     assert np.linalg.norm(held[:3]) == pytest.approx(np.linalg.norm(wrench[:3]) / 0.5)
-    np.testing.assert_allclose(ends[MEMORY_S][OF_LOAD], 0.5 * held, atol=1e-15)
+    np.testing.assert_allclose(ends[MEMORY_S][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 
 
 def test_what_is_in_flight_belongs_to_the_context():
@@ -182,11 +182,11 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
         assert np.isfinite(values).all(), name
     t, force = result.t, np.linalg.norm(result["force_to_master"][:, :3], axis=1)
     position = result["pose_received"][:, 4:]
-    safe = (t > 0.2 + 0.01 + STOP + 0.005) & (t < 0.4)
+    safe = (t > 0.2 + 0.01 + STOP_TIME + 0.005) & (t < 0.4)
     assert force[safe].max() < 1e-12
     assert np.ptp(position[safe], axis=0).max() < 1e-12
     # Later the hand feels the tool's inertia at full, which trembles without the failure as well.
-    resumed = t[1:] < 0.4 + 0.01 + RESUME
+    resumed = t[1:] < 0.4 + 0.01 + RESUME_TIME
     assert np.abs(np.diff(result["force_to_master"][:, :3], axis=0))[resumed].max() < 0.5
     fastest = np.abs(np.diff(sound["pose_received"][:, 4:], axis=0)).max()
     assert np.abs(np.diff(position, axis=0)).max() < 2.0 * fastest

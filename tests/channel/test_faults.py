@@ -10,10 +10,10 @@ import pytest
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.channel import MEMORY_S, channel_step, initial_ends
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import DAMPING, HELD, STIFFNESS
+from drake_teleop.station.passivity.memory import DAMPING, HELD_WRENCH, STIFFNESS
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters, steps_of
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
 
 T, STEPS, DELAY = 1e-3, 4000, 0.01
 LIMIT = 5.0
@@ -83,7 +83,7 @@ def run(method: str, fault: str | None, span: tuple[float, float] = FAULT, bad=n
         found.touched[k] = wall < 0.0
         found.command[k], found.felt[k], found.ports[k] = received, felt, ports
         pull = p[STIFFNESS][0] * (received[4] - slave[4]) - p[DAMPING][0] * velocity
-        found.servo[k] = pull, ends[MEMORY_S][HELD][0]
+        found.servo[k] = pull, ends[MEMORY_S][HELD_WRENCH][0]
     return found
 
 
@@ -110,10 +110,10 @@ def test_a_fault_is_smooth_bounded_and_recovered_from(method, fault):
     # No step, of force or of the command, that the sound run does not have.
     assert np.abs(np.diff(f)).max() < 0.5
     missed = np.ptp(faulty.hand[(t > FAULT[0]) & (t < FAULT[1])])
-    fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME
+    fastest = np.abs(np.diff(sound.command[:, 4])).max() + 2.0 * missed * T / RESUME_TIME
     assert np.abs(np.diff(x)).max() < 1.5 * fastest
     # The safe state of both ends.
-    safe = (t > FAULT[0] + DELAY + STOP + 0.005) & (t < FAULT[1])
+    safe = (t > FAULT[0] + DELAY + STOP_TIME + 0.005) & (t < FAULT[1])
     if fault != "saturated":
         assert np.abs(f[safe]).max() < 1e-12
         assert np.ptp(x[safe]) < 1e-12
@@ -136,9 +136,9 @@ def test_the_hand_fades_in_50_ms_and_not_at_once():
     found = run("none", "slave_wrench")
     f = found.felt[:, 0]
     told = round((FAULT[0] + DELAY) / T) + 2
-    fade = np.abs(f[told : told + round(STOP / T) + 2])
+    fade = np.abs(f[told : told + round(STOP_TIME / T) + 2])
     assert (np.diff(fade) <= 0.0).all()
-    assert np.abs(np.diff(fade)).max() < 2.5 * fade[0] * T / STOP
+    assert np.abs(np.diff(fade)).max() < 2.5 * fade[0] * T / STOP_TIME
     assert fade[-1] < 1e-12
 
 
@@ -149,7 +149,7 @@ def test_while_the_sensor_is_saturated_the_last_good_wrench_is_felt():
     t, f = found.t, found.felt[:, 0]
     held = f[(t > span[0] + 2 * DELAY) & (t < span[1])]
     assert np.ptp(held) < 1e-12 and abs(held[0]) > 1.0
-    back = f[(t > span[1]) & (t < span[1] + DELAY + STOP + 0.01)]
+    back = f[(t > span[1]) & (t < span[1] + DELAY + STOP_TIME + 0.01)]
     assert np.abs(np.diff(back)).max() < 0.1
     assert abs(back[-1]) < 0.1
 
@@ -159,6 +159,6 @@ def test_the_ledger_of_the_motor_sees_the_command_that_really_leaves(method):
     """In the safe state, and on the way out of it, that is not the one the method asked for."""
     found = run(method, "hand_wrench")
     t = found.t
-    changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME)
+    changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME)
     assert np.abs(found.servo[changed, 0]).max() > 0.1
     np.testing.assert_allclose(found.servo[:, 1], found.servo[:, 0], atol=1e-6)

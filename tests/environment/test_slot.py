@@ -20,7 +20,7 @@ from drake_teleop.station.environment.slot import (
     TIP_BALL,
     UPPER_BALL,
     Slot,
-    TouchAsSlot,
+    UseSlotMaterial,
     _boxes,
 )
 from drake_teleop.station.replay import ReplayScene
@@ -49,7 +49,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     plant.RegisterCollisionGeometry(tool, RigidTransform(), ball, "ball", friction)
     environment = AddEnvironment(plant, slot).instances
     plant.Finalize()
-    TouchAsSlot(plant, scene_graph, slot, tool.index())
+    UseSlotMaterial(plant, scene_graph, slot, tool.index())
     shapes = dict.fromkeys(plant.GetCollisionGeometriesForBody(tool), RigidTransform())
     inspector = scene_graph.model_inspector()
     pairs = ContactPairs(plant, inspector, shapes, environment, slot.slip).known

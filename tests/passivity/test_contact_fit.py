@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.station.passivity.contact_fit import SUMS, fit, slipped
+from drake_teleop.station.passivity.contact_fit import NUM_SUMS, slip_change, update_fit
 
 
 def found(stiffness, damping, way, faster, keep=0.8):
-    sums, values = np.zeros(SUMS), (0.0, 0.0)
+    sums, values = np.zeros(NUM_SUMS), (0.0, 0.0)
     for dx, dv in zip(way, faster, strict=True):
-        values = fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
+        values = update_fit(sums, stiffness * dx + damping * dv, dx, dv, keep)
     return values
 
 
@@ -30,22 +30,25 @@ def test_what_cannot_be_told_apart_is_a_spring_and_the_past_is_forgotten():
     k, b = found(300.0, 17.0, way, 10.0 * way)
     assert b <= 17.0 and k + 10.0 * b == pytest.approx(470.0, rel=0.02)
     assert found(300.0, 17.0, way[:1], 10.0 * way[:1]) == (pytest.approx(470.0), 0.0)
-    sums = np.zeros(SUMS)
+    sums = np.zeros(NUM_SUMS)
     for stiffness in (2000.0, 100.0):
         for step in 2e-4 * np.array([1.0, -1.0, 2.0, -1.0, 1.0, 2.0] * 4):
-            k, _ = fit(sums, stiffness * step, step, 0.0, 0.5)
+            k, _ = update_fit(sums, stiffness * step, step, 0.0, 0.5)
     assert k == pytest.approx(100.0, rel=0.01)
 
 
 def test_neither_is_negative():
-    assert fit(np.zeros(SUMS), -1.0, 1e-3, 0.1, 0.5) == (0.0, pytest.approx(0.0, abs=1e-9))
+    assert update_fit(np.zeros(NUM_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
+        0.0,
+        pytest.approx(0.0, abs=1e-9),
+    )
 
 
 def test_a_slip_is_no_stiffness_and_a_stop_that_is_struck_is_one():
     """Of what a way of 0.2 mm changes: up to 0.12 N are a spring's, 0.4 N at most friction's."""
     for sign in (1.0, -1.0):
-        assert sign * slipped(sign * 0.1, sign * 0.12, 0.4) == 0.0
-        assert sign * slipped(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)
-        assert sign * slipped(-sign * 0.1, sign * 0.12, 0.4) == pytest.approx(-0.1)
-        assert sign * slipped(sign * 2.0, sign * 0.12, 0.4) == pytest.approx(0.4)
-        assert slipped(sign * 2.0, sign * 0.12, 0.0) == 0.0
+        assert sign * slip_change(sign * 0.1, sign * 0.12, 0.4) == 0.0
+        assert sign * slip_change(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)
+        assert sign * slip_change(-sign * 0.1, sign * 0.12, 0.4) == pytest.approx(-0.1)
+        assert sign * slip_change(sign * 2.0, sign * 0.12, 0.4) == pytest.approx(0.4)
+        assert slip_change(sign * 2.0, sign * 0.12, 0.0) == 0.0

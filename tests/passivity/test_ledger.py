@@ -24,7 +24,7 @@ from drake_teleop.lab.comparison.one_dof import (
 )
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
-from drake_teleop.station.passivity.ledger_slave import _ACCOUNT
+from drake_teleop.station.passivity.ledger_slave import _BALANCE
 from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOST, RECEIVED, SENT
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
@@ -166,7 +166,7 @@ def test_motors_may_not_spend_what_the_slave_moves_with():
         PERIOD, p, memory, np.zeros(13), np.zeros(PACKET_SIZE),
     )  # fmt: skip
     moving = 1.05 * 0.5 * np.array([4.0 * 0.01, 0.02 * 0.25])
-    np.testing.assert_allclose(memory[_ACCOUNT], held - moving, rtol=1e-12)
+    np.testing.assert_allclose(memory[_BALANCE], held - moving, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", [4, 38])

@@ -11,13 +11,13 @@ import pytest
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.ledger_slave import (
     CONTACT_STIFFNESS,
+    IN_CONTACT,
     NORMAL,
-    TOUCHED,
-    TRIP,
-    along,
+    ROUND_TRIP,
+    component_along,
     find_direction,
 )
-from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOST, OF_LOAD, SENT
+from drake_teleop.station.passivity.memory import LEDGER, LIMIT, LOAD_WRENCH, LOST, SENT
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
@@ -26,7 +26,14 @@ from drake_teleop.station.passivity.methods import (
     slave_step,
     steps_of,
 )
-from drake_teleop.station.passivity.packet import GENTLE, LOAD, PACKET_SIZE, POSE, SEQUENCE, WRENCH
+from drake_teleop.station.passivity.packet import (
+    LOAD,
+    MAX_WRENCH_RATE,
+    PACKET_SIZE,
+    POSE,
+    SEQUENCE,
+    WRENCH,
+)
 
 T = 1e-3
 START = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -44,7 +51,7 @@ class Hand:
         self.memory[LEDGER] = 0.2  # more than it needs, and no more than it keeps in contact
         self.pose, self.felt, self.packet = START.copy(), np.zeros(6), np.zeros(PACKET_SIZE)
         self.packet[POSE], self.packet[WRENCH] = START, wrench
-        self.packet[CONTACT_STIFFNESS], self.packet[TRIP] = stiffness / 1.1, 0.1
+        self.packet[CONTACT_STIFFNESS], self.packet[ROUND_TRIP] = stiffness / 1.1, 0.1
 
     def step(self, dx: np.ndarray | None = None) -> np.ndarray:
         """Moves by dx (6,), translation and small turn; what it feels then."""
@@ -70,10 +77,10 @@ def test_a_point_that_is_touched_far_from_the_reference_is_one_spring():
     """As deep as the point itself goes, whether the hand moves or turns; the torque goes along."""
     arm, k = np.array([0.0, 0.1, 0.0]), 200.0
     normal = np.array([0.0, 0.0, 1.0, *np.cross(arm, [0.0, 0.0, 1.0])])
-    along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, a torque being a force at 0.1 m
+    component_along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, a torque being a force at 0.1 m
     depth = 1e-3
     for way in ([0, 0, -depth, 0, 0, 0], [0, 0, 0, -depth / 0.1, 0, 0]):
-        hand = Hand(2.0 * normal, k * along)
+        hand = Hand(2.0 * normal, k * component_along)
         np.testing.assert_allclose(hand.rest(2500), 2.0 * normal, atol=1e-9)
         for _ in range(50):
             hand.step(np.array(way) / 50)
@@ -102,7 +109,7 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
 def test_friction_does_not_fade_under_a_hand_that_rests():
     """Over 600 ms what the slave measures now is less than what holds the hand."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[TRIP] = 0.6
+    hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][1] = -0.6
     for _ in range(20):
@@ -116,7 +123,7 @@ def test_friction_does_not_fade_under_a_hand_that_rests():
 def test_friction_stays_across_a_direction_that_turns(way):
     """An arm that rubs presses aslant at first. What was shown of friction then was 0.2 N along."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.0, 0.0, 0.0]), 200.0)
-    hand.packet[TRIP] = 0.6
+    hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][1] = 0.0
     for _ in range(20):
@@ -147,7 +154,7 @@ def test_the_brake_on_a_hand_that_was_pushed_fades_with_its_speed():
 def test_friction_whose_torque_hides_a_force_is_no_press(turns):
     """A point 40 mm off is touched, then one on the other side; 2.6 and 3.4 N of 3 were felt."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.12, 0.0, 0.0]), 200.0)
-    hand.packet[TRIP] = 0.6
+    hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
     hand.packet[WRENCH][:4] = [0.0, 0.0, 3.0, -0.12]
     for _ in range(20):
@@ -242,8 +249,10 @@ def test_after_missing_packets_the_wrench_goes_over_gradually():
     hand.packet[WRENCH][2] = 3.0
     hand.packet[SEQUENCE] += 3.0
     course = [hand.step()[2] for _ in range(10)]
-    assert course[0] == pytest.approx(1.0 + GENTLE[0] * T)
-    assert np.diff(course).max() <= GENTLE[0] * T + 1e-12 and course[-1] == pytest.approx(3.0)
+    assert course[0] == pytest.approx(1.0 + MAX_WRENCH_RATE[0] * T)
+    assert np.diff(course).max() <= MAX_WRENCH_RATE[0] * T + 1e-12 and course[-1] == pytest.approx(
+        3.0
+    )
 
 
 def test_friction_that_changes_its_sign_does_not_soften_the_wall():
@@ -291,7 +300,7 @@ def test_a_tip_that_slips_once_is_no_step_of_what_is_pressed_and_a_wall_that_giv
             steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
             packet,
         )  # fmt: skip
-        hand.packet[WRENCH], hand.packet[TRIP] = packet[WRENCH], packet[TRIP]
+        hand.packet[WRENCH], hand.packet[ROUND_TRIP] = packet[WRENCH], packet[ROUND_TRIP]
         felt.append(hand.step()[2])
     assert felt[1999] == pytest.approx(4.0, abs=0.05)
     assert np.ptp(felt[1990:2500]) < 0.05
@@ -309,10 +318,10 @@ def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_ano
         wrench = contact / 17.5 / np.repeat(motion, 3)
         size = find_direction(wrench, 0.01, 1e-3, p, memory)
         sizes.append(size * motion[0])
-        memory[TOUCHED] = 1.0
+        memory[IN_CONTACT] = 1.0
         turned = wrench * np.repeat([-1.0, 0.5], 3)
         assert find_direction(turned, 0.01, 1e-3, p, memory) > 0.9 * size
-        assert along(memory[NORMAL], wrench, p) < 0.0
+        assert component_along(memory[NORMAL], wrench, p) < 0.0
     np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
 
 
@@ -330,8 +339,8 @@ def test_the_loads_weight_is_no_contact_and_is_felt_beside_one():
         dx = np.array([0.0, 0.0, -1e-5, 0.0, 0.0, 0.0])
         pose[6] += dx[2]
         contact = np.array([0.0, 0.0, max(depth := -pose[6] - 0.004, 0.0) * 200.0, 0.0, 0.0, 0.0])
-        memory[OF_LOAD] = load + 0.5 * np.sin(0.3 * k) * np.eye(6)[1]
-        wrench = contact + memory[OF_LOAD]
+        memory[LOAD_WRENCH] = load + 0.5 * np.sin(0.3 * k) * np.eye(6)[1]
+        wrench = contact + memory[LOAD_WRENCH]
         received[SEQUENCE] += 1.0
         slave_step(
             steps_of("ledger"), received, True, pose, dx / T, dx, wrench, T, p, memory, command,
@@ -339,7 +348,7 @@ def test_the_loads_weight_is_no_contact_and_is_felt_beside_one():
         )  # fmt: skip
         np.testing.assert_allclose(packet[WRENCH], contact, atol=1e-15)
         np.testing.assert_allclose(packet[LOAD], load, atol=0.15)
-        assert k > 400 or not memory[TOUCHED], "nothing is touched yet"
+        assert k > 400 or not memory[IN_CONTACT], "nothing is touched yet"
     np.testing.assert_allclose(memory[NORMAL], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], atol=1e-12)
     stiffness = packet[CONTACT_STIFFNESS]
     assert stiffness == pytest.approx(200.0, rel=0.05)

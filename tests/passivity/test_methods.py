@@ -16,7 +16,7 @@ from drake_teleop.lab.comparison.one_dof import (
     run_one_dof,
 )
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD, LEDGER, LIMIT, MEMORY, SENT
+from drake_teleop.station.passivity.memory import HELD_WRENCH, LEDGER, LIMIT, MEMORY, SENT
 from drake_teleop.station.passivity.methods import (
     METHODS,
     PassivityConfig,
@@ -259,7 +259,7 @@ def test_a_wrench_falls_by_a_blow_only_if_nothing_pays_for_less(stored, left):
     p = parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
     memory, packet, wrench = initial_memory("tdpa", p, START), np.zeros(PACKET_SIZE), np.zeros(6)
     received = packet.copy()
-    received[WRENCH][1] = memory[HELD][1] = 3.0
+    received[WRENCH][1] = memory[HELD_WRENCH][1] = 3.0
     memory[LEDGER][0] = stored
     dx = np.array([0.1e-3, 0.3e-3, 0.0, 0.0, 0.0, 0.0])
     master_step(

@@ -8,7 +8,7 @@ import pytest
 from drake_teleop.station.passivity import pspm
 from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
-    HELD,
+    HELD_WRENCH,
     LEDGER,
     LIMIT,
     LOST,
@@ -141,7 +141,7 @@ def test_a_command_that_was_held_back_is_pulled_at_as_it_left(monkeypatch):
     moved_into(pose, asked, wanted)
     moved_into(pose, left, command)
     pspm.command_left.py_func(wanted, command, pose, twist, p, memory)
-    np.testing.assert_allclose(memory[HELD], K * left - D * twist, rtol=1e-9)
+    np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))
     np.testing.assert_allclose(memory[LEDGER], before - more, rtol=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operators_intent, run_one_dof
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.passivity.memory import HELD, MEMORY
+from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters
 from drake_teleop.station.passivity.retreat import retreat
 
@@ -42,7 +42,7 @@ def test_only_what_drives_a_fast_hand_fades():
         retreat(before, 1.0, p, memory, wrench)  # a long step: nothing is filtered
         wrench[:] = given
         retreat(now, 1e-9, p, memory, wrench)
-        np.testing.assert_array_equal(memory[HELD], wrench)
+        np.testing.assert_array_equal(memory[HELD_WRENCH], wrench)
         return np.array([wrench[:3] @ along[:3], wrench[3:] @ along[3:]])
 
     for speed, share in ((-9.0, 1.0), (0.99, 1.0), (1.5, 0.5), (2.0, 0.0), (9.0, 0.0)):

@@ -29,7 +29,7 @@ from drake_teleop.station.passivity.methods import (
     steps_of,
 )
 from drake_teleop.station.passivity.packet import PACKET_SIZE
-from drake_teleop.station.passivity.safe_state import RESUME, STOP
+from drake_teleop.station.passivity.safe_state import RESUME_TIME, STOP_TIME
 
 TIMEOUT = 0.1
 LEDGERS = ("wave", "tdpa")  # what leaves an end is paid for by what has come, to the last joule
@@ -58,9 +58,9 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     t, felt, command = result.t, result.felt, result.command
     assert np.abs(felt[(t > 7.5) & (t < 8.0)]).min() > 0.3
     entered = 8.0 + 0.01 + TIMEOUT
-    assert np.abs(felt[(t > entered + STOP + 0.01) & (t < 9.0)]).max() < 1e-12
+    assert np.abs(felt[(t > entered + STOP_TIME + 0.01) & (t < 9.0)]).max() < 1e-12
     # The command is at rest soon, and stays.
-    at_rest = command[(t > entered + STOP + 0.01) & (t < 9.0)]
+    at_rest = command[(t > entered + STOP_TIME + 0.01) & (t < 9.0)]
     assert np.ptp(at_rest) < 1e-12
     # From the end of the silence on nothing steps.
     resumed = (t > entered) & (t < 11.0)
@@ -68,7 +68,7 @@ def test_silence_while_pressing_fades_and_comes_back_without_a_step(tmp_path, me
     assert np.abs(np.diff(command[resumed])).max() < 2e-3
     # It is as it was before; but to push back a hand that went on in the silence takes energy, and
     # methods with an exact ledger have none that was not paid for: there the wall is pressed less.
-    again = (t > 9.0 + RESUME + 1.0) & (t < 11.4)
+    again = (t > 9.0 + RESUME_TIME + 1.0) & (t < 11.4)
     tolerance = 0.15 if method in LEDGERS else 0.05
     assert felt[again].mean() == pytest.approx(felt[(t > 7.5) & (t < 8.0)].mean(), rel=tolerance)
     assert np.isfinite(felt).all()
@@ -108,8 +108,8 @@ def test_motion_that_happened_in_silence_is_not_replayed(tmp_path, method):
     # Never faster than the hand itself and the way that was missed, on the ramp of the resumption,
     # whose steepest rate is 15/8.
     missed = np.ptp(result.master)
-    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME * PERIOD
-    back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME))[:-1]
+    fast = np.abs(np.diff(result.master)).max() + 15 / 8 * missed / RESUME_TIME * PERIOD
+    back = ((t > 2.5) & (t < 2.5 + 0.1 + RESUME_TIME))[:-1]
     assert np.abs(np.diff(result.slave))[back].max() < fast
     if method not in AT_THE_MOTOR:  # there the command is a pull, written as a pose
         assert np.abs(np.diff(result.command))[back].max() < fast
@@ -173,10 +173,10 @@ def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, met
         result = run_one_dof(OneDof(), config, forward, backward, timeout=TIMEOUT)
         silent, steps = result.silent[:, 0] > TIMEOUT, np.arange(len(result.t))
         since = steps - np.maximum.accumulate(np.where(silent, steps, -len(steps)))
-        resuming = (since > 0) & (since < round(RESUME / PERIOD))
+        resuming = (since > 0) & (since < round(RESUME_TIME / PERIOD))
         resumptions += int((np.diff(silent.astype(int)) < 0).sum())
         growth = np.diff(np.abs(result.felt), prepend=0.0)[resuming]
-        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME
+        assert growth.max(initial=0.0) < 1.001 * FORCE_LIMIT * PERIOD / RESUME_TIME
     assert resumptions >= 5
 
 

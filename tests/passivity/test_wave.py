@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.station.passivity.memory import FILLS, LEDGER, LIMIT, RECEIVED
+from drake_teleop.station.passivity.memory import FILL_TIME, LEDGER, LIMIT, RECEIVED
 from drake_teleop.station.passivity.methods import (
     PassivityConfig,
     initial_memory,
@@ -30,7 +30,7 @@ def line(config, motion, contact, forward, backward, missing=range(0), fills=0):
     p = parameters(PassivityConfig(method="wave", force_limit=1e3, retreat=[1e3, 1e3], wave=config))
     start = np.array([1.0, 0, 0, 0, 0, 0, 0])
     memory = [initial_memory("wave", p, start) for _ in range(2)]
-    memory[1][FILLS] = (fills - 0.5) * T
+    memory[1][FILL_TIME] = (fills - 0.5) * T
     sent, command = np.zeros((2, len(motion), PACKET_SIZE)), np.zeros((len(motion), 13))
     nothing, zero, wrench = np.zeros(PACKET_SIZE), np.zeros(6), np.zeros((len(motion), 6))
     u = np.zeros(len(motion))
@@ -133,7 +133,7 @@ def test_what_fills_a_line_is_accounted_for_once():
         np.array([-force, *[0.0] * 5]),
     )
     memory, received = initial_memory("wave", p, start), np.zeros(PACKET_SIZE)
-    memory[FILLS], packet, command = (n - 0.5) * T, np.zeros(PACKET_SIZE), np.zeros(13)
+    memory[FILL_TIME], packet, command = (n - 0.5) * T, np.zeros(PACKET_SIZE), np.zeros(13)
     for k in range(n):
         received[ENERGY] = 0.01 * k
         slave_step(

@@ -10,7 +10,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.point_contact import ContactPairs, apart
+from drake_teleop.station.environment.point_contact import ContactPairs, separation
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
@@ -147,7 +147,9 @@ def test_boxes_that_are_apart_do_not_touch():
         rest = [moved.rotation().matrix().ravel(), moved.translation(), half[1], leaf, np.zeros(6)]
         own = [X_SOwn.rotation().matrix().ravel(), half[0]]
         pair = np.concatenate([X_SOwn.translation(), [0.0], *rest, *own])
-        found = apart(pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection)
+        found = separation(
+            pair, pair[:28], X_WS.translation(), X_WS.rotation().matrix(), deflection
+        )
         told = query.Eval(context).ComputeSignedDistancePairClosestPoints(*shapes).distance
         assert found <= max(told, 0.0) + 1e-6
         facing += found > 0.0 and found > told - 1e-6

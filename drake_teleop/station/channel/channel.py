@@ -30,7 +30,7 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig
 from drake_teleop.station.passivity import methods
-from drake_teleop.station.passivity.memory import FILLS, LIMIT, MEMORY, OF_LOAD, Slots
+from drake_teleop.station.passivity.memory import FILL_TIME, LIMIT, LOAD_WRENCH, MEMORY, Slots
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.passivity.packet import (
     CONTACT,
@@ -44,7 +44,7 @@ from drake_teleop.station.passivity.safe_state import (
     MASTER_WATCH,
     SILENT,
     SLAVE_WATCH,
-    STOP,
+    STOP_TIME,
     initial_master_watch,
     initial_slave_watch,
     master_limits_into,
@@ -55,7 +55,7 @@ _NETWORKS = ("custom", *PRESETS)
 _DIRECTIONS = (network.FORWARD, network.BACKWARD)
 #: Smallest default and largest timeout [s].
 SHORTEST_TIMEOUT, LONGEST_TIMEOUT = 0.1, 1.0
-_AFTER = 1.5  # default timeout over the longest silence of a minute
+_TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 
 
 @settings
@@ -102,7 +102,7 @@ class Channel(NetworkConfig):
             network.longest_silence(line, direction, period)
             for line, direction in zip(self.lines(), _DIRECTIONS, strict=True)
         ]
-        return min(max(_AFTER * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
+        return min(max(_TIMEOUT_FACTOR * max(longest), SHORTEST_TIMEOUT), LONGEST_TIMEOUT)
 
 
 # State of both ends in one array.
@@ -113,7 +113,7 @@ _POSE_M = _places.vector(8)  # last finite command; 1 if the last one was not
 _POSE_S = _places.vector(8)  # pose of the slave, likewise
 _WRENCH_M = _places.vector(6)  # wrench rendered since then
 _WRENCH_S = _places.vector(6)  # the slave's wrench at that time
-_TRUSTED = _places.number()  # time with valid wrenches [s]
+_VALID_TIME = _places.number()  # time with valid wrenches [s]
 _WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
 MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
 # Transformation of a wrench at the hand to the world, one array.
@@ -127,11 +127,11 @@ _WORK_M, _WORK_S, _SILENCE = _places.vector(2), _places.vector(2), _places.vecto
 _WORK_C = _places.vector(2)
 # Received values at the master.
 _places = Slots(7)
-_FELT, _TOLD = _places.vector(6), _places.number()
+_RENDERED, _CONTACT_FLAG = _places.vector(6), _places.number()
 
 # Least delay in steps. Forward: the slave reads the command one step later. Backward: the master
 # takes its step before the slave.
-_LEAST_DELAY = 1
+_MIN_DELAY = 1
 _NO_LOAD = np.zeros(6)
 
 
@@ -147,7 +147,7 @@ def initial_ends(
     """
     ends = np.zeros(_SIZE)
     ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
-    ends[_TRUSTED] = STOP
+    ends[_VALID_TIME] = STOP_TIME
     ends[_WATCH_M] = initial_master_watch()
     ends[_WATCH_S] = initial_slave_watch(start)
     memory = methods.initial_memory(method, parameters, start)
@@ -205,7 +205,7 @@ def channel_step(
     received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
 
     # The master's end.
-    good = _moved(pose_command, before_M, dx)
+    valid = _increment_into(pose_command, before_M, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
@@ -214,57 +214,57 @@ def channel_step(
     if sound(hand_B):
         _to_world(hand_B, frame, hand)
     else:
-        good = False
+        valid = False
     _, fresh = network.receive(backward_parameters, backward, k, received)
-    alive = fresh and received[HEALTHY] > 0.5
-    fault = (fresh and not alive) or not good
-    master_limits_into(alive, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
+    healthy = fresh and received[HEALTHY] > 0.5
+    fault = (fresh and not healthy) or not valid
+    master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
     methods.master_step(
         steps, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
         held_M, packet,
     )  # fmt: skip
-    if not good:
+    if not valid:
         packet[HEALTHY] = 0.0
     network.send(forward_parameters, forward, k, packet)
-    _to_master(held_M, frame, wrench_received[_FELT])
-    wrench_received[_TOLD] = received[CONTACT]
+    _to_master(held_M, frame, wrench_received[_RENDERED])
+    wrench_received[_CONTACT_FLAG] = received[CONTACT]
 
     # The slave's end.
-    good = _moved(slave_pose, before_S, dx)
+    valid = _increment_into(slave_pose, before_S, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
         work_S[g] += dot(held_S, dx, g)
-    load = memory_S[OF_LOAD]
+    load = memory_S[LOAD_WRENCH]
     if not (sound(wrench_B) and sound(load_B)):
-        good = False
-        ends[_TRUSTED] = 0.0
+        valid = False
+        ends[_VALID_TIME] = 0.0
     elif saturated:
-        ends[_TRUSTED] = 0.0
+        ends[_VALID_TIME] = 0.0
     else:
         # Blend from the kept wrench to the measured one.
         _to_world(wrench_B, frame, wrench)
-        share = T / max(STOP - ends[_TRUSTED], T)
+        share = T / max(STOP_TIME - ends[_VALID_TIME], T)
         for i in range(6):
             held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
         _to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
-        ends[_TRUSTED] += T
+        ends[_VALID_TIME] += T
     put(wrench, 0, held_S, 0, 6)
     _, fresh = network.receive(forward_parameters, forward, k + 1, received)
-    alive = fresh and received[HEALTHY] > 0.5
+    healthy = fresh and received[HEALTHY] > 0.5
     methods.slave_step(
         steps, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
         packet,
     )  # fmt: skip
-    if not good:
+    if not valid:
         packet[HEALTHY] = 0.0
     packet[CONTACT] = contact
     network.send(backward_parameters, backward, k, packet)
-    fault, wanted = (fresh and not alive) or not good, command[:7]
-    slave_command_into(alive, fault, T, timeout, wanted, watch_S, pose_received)
-    methods.command_left(steps, wanted, pose_received, before_S[:7], twist, parameters, memory_S)
+    fault, requested = (fresh and not healthy) or not valid, command[:7]
+    slave_command_into(healthy, fault, T, timeout, requested, watch_S, pose_received)
+    methods.command_sent(steps, requested, pose_received, before_S[:7], twist, parameters, memory_S)
     difference_into(pose_received, left, dx)
     for g in range(2):
         ports[_WORK_C][g] += dot(held_S, dx, g)
@@ -272,7 +272,7 @@ def channel_step(
 
 
 @njit(cache=True)
-def _moved(pose, before, dx):
+def _increment_into(pose, before, dx):
     """Write the pose increment since the last step; 0 from or to a pose that is not finite.
 
     Args:
@@ -283,14 +283,14 @@ def _moved(pose, before, dx):
     Returns:
         Whether the pose is finite.
     """
-    good = sound(pose)
-    if good:
+    valid = sound(pose)
+    if valid:
         difference_into(pose, before, dx)
         put(before, 0, pose, 0, 7)
-    if not good or before[7] > 0.0:
+    if not valid or before[7] > 0.0:
         dx[:] = 0.0
-    before[7] = 0.0 if good else 1.0
-    return good
+    before[7] = 0.0 if valid else 1.0
+    return valid
 
 
 @njit(cache=True)
@@ -374,12 +374,12 @@ class TeleopChannel(LeafSystem):
         # A motion scale of zero transfers no energy; any unit is valid.
         scales = np.where(scales > 0.0, scales, 1.0)
         lines = [
-            network.parameters(line, seed, direction, period, least=_LEAST_DELAY)
+            network.parameters(line, seed, direction, period, least=_MIN_DELAY)
             for line, direction in zip(channel.lines(), _DIRECTIONS, strict=True)
         ]
         parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
         self._steps = methods.steps_of(passivity.method)
-        self._tells_apart = passivity.method == "ledger"
+        self._uses_load = passivity.method == "ledger"
         self._constants = (
             *(
                 period,
@@ -397,16 +397,20 @@ class TeleopChannel(LeafSystem):
         self._contact = self.DeclareVectorInputPort("contact", 1)
         self._load = self.DeclareVectorInputPort("load_wrench_B", 6)
         ends = initial_ends(passivity.method, parameters, start)
-        carried = np.zeros(PACKET_SIZE if self._tells_apart else LOAD.start)
-        receivers, flying = zip(*(network.initial_state(p, carried) for p in lines), strict=True)
+        carried = np.zeros(PACKET_SIZE if self._uses_load else LOAD.start)
+        receivers, in_transit = zip(
+            *(network.initial_state(p, carried) for p in lines), strict=True
+        )
         state = [*receivers, ends, np.array(start), np.zeros(PORTS)]
-        self._begin = (passivity.method, parameters)
+        self._initial_arguments = (passivity.method, parameters)
         received = np.zeros(7)
         groups = [self.DeclareDiscreteState(part) for part in state]
         self._groups = [int(group) for group in groups]  # faster than Drake's own indices
         # Packets in transit are abstract parameters, which a context clones. Drake would copy a
         # discrete state several times a step: 1.5 MB for `lunar`.
-        self._flying = [self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in flying]
+        self._in_transit = [
+            self.DeclareAbstractParameter(AbstractValue.Make(f)) for f in in_transit
+        ]
         self.DeclareStateOutputPort("pose_received", groups[3])
         self.DeclareStateOutputPort("ports", groups[4])
         # One step computes the present wrench and the next state.
@@ -419,9 +423,13 @@ class TeleopChannel(LeafSystem):
             {self.all_input_ports_ticket(), self.xd_ticket()},
         )
         self._step = step.cache_index()  # the entry itself would keep the block alive
-        taken = {step.ticket()}
-        self.DeclareVectorOutputPort("wrench_received", 6, weak_callback(self._calc_wrench), taken)
-        self.DeclareVectorOutputPort("contact_at_hand", 1, weak_callback(self._calc_contact), taken)
+        step_ticket = {step.ticket()}
+        self.DeclareVectorOutputPort(
+            "wrench_received", 6, weak_callback(self._calc_wrench), step_ticket
+        )
+        self.DeclareVectorOutputPort(
+            "contact_at_hand", 1, weak_callback(self._calc_contact), step_ticket
+        )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(
@@ -440,8 +448,8 @@ class TeleopChannel(LeafSystem):
             fills: time with the clutch open [s]. The slave of `wave` keeps its command until then
                 and reflects the present wrench.
         """
-        ends = initial_ends(*self._begin, command)
-        ends[_POSE_S][:7], ends[MEMORY_S][FILLS] = slave, fills
+        ends = initial_ends(*self._initial_arguments, command)
+        ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills
         context.SetDiscreteState(self._groups[2], ends)
         context.SetDiscreteState(self._groups[3], command)
 
@@ -450,10 +458,10 @@ class TeleopChannel(LeafSystem):
         for part, group in zip(state, self._groups, strict=True):
             part[:] = context.get_discrete_state(group).value()
         # A repeated step with other inputs overwrites the same places.
-        flying = [context.get_abstract_parameter(k).get_value() for k in self._flying]
-        forward, backward = zip(state[:2], flying, strict=True)
+        in_transit = [context.get_abstract_parameter(k).get_value() for k in self._in_transit]
+        forward, backward = zip(state[:2], in_transit, strict=True)
         load = _NO_LOAD
-        if self._tells_apart and self._load.HasValue(context):  # its evaluation takes time
+        if self._uses_load and self._load.HasValue(context):  # its evaluation takes time
             load = self._load.Eval(context)
         channel_step(
             self._steps,
@@ -471,16 +479,16 @@ class TeleopChannel(LeafSystem):
             received,
         )
 
-    def _taken(self, context: Context) -> list[NDArray[np.float64]]:
+    def _step_result(self, context: Context) -> list[NDArray[np.float64]]:
         """Return the state after the step, and the master's received values."""
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._taken(context)[-1][_FELT])
+        output.SetFromVector(self._step_result(context)[-1][_RENDERED])
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._taken(context)[-1][_TOLD]
+        output[0] = self._step_result(context)[-1][_CONTACT_FLAG]
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        for part, group in zip(self._taken(context), self._groups, strict=False):
+        for part, group in zip(self._step_result(context), self._groups, strict=False):
             discrete_state.set_value(group, part)

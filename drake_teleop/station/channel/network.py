@@ -34,11 +34,11 @@ LONGEST_EXTRAPOLATION = 0.1  # [s]; then the pose stands still
 
 # Distribution -> largest deviation from the mean, in units of jitter times delay. It cuts the delay
 # of one packet in 1e7.
-_TAILS = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
+_MAX_DEVIATION = {"uniform": 1.0, "normal": 3.0, "gamma": 6.0}
 _SILENCE = ("hold", "zero", "extrapolate")
 _ZERO, _EXTRAPOLATE = 1, 2
 _TRACE_STEP = 1e-3  # [s], for mean and maximum of a trace
-_MINUTE, _OTHER_SEED = 60.0, 20090101  # [s]; seed for the silence of a network
+_MINUTE_S, _SILENCE_SEED = 60.0, 20090101  # [s]; seed for the silence of a network
 
 
 @settings
@@ -48,7 +48,7 @@ class NetworkConfig:
 
     delay: float = quantity(0.0, "s", 0.0, LONGEST_DELAY, "mean one-way delay")
     jitter: float = quantity(0.0, "1", 0.0, 1.0, "sqrt(3) standard deviations over the mean delay")
-    distribution: str = choice("uniform", tuple(_TAILS), "distribution of the delay")
+    distribution: str = choice("uniform", tuple(_MAX_DEVIATION), "distribution of the delay")
     loss: float = quantity(0.0, "1", 0.0, 1.0, "share of the packets that is lost, mean")
     burst: float = quantity(0.0, "s", 0.0, 100.0, "mean length of a bad state; 0: independent loss")
     burst_loss: float = quantity(1.0, "1", 0.01, 1.0, "share that is lost in the bad state")
@@ -110,9 +110,11 @@ lunar: 384 400 km are 1.28 s; with the ground stations 2.6 s.
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
 _KEY, _PERIOD, _DELAY, _JITTER, _DISTRIBUTION, _LONGEST, _BAD_SHARE, _BAD_MEMORY = range(8)
-_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _LEAST, _TRACE = range(8, 17)
+_BURST_LOSS, _DUPLICATE, _RATE, _PLAYOUT, _REDUNDANT, _SLOTS, _POLICY, _MIN_DELAY, _TRACE = range(
+    8, 17
+)
 # State of a receiver: these, then its last packet. In transit: slots, then sent packets.
-_BAD, _ARRIVED, _RECEIVED, _SILENT, _LAST = range(5)
+_BAD, _NEWEST_ARRIVED, _NEWEST_READ, _SILENT_STEPS, _LAST_PACKET = range(5)
 
 
 def parameters(
@@ -142,22 +144,25 @@ def parameters(
     trace = np.zeros(0) if config.trace is None else _read_trace(Path(config.trace), period)
     trace = trace if delays is None else np.asarray(delays, np.float64)
     mean, playout = config.delay / period, math.floor(config.playout / period + 0.5)
-    longest = math.floor(mean * (1 + _TAILS[config.distribution] * config.jitter) + 0.5)
+    longest = math.floor(mean * (1 + _MAX_DEVIATION[config.distribution] * config.jitter) + 0.5)
     if trace.size:
         longest = max(int(trace.max()), 0)
     longest = max(longest, least)
     bad = config.loss / config.burst_loss
-    sojourn = config.burst * (1 - bad)  # time constant of the chain
+    time_constant = config.burst * (1 - bad)  # time constant of the chain
     p = np.empty(_TRACE + trace.size)
     # 53 bits of a key are exact in a float.
     p[_KEY] = random_bits(np.uint64(random_bits(np.uint64(seed % 2**64), 0)), direction)
     p[_PERIOD], p[_DELAY], p[_JITTER], p[_LONGEST] = period, mean, config.jitter, longest
-    p[_DISTRIBUTION] = list(_TAILS).index(config.distribution)
-    p[_BAD_SHARE], p[_BAD_MEMORY] = bad, math.exp(-period / sojourn) if sojourn > 0 else 0.0
+    p[_DISTRIBUTION] = list(_MAX_DEVIATION).index(config.distribution)
+    p[_BAD_SHARE], p[_BAD_MEMORY] = (
+        bad,
+        math.exp(-period / time_constant) if time_constant > 0 else 0.0,
+    )
     p[_BURST_LOSS], p[_DUPLICATE] = config.burst_loss, config.duplicate
     p[_RATE] = min(1.0, period * config.rate_hz) if config.rate_hz is not None else 1.0
     p[_PLAYOUT], p[_REDUNDANT], p[_SLOTS] = playout, config.redundant, max(longest, playout) + 1
-    p[_POLICY], p[_LEAST] = _SILENCE.index(config.silence), least
+    p[_POLICY], p[_MIN_DELAY] = _SILENCE.index(config.silence), least
     p[_TRACE:] = trace
     return p
 
@@ -173,7 +178,7 @@ def mean_delay(config: NetworkConfig) -> float:
 
 def longest_delay(config: NetworkConfig) -> float:
     """Return the largest age of a packet when it is used [s]."""
-    longest = config.delay * (1 + _TAILS[config.distribution] * config.jitter)
+    longest = config.delay * (1 + _MAX_DEVIATION[config.distribution] * config.jitter)
     if config.trace is not None:
         longest = float(_read_trace(Path(config.trace), _TRACE_STEP).max()) * _TRACE_STEP
     return max(longest, config.playout)
@@ -214,11 +219,11 @@ def _uniform(p, k, draw):
 
 
 @njit(cache=True)
-def _travel(p, k, draw):
+def _delay_steps(p, k, draw):
     """Return the delay of packet k in steps, -1 if the trace lost it. Uses three draws."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
-        return int(max(steps, p[_LEAST])) if steps >= 0.0 else -1
+        return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
     mean, spread = p[_DELAY], p[_DELAY] * p[_JITTER]
     if spread == 0.0:
         return int(p[_LONGEST])
@@ -231,11 +236,11 @@ def _travel(p, k, draw):
     else:  # sum of three exponential waits
         u *= _uniform(p, k, draw + 1) * _uniform(p, k, draw + 2)
         delay = mean - spread - spread / 3.0 * math.log(u)
-    return int(min(max(delay + 0.5, p[_LEAST]), p[_LONGEST]))
+    return int(min(max(delay + 0.5, p[_MIN_DELAY]), p[_LONGEST]))
 
 
 @njit(cache=True)
-def _fate(p, k, bad):
+def _advance_chain(p, k, bad):
     """Return the chain's state at step k, and the delays of packet and copy in steps (-1: none).
 
     `bad` is the state one step before: 0 good, 1 bad; before step 0 the probability of bad.
@@ -247,10 +252,10 @@ def _fate(p, k, bad):
         return bad, -1, -1
     if bad == 1.0 and _uniform(p, k, 1) <= p[_BURST_LOSS]:
         return bad, -1, -1
-    first = _travel(p, k, 2)
+    first = _delay_steps(p, k, 2)
     second = -1
     if first >= 0 and p[_DUPLICATE] > 0.0 and _uniform(p, k, 5) <= p[_DUPLICATE]:
-        second = _travel(p, k, 6)
+        second = _delay_steps(p, k, 6)
     return bad, first, second
 
 
@@ -276,17 +281,17 @@ def initial_state(
 @njit(cache=True)
 def send(p, state, k, packet):
     """Send the packet (N,) of step k; steps count from 0 without gaps."""
-    receiver, flying = state
-    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
-    receiver[_BAD], first, second = _fate(p, k, receiver[_BAD])
+    receiver, in_transit = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
+    receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
     for travel in (first, second):
         if travel >= 0:
             if p[_REDUNDANT] == 0.0:
                 travel = max(travel, int(p[_PLAYOUT]))
             # The previous content of the slot is older.
-            flying[(k + travel) % slots] = k
+            in_transit[(k + travel) % slots] = k
     # A lost packet is written too, because a later redundant packet may contain it.
-    put(flying, slots + size * (k % slots), packet, 0, size)
+    put(in_transit, slots + size * (k % slots), packet, 0, size)
 
 
 @njit(cache=True)
@@ -301,23 +306,23 @@ def receive(p, state, k, packet):
     Returns:
         The step at which the newest packet was sent, or -1; whether it is new.
     """
-    receiver, flying = state
-    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST
+    receiver, in_transit = state
+    slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
     # An old entry of the slot is smaller and has no effect.
-    receiver[_ARRIVED] = max(receiver[_ARRIVED], flying[k % slots])
-    newest = receiver[_ARRIVED]
+    receiver[_NEWEST_ARRIVED] = max(receiver[_NEWEST_ARRIVED], in_transit[k % slots])
+    newest = receiver[_NEWEST_ARRIVED]
     if p[_REDUNDANT] != 0.0:
         newest = min(newest, k - p[_PLAYOUT])
-    fresh = newest > receiver[_RECEIVED]
+    fresh = newest > receiver[_NEWEST_READ]
     if fresh:
-        receiver[_RECEIVED], receiver[_SILENT] = newest, 0.0
-        put(receiver, _LAST, flying, slots + size * (int(newest) % slots), size)
+        receiver[_NEWEST_READ], receiver[_SILENT_STEPS] = newest, 0.0
+        put(receiver, _LAST_PACKET, in_transit, slots + size * (int(newest) % slots), size)
     else:
-        receiver[_SILENT] += 1.0
-    put(packet, 0, receiver, _LAST, size)
+        receiver[_SILENT_STEPS] += 1.0
+    put(packet, 0, receiver, _LAST_PACKET, size)
     if not fresh:
-        _fill_silence(p[_POLICY], receiver[_SILENT] * p[_PERIOD], packet)
-    return int(receiver[_RECEIVED]), fresh
+        _fill_silence(p[_POLICY], receiver[_SILENT_STEPS] * p[_PERIOD], packet)
+    return int(receiver[_NEWEST_READ]), fresh
 
 
 @njit(cache=True)
@@ -341,15 +346,15 @@ def packet_delays(
     Args:
         config, seed, direction, period: as for `parameters`.
     """
-    return _fates(parameters(config, seed, direction, period), steps)
+    return _all_delays(parameters(config, seed, direction, period), steps)
 
 
 @njit(cache=True)
-def _fates(p, steps):
-    fates, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
+def _all_delays(p, steps):
+    delays, bad = np.empty((steps, 2), np.int64), p[_BAD_SHARE]
     for k in range(steps):
-        bad, fates[k, 0], fates[k, 1] = _fate(p, k, bad)
-    return fates
+        bad, delays[k, 0], delays[k, 1] = _advance_chain(p, k, bad)
+    return delays
 
 
 def newest_packets(
@@ -362,7 +367,7 @@ def newest_packets(
     """
     p = parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
-    for travel in _fates(p, steps).T:
+    for travel in _all_delays(p, steps).T:
         used = travel if config.redundant else np.maximum(travel, playout)
         seen = (travel >= 0) & (sent + used < steps)
         np.maximum.at(arrived, (sent + used)[seen], sent[seen])
@@ -376,7 +381,7 @@ def longest_silence(config: NetworkConfig, direction: int, period: float) -> flo
     Args:
         config, direction, period: as for `parameters`. The seed is fixed, not the scenario's.
     """
-    steps = math.ceil((_MINUTE + longest_delay(config)) / period)
-    newest = newest_packets(config, _OTHER_SEED, direction, steps, period)
+    steps = math.ceil((_MINUTE_S + longest_delay(config)) / period)
+    newest = newest_packets(config, _SILENCE_SEED, direction, steps, period)
     fresh = np.flatnonzero(np.diff(newest, prepend=-1) > 0)
     return float(np.diff(fresh, append=steps).max(initial=0) * period) if len(fresh) else math.inf

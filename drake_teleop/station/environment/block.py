@@ -20,16 +20,16 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
 from drake_teleop.station.environment.box import AddFixedBox
 from drake_teleop.station.environment.environment import (
+    BodiesOfTool,
     ExcludeContact,
     LetFloat,
     NewInstance,
-    OnSensor,
     Stand,
 )
 from drake_teleop.station.environment.surface import Surface
 
-_FOOT, _TABLE = 0.002, 0.05  # m: radius of the balls, thickness of the table
-_NAME, _FEET = "block", "foot_of_block_"
+_FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
+_NAME, _FOOT_NAME = "block", "foot_of_block_"
 _COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 
 
@@ -61,13 +61,15 @@ class Block(Surface):
     def stand(self) -> Stand | None:
         x, y, top = self.position
         across = 0.6 * min(self.table)
-        return Stand(across, across, x, y, top - _TABLE) if across > 0.0 else None
+        return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the block at rest on its table; without a scene graph they have no shapes."""
         if min(self.table) > 0.0:
-            below = np.array(self.position) - [0.0, 0.0, _TABLE / 2]
-            AddFixedBox(plant, "table", RigidTransform(below), [*self.table, _TABLE], self)
+            below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS / 2]
+            AddFixedBox(
+                plant, "table", RigidTransform(below), [*self.table, _TABLE_THICKNESS], self
+            )
         inertia = SpatialInertia.SolidBoxWithMass(self.mass, *self.size)
         body = plant.AddRigidBody(_NAME, NewInstance(plant, _NAME), inertia)
         x, y, foot = self.position
@@ -80,9 +82,9 @@ class Block(Surface):
         plant.RegisterCollisionGeometry(body, here, box, _NAME, self.material())
         plant.RegisterVisualGeometry(body, here, box, _NAME, _COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
-            place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT))
-            ball = Sphere(_FOOT)
-            plant.RegisterCollisionGeometry(body, place, ball, f"{_FEET}{k}", self.material())
+            place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS))
+            ball = Sphere(_FOOT_RADIUS)
+            plant.RegisterCollisionGeometry(body, place, ball, f"{_FOOT_NAME}{k}", self.material())
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
@@ -92,9 +94,9 @@ class Block(Surface):
         blocks = [body for body in map(plant.get_body, bodies) if body.name() == _NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]
         name = scene_graph.model_inspector().GetName
-        feet = [shape for shape in shapes if _FEET in name(shape)]
+        feet = [shape for shape in shapes if _FOOT_NAME in name(shape)]
         boxes = [shape for shape in shapes if shape not in feet]
-        on_sensor = OnSensor(plant, tool)
-        ExcludeContact(plant, scene_graph, feet, on_sensor)
-        others = {*on_sensor, *(body.index() for body in blocks)}
+        tool_bodies = BodiesOfTool(plant, tool)
+        ExcludeContact(plant, scene_graph, feet, tool_bodies)
+        others = {*tool_bodies, *(body.index() for body in blocks)}
         ExcludeContact(plant, scene_graph, boxes, [k for k in bodies if k not in others])

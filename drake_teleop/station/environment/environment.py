@@ -132,7 +132,7 @@ def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) ->
     joint.set_default_positions(np.concatenate([turn, X_WBody.translation()]))
 
 
-def OnSensor(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
+def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
     """Return the tool's body and the bodies welded to it, after Finalize."""
     return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
 
@@ -148,7 +148,7 @@ def ToolShapes(
             for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index))
             if properties(shape) is not None
         ]
-        for index in OnSensor(plant, tool)
+        for index in BodiesOfTool(plant, tool)
     }
 
 

@@ -31,7 +31,7 @@ from drake_teleop.common.vectors import cross, plus, three, times
 
 Array = NDArray[np.float64]
 
-_FIXED, _TURNS, _SLIDES, _FLOATS = range(4)
+_FIXED, _REVOLUTE, _PRISMATIC, _FREE = range(4)
 _PARENT, _KIND, _Q, _V, _AXIS, _F, _M = 0, 1, 2, 3, 4, 7, 14
 #: Columns of the table of joints.
 JOINT_WIDTH = 21
@@ -80,20 +80,20 @@ def _row(plant: MultibodyPlant, context: Context, joint: Joint, row: int) -> Arr
     F = joint.frame_on_parent()
     X_PF = F.CalcPoseInWorld(context) if row < 0 else F.GetFixedPoseInBodyFrame()
     X_MB = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
-    kind, axis = _kind(joint)
+    kind, axis = _joint_kind(joint)
     places = joint.position_start(), plant.num_positions() + joint.velocity_start()
-    return np.array([row, kind, *places, *axis, *_numbers(X_PF), *_numbers(X_MB)])
+    return np.array([row, kind, *places, *axis, *_pose_numbers(X_PF), *_pose_numbers(X_MB)])
 
 
-def _kind(joint: Joint) -> tuple[int, Array]:
+def _joint_kind(joint: Joint) -> tuple[int, Array]:
     if isinstance(joint, RevoluteJoint):
-        return _TURNS, joint.revolute_axis()
+        return _REVOLUTE, joint.revolute_axis()
     if isinstance(joint, PrismaticJoint):
-        return _SLIDES, joint.translation_axis()
-    return _FLOATS if isinstance(joint, QuaternionFloatingJoint) else _FIXED, np.zeros(3)
+        return _PRISMATIC, joint.translation_axis()
+    return _FREE if isinstance(joint, QuaternionFloatingJoint) else _FIXED, np.zeros(3)
 
 
-def _numbers(X: RigidTransform) -> Array:
+def _pose_numbers(X: RigidTransform) -> Array:
     return np.concatenate([X.rotation().ToQuaternion().wxyz(), X.translation()])
 
 
@@ -119,17 +119,17 @@ def bodies_into(joints, state, out):
         turn = multiply(turn, _quaternion(row, _F))
         # From F to M.
         q, v, kind, axis = int(row[_Q]), int(row[_V]), row[_KIND], three(row, _AXIS)
-        if kind == _TURNS:
+        if kind == _REVOLUTE:
             spin = plus(spin, times(state[v], rotate(turn, axis)))
             half = 0.5 * state[q]
             x, y, z = times(sin(half), axis)
             turn = multiply(turn, (cos(half), x, y, z))
-        elif kind == _SLIDES:
+        elif kind == _PRISMATIC:
             axis = rotate(turn, axis)
             lever = times(state[q], axis)
             place = plus(place, lever)
             speed = plus(plus(speed, cross(spin, lever)), times(state[v], axis))
-        elif kind == _FLOATS:
+        elif kind == _FREE:
             lever = rotate(turn, three(state, q + 4))
             place = plus(place, lever)
             speed = plus(plus(speed, cross(spin, lever)), rotate(turn, three(state, v + 3)))
@@ -155,7 +155,7 @@ def _hermite(h, u, a, a_dot, b, b_dot):
 
 
 @njit(cache=True)
-def _rate(spin, turn):
+def _quaternion_rate(spin, turn):
     """Return the rate of a quaternion for an angular velocity."""
     return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
 
@@ -169,15 +169,15 @@ def interpolate_bodies(joints, h, u, start, end, out):
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]
-        if kind in (_TURNS, _SLIDES):
+        if kind in (_REVOLUTE, _PRISMATIC):
             out[q], out[v] = _hermite(h, u, start[q], start[v], end[q], end[v])
-        elif kind == _FLOATS:
+        elif kind == _FREE:
             for i in range(3):
                 out[q + 4 + i], out[v + 3 + i] = _hermite(
                     h, u, start[q + 4 + i], start[v + 3 + i], end[q + 4 + i], end[v + 3 + i]
                 )
             a, b = _quaternion(start, q), _quaternion(end, q)
-            a_dot, b_dot = _rate(three(start, v), a), _rate(three(end, v), b)
+            a_dot, b_dot = _quaternion_rate(three(start, v), a), _quaternion_rate(three(end, v), b)
             w, w_dot = _hermite(h, u, a[0], a_dot[0], b[0], b_dot[0])
             x, x_dot = _hermite(h, u, a[1], a_dot[1], b[1], b_dot[1])
             y, y_dot = _hermite(h, u, a[2], a_dot[2], b[2], b_dot[2])

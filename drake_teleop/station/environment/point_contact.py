@@ -40,7 +40,7 @@ STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
 #: Number of columns of `Pairs.known` and `Pairs.watched`.
 WIDTH, WATCHED_WIDTH = 28, 40
 _STIFFNESS, _DISSIPATION = "point_contact_stiffness", "hunt_crossley_dissipation"
-_NO_SLIP = 1e-14  # m/s, as in Drake: a point at rest has a direction
+_MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class Pairs(NamedTuple):
@@ -53,8 +53,9 @@ class Pairs(NamedTuple):
             if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and dynamic
             friction, 26 slip at which it is complete [m/s], 27 the row of its body in a
             `JointTable`, or -1.
-        watched: (l, 40), bounding boxes of all other pairs, see `apart`. As above, with 0-2 the
-            centre of the tool's box, 3 unused; 28-36 R_SBox of that by rows, 37-39 half its edges.
+        watched: (l, 40), bounding boxes of all other pairs, see `separation`. As above, with 0-2
+            the centre of the tool's box, 3 unused; 28-36 R_SBox of that by rows, 37-39 half its
+            edges.
         unknown: reason for the first of the other pairs.
     """
 
@@ -92,27 +93,27 @@ def ContactPairs(
     for body in map(plant.get_body, touched):
         row = moving.index(int(body.index())) if int(body.index()) in moving else -1
         X_Body = plant.EvalBodyPoseInWorld(context, body) if row < 0 else RigidTransform()
-        direction = _direction(plant, context, body)
-        for thing in plant.GetCollisionGeometriesForBody(body):
+        direction = _motion_direction(plant, context, body)
+        for other in plant.GetCollisionGeometriesForBody(body):
             for own, X_SOwn in tool.items():
-                if inspector.CollisionFiltered(own, thing):
+                if inspector.CollisionFiltered(own, other):
                     continue
-                X_Thing = X_Body @ inspector.GetPoseInFrame(thing)
+                X_Other = X_Body @ inspector.GetPoseInFrame(other)
                 X_SShape = X_SOwn @ inspector.GetPoseInFrame(own)
                 try:
-                    sphere, edges = _sphere_and_box(inspector, own, thing)
-                    law = _law(*map(inspector.GetProximityProperties, (own, thing)))
+                    sphere, edges = _sphere_and_box(inspector, own, other)
+                    law = _contact_law(*map(inspector.GetProximityProperties, (own, other)))
                     half = np.array(edges.size()) / 2
                     place = [X_SShape.translation(), [sphere.radius()]]
-                    known.append(_row(place, X_Thing, half, [direction, law, [slip, row]]))
+                    known.append(_row(place, X_Other, half, [direction, law, [slip, row]]))
                 except DrakeTeleopError as beyond:
                     unknown = unknown or str(beyond)
-                    around, box = _around(inspector, own), _around(inspector, thing)
-                    X_SBox, X_Thing = X_SShape @ around.pose(), X_Thing @ box.pose()
+                    own_box, box = _bounding_box(inspector, own), _bounding_box(inspector, other)
+                    X_SBox, X_Other = X_SShape @ own_box.pose(), X_Other @ box.pose()
                     place = [X_SBox.translation(), [0.0]]
-                    turned = [X_SBox.rotation().matrix().ravel(), around.half_width()]
+                    turned = [X_SBox.rotation().matrix().ravel(), own_box.half_width()]
                     last = [direction, [0.0] * 4, [slip, row], *turned]
-                    watched.append(_row(place, X_Thing, box.half_width(), last))
+                    watched.append(_row(place, X_Other, box.half_width(), last))
     return Pairs(
         np.array(known).reshape(len(known), WIDTH),
         np.array(watched).reshape(len(watched), WATCHED_WIDTH),
@@ -120,13 +121,13 @@ def ContactPairs(
     )
 
 
-def _row(first: list[Any], X_Thing: RigidTransform, half: Array, last: list[Any]) -> Array:
+def _row(first: list[Any], X_Other: RigidTransform, half: Array, last: list[Any]) -> Array:
     return np.concatenate(
-        [*first, X_Thing.rotation().matrix().ravel(), X_Thing.translation(), half, *last]
+        [*first, X_Other.rotation().matrix().ravel(), X_Other.translation(), half, *last]
     )
 
 
-def _around(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
+def _bounding_box(inspector: SceneGraphInspector, shape: GeometryId) -> Obb:
     box = inspector.GetObbInGeometryFrame(shape)
     if box is None:
         raise DrakeTeleopError(
@@ -150,7 +151,7 @@ def _sphere_and_box(
     )
 
 
-def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
+def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
     """Return the body's velocity in W for a unit speed of its prismatic joint."""
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
     direction = np.zeros(3)
@@ -161,7 +162,7 @@ def _direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Arra
     return direction
 
 
-def _law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
+def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
     """Return k, d, static and dynamic friction of a pair, as in Drake.
 
     Springs are in series, dissipation is weighted by deformation, friction is the harmonic mean.
@@ -233,7 +234,7 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
 
 @njit(cache=True)
-def apart(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
+def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
     """Return a lower bound of the distance of two boxes [m], below 0 if they may touch.
 
     It is the largest gap along the edges of either (Gottschalk 1996, without the cross products).
@@ -291,7 +292,7 @@ def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: 
     for i in range(3):
         force[i] = velocity[i] - out * normal[i]
         speed += force[i] * force[i]
-    speed = np.sqrt(speed + _NO_SLIP * _NO_SLIP)
+    speed = np.sqrt(speed + _MIN_SLIP_SPEED * _MIN_SLIP_SPEED)
     mu = _friction(pair[24], pair[25], speed / pair[26])
     for i in range(3):
         force[i] = f_n * (normal[i] - mu * force[i] / speed)

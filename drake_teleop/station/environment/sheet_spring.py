@@ -19,13 +19,13 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.environment.environment import (
+    BodiesOfTool,
     Environment,
     ExcludeContact,
-    OnSensor,
     Stand,
 )
 
-_BENCH = 0.15  # from the lower face of the model's bench to the leaf [m]
+_BENCH_HEIGHT = 0.15  # from the lower face of the model's bench to the leaf [m]
 
 
 @settings
@@ -75,7 +75,7 @@ class SheetSpring(Environment):
     @property
     def stand(self) -> Stand:
         x, y, z = self.position
-        return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH)
+        return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
         AddSheetSpring(plant, self)
@@ -85,8 +85,8 @@ class SheetSpring(Environment):
     ) -> None:
         """Exclude contact of the leaf's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
-        on_sensor = OnSensor(plant, tool)
-        others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in on_sensor]
+        tool_bodies = BodiesOfTool(plant, tool)
+        others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
         shapes = plant.GetCollisionGeometriesForBody(leaf)
         ExcludeContact(plant, scene_graph, shapes, others)
 

@@ -97,7 +97,7 @@ class Slot(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        TouchAsSlot(plant, scene_graph, self, tool)
+        UseSlotMaterial(plant, scene_graph, self, tool)
 
 
 def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
@@ -121,7 +121,7 @@ def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
     return instance
 
 
-def TouchAsSlot(
+def UseSlotMaterial(
     plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot, tool: BodyIndex
 ) -> None:
     """Give the tool's balls the slot's material."""

@@ -13,7 +13,7 @@ from drake_teleop.common.quantities import quantity
 from drake_teleop.station.environment.box import AddFixedBox
 from drake_teleop.station.environment.surface import Surface
 
-_THICK = 0.1  # m; deep enough that a tool leaves through the face
+_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
 
 
 @settings
@@ -42,5 +42,5 @@ class Wall(Surface):
         """Add a box behind the face, with z along the normal."""
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
-        behind = RigidTransform([0.0, 0.0, -_THICK / 2])
-        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _THICK], self)
+        behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])
+        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _THICKNESS], self)

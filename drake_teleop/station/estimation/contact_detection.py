@@ -50,7 +50,7 @@ class ContactDetectionConfig:
 
 
 @njit(cache=True)
-def _detected(memory, sample, estimate, arm, settings):
+def _update_flag(memory, sample, estimate, arm, settings):
     """Update the detector with one sample and return its flag; a fault keeps the flag."""
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
@@ -105,13 +105,13 @@ class ContactDetection(LeafSystem):
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
         self._recovery = round(config.recovery / period)
-        self._blind = self.DeclareDiscreteState(1)  # remaining samples without detection
+        self._blind_samples = self.DeclareDiscreteState(1)  # remaining samples without detection
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
-        blind = discrete_state.get_mutable_value(self._blind)
+        blind = discrete_state.get_mutable_value(self._blind_samples)
         if sample[SATURATED] > 0.5:
             blind[0] = self._recovery
             return
@@ -121,4 +121,4 @@ class ContactDetection(LeafSystem):
         memory = discrete_state.get_mutable_value(self._memory)
         estimate = self._estimate.Eval(context)
         flag = discrete_state.get_mutable_value(self._flag)
-        flag[0] = _detected(memory, sample, estimate, self._arm, self._settings)
+        flag[0] = _update_flag(memory, sample, estimate, self._arm, self._settings)

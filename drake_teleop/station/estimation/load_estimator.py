@@ -29,7 +29,7 @@ from drake_teleop.load.online.watched import (
 from drake_teleop.load.regressor import SATURATED
 
 # Samples between two checks for settling.
-_CHECK = 16
+_CHECK_SAMPLES = 16
 
 
 @settings
@@ -139,7 +139,7 @@ class LoadEstimator(LeafSystem):
             change = change_parameters(
                 noise_std, motion_std, period, model_error=config.model_error
             )
-            self._watching = (
+            self._watch_arguments = (
                 np.zeros(10) if fallback is None else np.array(fallback, dtype=float),
                 period,
                 *change,
@@ -155,7 +155,9 @@ class LoadEstimator(LeafSystem):
         if self._state(discrete_state) == LEARNING:
             self._learn(estimate, sample, discrete_state, context.get_time())
         else:
-            watched_update(estimate, discrete_state.get_mutable_value(2), sample, *self._watching)
+            watched_update(
+                estimate, discrete_state.get_mutable_value(2), sample, *self._watch_arguments
+            )
 
     def _learn(
         self,
@@ -167,7 +169,7 @@ class LoadEstimator(LeafSystem):
         memory = discrete_state.get_mutable_value(1).reshape(self._shape)
         self._estimator.update_into(estimate, memory, sample)
         # The check for settling takes longer than the update.
-        due = self._watches and round(time / self._period) % _CHECK == 0
+        due = self._watches and round(time / self._period) % _CHECK_SAMPLES == 0
         if due and self._estimator.settled_at(estimate, memory):
             covariance = self._estimator.covariance_of(estimate, memory)
             discrete_state.set_value(2, watched_memory(estimate, covariance))

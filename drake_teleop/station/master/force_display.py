@@ -19,7 +19,7 @@ from drake_teleop.station.passivity.memory import Slots
 from drake_teleop.station.passivity.packet import limit
 from drake_teleop.station.passivity.safe_state import (
     MASTER_WATCH,
-    STOP,
+    STOP_TIME,
     initial_master_watch,
     master_limits_into,
 )
@@ -127,7 +127,7 @@ def _change(device, numbers, period, drive):
     fault = drive[_FAULT] != _NONE
     drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
     # All of the way within STOP, so that it does not turn at once either.
-    share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
+    share = 0.0 if fault else period / max(STOP_TIME + period - drive[_SOUND], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)

@@ -15,10 +15,10 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity import none
-from drake_teleop.station.passivity.memory import HELD, MOTION_SCALE, own_parameters
+from drake_teleop.station.passivity.memory import HELD_WRENCH, MOTION_SCALE, own_parameters
 from drake_teleop.station.passivity.packet import limit
 
-_OWN_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
+_LOCAL_LIMIT = own_parameters().vector(2)  # in the master's power units [N, N m]
 
 
 @settings
@@ -31,7 +31,7 @@ class ForceLimitConfig:
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
         """See `Methods`."""
-        p[_OWN_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
+        p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
@@ -39,8 +39,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """See `methods.master_step`."""
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
-        limit(wrench, g, p[_OWN_LIMIT][g])
-    put(memory, HELD.start, wrench, 0, 6)
+        limit(wrench, g, p[_LOCAL_LIMIT][g])
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
 
 
 @njit(cache=True)

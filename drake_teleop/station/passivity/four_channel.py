@@ -21,7 +21,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    HELD,
+    HELD_WRENCH,
     STIFFNESS,
     own_memory,
     own_parameters,
@@ -40,7 +40,7 @@ from drake_teleop.station.passivity.packet import (
 # Parameters; pairs are for translation and rotation.
 _places = own_parameters()
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
-_SLAVE, _HAND = _places.number(), _places.number()
+_SLAVE_FEEDBACK, _HAND_FEEDBACK = _places.number(), _places.number()
 _DIFFERENCE = own_memory().vector(6)
 
 
@@ -63,7 +63,7 @@ class FourChannelConfig:
     def pack_into(self, p: NDArray[np.float64]) -> None:
         """See `Methods`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
-        p[_SLAVE], p[_HAND] = self.slave_feedback, self.hand_feedback
+        p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
@@ -71,18 +71,18 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """Run one step of the master's end, which sends the hand's wrench."""
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
-    behind = arrived(received)
-    if behind:
+    connected = arrived(received)
+    if connected:
         difference_into(received[POSE], pose, difference)
     for i in range(6):
         g = i // 3
-        wrench[i] = (1.0 + p[_HAND]) * received[WRENCH][i] + p[_HAND] * hand[i]
-        if behind:
+        wrench[i] = (1.0 + p[_HAND_FEEDBACK]) * received[WRENCH][i] + p[_HAND_FEEDBACK] * hand[i]
+        if connected:
             wrench[i] += p[_SPRING][g] * difference[i]
             wrench[i] += p[_DAMPER][g] * (received[VELOCITY][i] - twist[i])
     for g in range(2):
         limit(wrench, g, limits[g])
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, hand, packet)
 
 
@@ -93,10 +93,12 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         shift = memory[_DIFFERENCE]
         for i in range(6):
             g = i // 3
-            force = (1.0 + p[_SLAVE]) * received[WRENCH][i] + p[_SLAVE] * wrench[i]
+            force = (1.0 + p[_SLAVE_FEEDBACK]) * received[WRENCH][i] + p[_SLAVE_FEEDBACK] * wrench[
+                i
+            ]
             shift[i] = (force + p[DAMPING][g] * received[VELOCITY][i]) / p[STIFFNESS][g]
         moved_into(received[POSE], shift, memory[COMMAND_POSE])
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)

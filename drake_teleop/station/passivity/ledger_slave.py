@@ -9,17 +9,22 @@ import math
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.contact_fit import SUMS, fit, slipped, steadied
+from drake_teleop.station.passivity.contact_fit import (
+    NUM_SUMS,
+    slip_change,
+    smooth_slip,
+    update_fit,
+)
 from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    HELD,
+    HELD_WRENCH,
     LEDGER,
+    LOAD_WRENCH,
     LOST,
     MASS,
-    OF_LOAD,
     RECEIVED,
     SENT,
     STEPS,
@@ -45,418 +50,425 @@ from drake_teleop.station.passivity.packet import (
     scale,
 )
 
-# Of translation and rotation: a length is an angle at an arm of 0.1 m, a force a torque at the
-# lever of 0.01 m that haptic devices have. What is touched is known along one wrench of force and
-# torque together, where a torque counts as a force at the same arm: at the slave, so in the
-# master's power units it depends on the scales of both.
-ARM, LEVER = (1.0, 10.0), (1.0, 0.01)
-MARGIN = 0.03  #: of the slave's reserve: never spent; more than what a step can cost
-_KEPT = 0.1  # of that reserve, in contact, however short the hand's end is
-PASSED = 0.7  #: share of the slave's reserve that the hand's end may have in contact
+# docs/theory.md, "The energy ledger", lists the purpose of each constant.
+#: Of translation and rotation: angle for a length, torque for a force.
+ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
+MARGIN = 0.03  #: share of the slave's reserve that is never used
+SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
+_MIN_KEPT_RESERVE = 0.1
+_STIFFNESS_FACTOR, _DAMPING_FACTOR, MASS_FACTOR = 1.15, 0.9, 1.05
+_CAPACITY = 4.0  # over the reserve
+_FILTER_S = 3e-3
+_REST_SPEED = 0.05  # m/s
+_REST_SEND_RATE, _SEND_RATE = 5.0, 50.0  # 1/s
+_MAXIMUM_DECAY_S = 5.0
+_MIN_DISPLAYED_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 300.0, 1200.0  # N/m
+_PRESS_SPEED = 0.06  # m/s
+_STRETCH_M, _FAST_STRETCH_M = 2e-4, 2e-3
+_MIN_FIT_M, _MAX_FIT_M = 1e-3, 1e-2
+_FAST_SPEED = 0.15  # m/s
+_SHARE_FILTER_S, _SHARE_DEADBAND = 0.02, 0.1
+_REMOVAL_FORCE_N = 0.3
+_DIRECTION_FILTER_S = 3.0
+_SLIP_FADE_S, _FRICTION_MEMORY_S = 0.6, 1.0
+_GAIN_RISE_S, _MAX_GAIN, _GAIN_FALL_S = 0.5, 10.0, 1.0
+_COMMAND_FILTER_S, _MAX_ACCELERATION, _BRAKING_FACTOR = 0.01, 30.0, 0.7  # s, m/s^2, 1
+_FEEDFORWARD_S = 0.02
+_SILENCE_ROUND_TRIPS, _MAX_SILENCE_S = 0.5, 0.06
+_HORIZON_S = 4e-3
+_FREE_FORCE_N = 5.0
+_STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
-# What servo and mass are taken for, over what was configured: so errors of 20 % brake, and do not
-# push.
-_STIFF, _DAMPED, HEAVY = 1.15, 0.9, 1.05
-_CAPACITY = 4.0  # of the reserve: what is above is lost, or limit cycles would live on it
-_FILTER = 3e-3  # s, of velocity, wrench and way: encoders have steps
-_CALM, _CALM_RATE, _RATE = 0.05, 5.0, 50.0  # m/s, at rest; 1/s in which surplus goes, there and not
-_FORGET = 5.0  # s, of the largest round trip
-_SHOWN, _PRESS = 300.0, 0.06  # k_0 [N/m]; v_p, of a hand that presses [m/s]
-_STRETCH, _LONG = 2e-4, 2e-3  # m, way for a stiffness; likewise in fast motion
-_LEARN, _KNOWN = 1e-3, 1e-2  # m, way that a stiffness is the mean of at least, and at most
-_SLOW = 0.15  # m/s; an impact's wrench says less of the stiffness
-_SMOOTH = 0.02  # s, of the wall's place and of rho
-_FALLS = 0.3  # N, felt: from this on, what ends within a step may be a wall that goes
-_SURE = 0.1  # of rho, by which it is not changed: it moves the slave, which changes k
-_DIRECTION = 3.0  # s, of the contact's direction at least: a tip that sticks and slips turns it
-_TILTED, _RUBBED = 0.6, 1.0  # s, in which friction's step along n is shown; of the largest one
-# s and c, of a hand that stays; s, in which c falls: faster than the news it hunts
-_SETTLED, _TIMES, _TIRED = 0.5, 10.0, 1.0
-_STIFFEST = 1200.0  # N/m, of its k_d
-_FOLLOW = 0.01  # s, of the command's generator
-_FASTER = 30.0  # m/s^2, its acceleration
-_STOPPING = 0.7  # of the speed from which that acceleration stops in time
-_NEWS = 0.02  # s without a packet, after which the hand's velocity is not fed forward any more
-_SHORT, _LONGER = 0.5, 0.06  # of the round trip; s: a silence that is little to what is late
-_HORIZON = 4e-3  # s, in which the motors may spend what there is
-_UNPAID = 5.0  # N, what the slave may press a wall with though nobody has paid
-_STILL = 2e-3  # m/s, at rest: standing costs nothing
-_DECELERATION = 20.0  # m/s^2, of the brake when nothing is left
-
-# In the packet: stiffness k_c, damping b and round trip (slave's), number of the newest packet
-# (master's), ledger.
-CONTACT_STIFFNESS, CONTACT_DAMPING, TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
-LEVEL = OTHER_ENERGY
+# In the packet of the slave: k_c, b and round trip. Of both: ledger. Of the master: newest packet.
+CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
+LEDGER_LEVEL = OTHER_ENERGY
 ECHO = INTEGRAL.stop - 1
 
 # Parameters, in the master's power units.
 _places = own_parameters()
-INITIAL, RESERVE, HAND_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
-DRAG, TOUCH = _places.vector(2), _places.vector(2)
-METRIC = _places.vector(2)  #: of wrenches: what a squared force counts, and a squared torque
-# Memory: filtered velocity; whether something is touched; the servo's model; the motors' pull.
+INITIAL, SLAVE_RESERVE, MASTER_RESERVE = _places.vector(2), _places.vector(2), _places.vector(2)
+DRAG, CONTACT_THRESHOLD = _places.vector(2), _places.vector(2)
+METRIC = _places.vector(2)  #: weights of squared force and squared torque in the norm of a wrench
+# Memory. Filtered velocity; whether in contact; mean contact wrench and its direction; servo model.
 _places = own_memory()
-VELOCITY_HERE, TOUCHED = _places.vector(6), _places.number()
-#: What the contact pushes with, smoothed: its direction is the contact's.
-PUSHED, NORMAL = _places.vector(6), _places.vector(6)
-MODEL, _MODEL_TWIST, _PULL = _places.vector(7), _places.vector(6), _places.vector(6)
-_ACCOUNT, _PAID = _places.vector(2), _places.vector(2)  # A, Q
-# k, b; rho and where it goes to, c less 1, how deep the slave is in the wall.
-_STIFFNESS, _DAMPER = _places.number(), _places.number()
-_SHARE, _GOAL, _STAYED, _INSIDE = (_places.number() for _ in range(4))
-# Of the search for k and b: wrench filtered, it and the speed at the anchor; way since then, how
-# far that is behind; way since the onset; the fit's sums.
-_SMOOTHED, _ANCHOR, _FAST = (_places.number() for _ in range(3))
-_WAY, _BEHIND, _LEARNT, _SUMS = *(_places.number() for _ in range(3)), _places.vector(SUMS)
-# Time without packets and the longest such, the largest round trip, the period [s].
-_SILENT, _GAP, _ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
-# The contact's wrench; the load's, smoothed.
-_CONTACT, _WEIGHT = _places.vector(6), _places.vector(6)
-# What is shown along n; the last speed into it; the largest friction.
-_PUSH, _BEFORE, _ACROSS = (_places.number() for _ in range(3))
+OWN_VELOCITY, IN_CONTACT = _places.vector(6), _places.number()
+MEAN_WRENCH, NORMAL = _places.vector(6), _places.vector(6)
+SERVO_MODEL, _SERVO_MODEL_TWIST = _places.vector(7), _places.vector(6)
+_MOTOR_WRENCH = _places.vector(6)
+_BALANCE, _CONTACT_INPUT = _places.vector(2), _places.vector(2)  # A, Q
+# k, b; rho and its goal, c - 1, depth of the slave in the wall.
+_CONTACT_STIFFNESS, _CONTACT_DAMPING = _places.number(), _places.number()
+_DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _WALL_DEPTH = (_places.number() for _ in range(4))
+# Fit of k and b: filtered force; force and speed at the start of the stretch; its length and the
+# lag of its filter; length of the fit and its sums.
+_FILTERED_FORCE, _STRETCH_FORCE, _STRETCH_SPEED = (_places.number() for _ in range(3))
+_STRETCH_LENGTH, _FILTER_LAG, _FIT_LENGTH = (_places.number() for _ in range(3))
+_FIT_SUMS = _places.vector(NUM_SUMS)
+# Present and longest time without packets, longest round trip, period [s].
+_SILENCE, _LONGEST_SILENCE, _LONGEST_ROUND_TRIP, _PERIOD = (_places.number() for _ in range(4))
+_CONTACT_WRENCH, _LOAD = _places.vector(6), _places.vector(6)
+# Rendered force along n; last speed into the wall; largest friction.
+_DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(3))
 
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    velocity = memory[VELOCITY_HERE]
+    velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
 
 
 @njit(cache=True)
-def touches(wrench, p):
+def is_contact(wrench, p):
     """Return whether a wrench exceeds the contact threshold."""
-    return length(wrench, 0) > p[TOUCH][0] or length(wrench, 1) > p[TOUCH][1]
+    threshold = p[CONTACT_THRESHOLD]
+    return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
 
 @njit(cache=True)
-def along(a, b, p):
+def component_along(a, b, p):
     """Return the component of the wrench `a` along the unit wrench `b` [N]."""
     return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
 
 
 @njit(cache=True)
-def over_way(wrench, way):
+def work_along(wrench, displacement):
     """Return the work of a wrench over a displacement; for a unit wrench the component [m]."""
-    return dot(wrench, way, 0) + dot(wrench, way, 1)
+    return dot(wrench, displacement, 0) + dot(wrench, displacement, 1)
 
 
 @njit(cache=True)
-def find_direction(wrench, trip, T, p, memory):
+def find_direction(wrench, round_trip, T, p, memory):
     """Update the contact's direction, a unit wrench, and return the component along it [N].
 
     A much larger wrench or the opposite direction is a new contact and replaces the mean at once.
     """
-    pushed, normal = memory[PUSHED], memory[NORMAL]
+    mean, normal = memory[MEAN_WRENCH], memory[NORMAL]
     rate = 1.0
-    if memory[TOUCHED] > 0.0:
-        # What is far more than was there, noise say, is found at once.
-        more = 1.0 - 3.0 * math.sqrt(
-            along(pushed, pushed, p) / max(along(wrench, wrench, p), 1e-300)
-        )
-        rate = max(min(T / max(_DIRECTION, 2.0 * trip), 1.0), more)
-        if not along(wrench, pushed, p) > 0.0:  # another contact
+    if memory[IN_CONTACT] > 0.0:
+        # A wrench far above the mean, which may be noise, replaces it at once.
+        square = max(component_along(wrench, wrench, p), 1e-300)
+        jump = 1.0 - 3.0 * math.sqrt(component_along(mean, mean, p) / square)
+        rate = max(min(T / max(_DIRECTION_FILTER_S, 2.0 * round_trip), 1.0), jump)
+        if not component_along(wrench, mean, p) > 0.0:  # another contact
             rate = 1.0
     for i in range(6):
-        pushed[i] += rate * (wrench[i] - pushed[i])
-    size = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
+        mean[i] += rate * (wrench[i] - mean[i])
+    size = max(math.sqrt(component_along(mean, mean, p)), 1e-12)
     for i in range(6):
-        normal[i] = pushed[i] / size
-    return along(wrench, normal, p)
+        normal[i] = mean[i] / size
+    return component_along(wrench, normal, p)
 
 
 @njit(cache=True)
 def receive(g, received, memory):
     """Add newly received energy to the ledger of group `g` and return it."""
-    more = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
-    memory[LEDGER][g] += more
-    memory[RECEIVED][g] += more
-    return more
+    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    memory[LEDGER][g] += new
+    memory[RECEIVED][g] += new
+    return new
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
-    gap, now, going = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
-    heard = arrived(received)
+    error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
+    connected = arrived(received)
     memory[_PERIOD] = T
-    memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
-    silence = memory[_SILENT] if heard else 0.0
-    memory[_GAP] = max(memory[_GAP] * (1.0 - T / _FORGET), silence)
-    trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if heard else 0.0
-    memory[_ROUND_TRIP] = max(memory[_ROUND_TRIP] * (1.0 - T / _FORGET), trip)
-    smooth_velocity(twist, min(T / _FILTER, 1.0), memory)
-    contact, load, weight = memory[_CONTACT], memory[OF_LOAD], memory[_WEIGHT]
+    memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
+    silence = memory[_SILENCE] if connected else 0.0
+    kept = 1.0 - T / _MAXIMUM_DECAY_S
+    memory[_LONGEST_SILENCE] = max(memory[_LONGEST_SILENCE] * kept, silence)
+    trip = max((memory[STEPS] - received[ECHO]) * T, 0.0) if connected else 0.0
+    memory[_LONGEST_ROUND_TRIP] = max(memory[_LONGEST_ROUND_TRIP] * kept, trip)
+    smooth_velocity(twist, min(T / _FILTER_S, 1.0), memory)
+    contact, load, filtered_load = memory[_CONTACT_WRENCH], memory[LOAD_WRENCH], memory[_LOAD]
     for i in range(6):
         contact[i] = wrench[i] - load[i]
-    touched = touches(contact, p)
-    late = memory[_ROUND_TRIP] + _lag(p)
-    share = min(T / late, 1.0) if memory[STEPS] > 0.0 else 1.0
+    in_contact = is_contact(contact, p)
+    delay = memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)
+    share = min(T / delay, 1.0) if memory[STEPS] > 0.0 else 1.0
     for i in range(6):
-        weight[i] += share * (load[i] - weight[i])
+        filtered_load[i] += share * (load[i] - filtered_load[i])
     for g in range(2):
-        _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory)
-    _learn(received, touched, dx, contact, T, p, memory)
-    put(memory, HELD.start, wrench, 0, 6)
-    gap[:] = 0.0
-    if heard:
-        difference_into(received[POSE], now, gap)
-    difference_into(now, pose, memory[_PULL])
-    _generate(received, heard, T, p, memory, gap)
+        _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory)
+    _identify_contact(received, in_contact, dx, contact, T, p, memory)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
+    error[:] = 0.0
+    if connected:
+        difference_into(received[POSE], now, error)
+    difference_into(now, pose, memory[_MOTOR_WRENCH])
+    _generate_command(received, connected, T, p, memory, error)
     for i in range(6):
-        gap[i] = T * going[i]
-    moved_into(now, gap, now)
-    _clamp(now, pose, twist, p, memory)
-    _model(received, heard, T, p, memory, gap)
+        error[i] = T * velocity[i]
+    moved_into(now, error, now)
+    _limit_motor_energy(now, pose, twist, p, memory)
+    _step_servo_model(received, connected, T, p, memory, error)
     put(command, 0, memory, COMMAND.start, 13)
-    fill(memory[MODEL], memory[_MODEL_TWIST], contact, packet)
-    if memory[TOUCHED] > 0.0:
-        instead = memory[_PUSH] - along(contact, memory[NORMAL], p)
+    fill(memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST], contact, packet)
+    if memory[IN_CONTACT] > 0.0:
+        correction = memory[_DISPLAYED_FORCE] - component_along(contact, memory[NORMAL], p)
         for i in range(6):
-            packet[WRENCH][i] += instead * memory[NORMAL][i]
-    put(packet, LOAD.start, weight, 0, 6)
-    k, yields = memory[_STIFFNESS], 0.0
+            packet[WRENCH][i] += correction * memory[NORMAL][i]
+    put(packet, LOAD.start, filtered_load, 0, 6)
+    k, compliance = memory[_CONTACT_STIFFNESS], 0.0
     for g in range(2):
         size = length(memory[NORMAL], g)
-        yields += size * size / (_STIFF * p[STIFFNESS][g])
+        compliance += size * size / (_STIFFNESS_FACTOR * p[STIFFNESS][g])
         packet[ENERGY][g] = memory[SENT][g]
-        packet[LEVEL][g] = memory[LEDGER][g] - memory[RECEIVED][g]
-    packet[CONTACT_DAMPING], packet[TRIP] = memory[_DAMPER], memory[_ROUND_TRIP]
-    packet[CONTACT_STIFFNESS] = memory[_SHARE] * k / (1.0 + k * yields)
+        packet[LEDGER_LEVEL][g] = memory[LEDGER][g] - memory[RECEIVED][g]
+    packet[CONTACT_DAMPING] = memory[_CONTACT_DAMPING]
+    packet[ROUND_TRIP] = memory[_LONGEST_ROUND_TRIP]
+    packet[CONTACT_STIFFNESS] = memory[_DISPLAYED_SHARE] * k / (1.0 + k * compliance)
 
 
 @njit(cache=True)
-def _account_of_slave(g, received, heard, touched, twist, dx, wrench, T, p, memory):
+def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
     """Update the slave's ledger and return surplus energy (S1, S2)."""
-    # The wrench went from the last one to this one: of both works the smaller is credited.
-    work = min(dot(wrench, dx, g), dot(memory[HELD], dx, g))
-    more = receive(g, received, memory)
-    ledger, paid, reserve = memory[LEDGER], memory[_PAID], p[RESERVE][g]
+    # The wrench between two samples is unknown: the smaller of both works is credited.
+    work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
+    new = receive(g, received, memory)
+    ledger, input_energy, reserve = memory[LEDGER], memory[_CONTACT_INPUT], p[SLAVE_RESERVE][g]
     ledger[g] += work
-    paid[g] = (paid[g] + work if touched else 0.0) + more
+    input_energy[g] = (input_energy[g] + work if in_contact else 0.0) + new
     speed = length(twist, g)
-    moving = 0.5 * HEAVY * p[MASS][g] * speed * speed
-    # At rest in contact energy is needed to push the hand back, else for speed.
-    keep, hold, rate = reserve, p[HAND_RESERVE][g], _RATE
-    free, short, give = ledger[g] - moving, hold - received[LEVEL][g], 0.0
-    needed = short
-    if touched and speed < _CALM * ARM[g]:
-        keep, rate = (1.0 - PASSED) * reserve, _CALM_RATE
-        needed += PASSED * reserve
-        give = min(free - _KEPT * reserve, short)
-    give = max(give, min(free - keep, needed), 0.0) * min(T * rate, 1.0) if heard else 0.0
-    lost = max(ledger[g] - give - _CAPACITY * reserve, 0.0)
-    memory[SENT][g] += give
+    kinetic = 0.5 * MASS_FACTOR * p[MASS][g] * speed * speed
+    # At rest in contact the hand needs the energy, otherwise motion needs it.
+    keep, hold, rate = reserve, p[MASTER_RESERVE][g], _SEND_RATE
+    free, missing, returned = ledger[g] - kinetic, hold - received[LEDGER_LEVEL][g], 0.0
+    needed = missing
+    if in_contact and speed < _REST_SPEED * ANGLE_PER_LENGTH[g]:
+        keep, rate = (1.0 - SHARED_RESERVE) * reserve, _REST_SEND_RATE
+        needed += SHARED_RESERVE * reserve
+        returned = min(free - _MIN_KEPT_RESERVE * reserve, missing)
+    returned = max(returned, min(free - keep, needed), 0.0) * min(T * rate, 1.0)
+    returned = returned if connected else 0.0
+    lost = max(ledger[g] - returned - _CAPACITY * reserve, 0.0)
+    memory[SENT][g] += returned
     memory[LOST][g] += lost
-    ledger[g] -= give + lost
-    memory[_ACCOUNT][g] = ledger[g] - moving
+    ledger[g] -= returned + lost
+    memory[_BALANCE][g] = ledger[g] - kinetic
 
 
 @njit(cache=True)
-def _lag(p):
+def _servo_lag(p):
     """Return the servo's delay [s]."""
     return 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])
 
 
 @njit(cache=True)
-def _shown_at_most(received, T, p, memory):
+def _max_displayed_stiffness(received, T, p, memory):
     """Return the largest displayed stiffness k_d (S3) [N/m]."""
-    normal, paid = memory[NORMAL], 0.0
-    depth, first = _PRESS * (memory[_ROUND_TRIP] + _lag(p)), math.inf
+    normal, fill_level = memory[NORMAL], 0.0
+    depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
-        part, reserve = ARM[g] * length(normal, g) * depth, p[HAND_RESERVE][g]
-        first = min(first, 2.0 * reserve / max(part * part, 1e-300))
-        there = min(max(received[LEVEL][g] / reserve, 0.0), 1.0)
-        paid += p[METRIC][g] * dot(normal, normal, g) * there
-    quiet = min(max(_NEWS, _SHORT * memory[_ROUND_TRIP]), _LONGER)
-    if memory[TOUCHED] == 0.0 or memory[_GAP] >= quiet:
-        memory[_STAYED] = 0.0
+        travel, reserve = ANGLE_PER_LENGTH[g] * length(normal, g) * depth, p[MASTER_RESERVE][g]
+        base = min(base, 2.0 * reserve / max(travel * travel, 1e-300))
+        level = min(max(received[LEDGER_LEVEL][g] / reserve, 0.0), 1.0)
+        fill_level += p[METRIC][g] * dot(normal, normal, g) * level
+    max_silence = max(_FEEDFORWARD_S, _SILENCE_ROUND_TRIPS * memory[_LONGEST_ROUND_TRIP])
+    max_silence = min(max_silence, _MAX_SILENCE_S)
+    if memory[IN_CONTACT] == 0.0 or memory[_LONGEST_SILENCE] >= max_silence:
+        memory[_EXTRA_GAIN] = 0.0
     else:
-        more = (_TIMES - 1.0) * paid - memory[_STAYED]
-        memory[_STAYED] += T / (_SETTLED if more > 0.0 else _TIRED) * more
-    return max(_SHOWN, first, min((1.0 + memory[_STAYED]) * first, _STIFFEST))
+        change = (_MAX_GAIN - 1.0) * fill_level - memory[_EXTRA_GAIN]
+        memory[_EXTRA_GAIN] += T / (_GAIN_RISE_S if change > 0.0 else _GAIN_FALL_S) * change
+    increased = min((1.0 + memory[_EXTRA_GAIN]) * base, _MAX_DISPLAYED_STIFFNESS)
+    return max(_MIN_DISPLAYED_STIFFNESS, base, increased)
 
 
 @njit(cache=True)
-def _learn(received, touched, dx, wrench, T, p, memory):
+def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
     """Identify direction, stiffness, damping, displayed share and depth of the contact (S3)."""
-    normal, k, velocity = memory[NORMAL], memory[_STIFFNESS], memory[VELOCITY_HERE]
-    if not touched:
-        if memory[TOUCHED] > 0.0 and _goes(dx, memory):
-            memory[_SHARE] = 0.0
-        memory[TOUCHED] = memory[_SMOOTHED] = memory[_ACROSS] = 0.0
+    normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
+    if not in_contact:
+        if memory[IN_CONTACT] > 0.0 and _wall_is_removed(dx, memory):
+            memory[_DISPLAYED_SHARE] = 0.0
+        memory[IN_CONTACT] = memory[_FILTERED_FORCE] = memory[_MAX_FRICTION] = 0.0
         return
-    size = find_direction(wrench, memory[_ROUND_TRIP], T, p, memory)
-    most = _shown_at_most(received, T, p, memory)
-    turned = _turns(wrench, size, T, p, memory)
-    inward, rate = -over_way(normal, dx), min(T / _FILTER, 1.0)
-    speed = -over_way(normal, velocity)
-    if memory[_SMOOTHED] == 0.0:
-        # From the first sample in contact: on the way to it a part was outside.
-        memory[_SMOOTHED] = memory[_ANCHOR] = memory[_PUSH] = size
-        memory[_BEHIND] = inward
-        memory[_FAST] = memory[_BEFORE] = speed
-        memory[_WAY] = memory[_LEARNT] = 0.0
-        memory[_SHARE] = memory[_GOAL] = most / max(k, most)
-    follows = rate * (inward - memory[_BEHIND])
-    memory[_BEHIND] += follows - inward
-    memory[_WAY] += follows
-    memory[_SMOOTHED] += rate * (size - memory[_SMOOTHED])
-    fastest = math.hypot(length(velocity, 0), length(velocity, 1) / ARM[1])
-    slow, far = fastest < _SLOW, abs(memory[_WAY])
-    if far > (_STRETCH if slow else _LONG):
-        memory[_LEARNT] = min(memory[_LEARNT] + far, _KNOWN)
-        keep = max(1.0 - far / max(memory[_LEARNT], _LEARN), 0.0) if slow else 0.5
-        faster = speed - memory[_FAST]
-        more = memory[_SMOOTHED] - memory[_ANCHOR] - memory[_DAMPER] * faster
-        more -= slipped(more, max(2.0 * k, _SHOWN) * memory[_WAY], turned)
-        more += memory[_DAMPER] * faster
-        k, damper = fit(memory[_SUMS], more, memory[_WAY], faster, keep)
-        memory[_STIFFNESS], memory[_DAMPER] = k, damper
-        memory[_WAY], memory[_ANCHOR], memory[_FAST] = 0.0, memory[_SMOOTHED], speed
-    if k > 1.0:  # N/m: something is known
-        rate, goal = min(T / _SMOOTH, 1.0), most / max(k, most)
-        if abs(goal - memory[_GOAL]) > _SURE * memory[_GOAL]:
-            memory[_GOAL] = goal
-        memory[_SHARE] += rate * (memory[_GOAL] - memory[_SHARE])
-        deep = max(size - memory[_DAMPER] * speed, 0.0) / k
-        if memory[TOUCHED] == 0.0:
-            memory[_INSIDE] = deep
-        memory[_INSIDE] += inward + rate * (deep - memory[_INSIDE] - inward)
-        memory[TOUCHED] = 1.0
-    explained = memory[_STIFFNESS] * inward + memory[_DAMPER] * (speed - memory[_BEFORE])
-    rate = T / _TILTED + abs(inward) / _LEARN
-    memory[_PUSH] = steadied(memory[_PUSH], size, explained, rate, turned)
-    memory[_BEFORE] = speed
+    size = find_direction(wrench, memory[_LONGEST_ROUND_TRIP], T, p, memory)
+    k_d = _max_displayed_stiffness(received, T, p, memory)
+    max_slip = _max_slip_change(wrench, size, T, p, memory)
+    inward, rate = -work_along(normal, dx), min(T / _FILTER_S, 1.0)
+    speed = -work_along(normal, velocity)
+    if memory[_FILTERED_FORCE] == 0.0:
+        # Start at the first sample in contact, because the step to it was partly outside.
+        memory[_FILTERED_FORCE] = memory[_STRETCH_FORCE] = memory[_DISPLAYED_FORCE] = size
+        memory[_FILTER_LAG] = inward
+        memory[_STRETCH_SPEED] = memory[_LAST_SPEED] = speed
+        memory[_STRETCH_LENGTH] = memory[_FIT_LENGTH] = 0.0
+        memory[_DISPLAYED_SHARE] = memory[_SHARE_GOAL] = k_d / max(k, k_d)
+    filtered_step = rate * (inward - memory[_FILTER_LAG])
+    memory[_FILTER_LAG] += filtered_step - inward
+    memory[_STRETCH_LENGTH] += filtered_step
+    memory[_FILTERED_FORCE] += rate * (size - memory[_FILTERED_FORCE])
+    fastest = math.hypot(length(velocity, 0), length(velocity, 1) / ANGLE_PER_LENGTH[1])
+    slow, length_m = fastest < _FAST_SPEED, abs(memory[_STRETCH_LENGTH])
+    if length_m > (_STRETCH_M if slow else _FAST_STRETCH_M):
+        memory[_FIT_LENGTH] = min(memory[_FIT_LENGTH] + length_m, _MAX_FIT_M)
+        keep = max(1.0 - length_m / max(memory[_FIT_LENGTH], _MIN_FIT_M), 0.0) if slow else 0.5
+        speed_change = speed - memory[_STRETCH_SPEED]
+        stretch, damping = memory[_STRETCH_LENGTH], memory[_CONTACT_DAMPING]
+        change = memory[_FILTERED_FORCE] - memory[_STRETCH_FORCE] - damping * speed_change
+        change -= slip_change(change, max(2.0 * k, _MIN_DISPLAYED_STIFFNESS) * stretch, max_slip)
+        change += damping * speed_change
+        k, damping = update_fit(memory[_FIT_SUMS], change, stretch, speed_change, keep)
+        memory[_CONTACT_STIFFNESS], memory[_CONTACT_DAMPING] = k, damping
+        memory[_STRETCH_LENGTH], memory[_STRETCH_FORCE] = 0.0, memory[_FILTERED_FORCE]
+        memory[_STRETCH_SPEED] = speed
+    if k > 1.0:  # N/m
+        rate, goal = min(T / _SHARE_FILTER_S, 1.0), k_d / max(k, k_d)
+        if abs(goal - memory[_SHARE_GOAL]) > _SHARE_DEADBAND * memory[_SHARE_GOAL]:
+            memory[_SHARE_GOAL] = goal
+        memory[_DISPLAYED_SHARE] += rate * (memory[_SHARE_GOAL] - memory[_DISPLAYED_SHARE])
+        depth = max(size - memory[_CONTACT_DAMPING] * speed, 0.0) / k
+        if memory[IN_CONTACT] == 0.0:
+            memory[_WALL_DEPTH] = depth
+        memory[_WALL_DEPTH] += inward + rate * (depth - memory[_WALL_DEPTH] - inward)
+        memory[IN_CONTACT] = 1.0
+    explained = memory[_CONTACT_STIFFNESS] * inward
+    explained += memory[_CONTACT_DAMPING] * (speed - memory[_LAST_SPEED])
+    rate = T / _SLIP_FADE_S + abs(inward) / _MIN_FIT_M
+    shown = smooth_slip(memory[_DISPLAYED_FORCE], size, explained, rate, max_slip)
+    memory[_DISPLAYED_FORCE] = shown
+    memory[_LAST_SPEED] = speed
 
 
 @njit(cache=True)
-def _goes(dx, memory):
+def _wall_is_removed(dx, memory):
     """Return whether the contact ended with the step `dx` because the wall was removed (S6)."""
     normal = memory[NORMAL]
-    faster = over_way(normal, memory[VELOCITY_HERE]) + memory[_BEFORE]
-    explained = abs(memory[_STIFFNESS] * over_way(normal, dx)) + abs(memory[_DAMPER] * faster)
-    return memory[_PUSH] > max(_FALLS, 2.0 * explained)
+    speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_SPEED]
+    explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
+    explained += abs(memory[_CONTACT_DAMPING] * speed_change)
+    return memory[_DISPLAYED_FORCE] > max(_REMOVAL_FORCE_N, 2.0 * explained)
 
 
 @njit(cache=True)
-def _turns(wrench, size, T, p, memory):
+def _max_slip_change(wrench, size, T, p, memory):
     """Return f^2 / |w| of S3: the largest change along n that a slip can cause [N]."""
-    pushed = memory[PUSHED]
-    mean = max(math.sqrt(along(pushed, pushed, p)), 1e-12)
-    rubs = math.sqrt(max(along(wrench, wrench, p) - size * size, 0.0))
-    memory[_ACROSS] = max(memory[_ACROSS] * (1.0 - min(T / _RUBBED, 1.0)), rubs)
-    return memory[_ACROSS] * min(memory[_ACROSS] / mean, 1.0)
+    mean_wrench = memory[MEAN_WRENCH]
+    mean = max(math.sqrt(component_along(mean_wrench, mean_wrench, p)), 1e-12)
+    friction = math.sqrt(max(component_along(wrench, wrench, p) - size * size, 0.0))
+    largest = max(memory[_MAX_FRICTION] * (1.0 - min(T / _FRICTION_MEMORY_S, 1.0)), friction)
+    memory[_MAX_FRICTION] = largest
+    return largest * min(largest / mean, 1.0)
 
 
 @njit(cache=True)
-def _generate(received, heard, T, p, memory, gap):
+def _generate_command(received, connected, T, p, memory, error):
     """Compute the command's velocity (S3, S4).
 
-    `gap` contains the pose difference from the command to the received pose and is overwritten.
+    `error` contains the pose difference from the command to the received pose and is overwritten.
     """
-    going, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
-    yields, over, fast = 0.0, 0.0, 0.0
-    if memory[TOUCHED] > 0.0:
-        over = memory[_INSIDE] - over_way(normal, gap) - over_way(normal, memory[_PULL])
-        if over > 0.0:
-            yields, fast = 1.0 - memory[_SHARE], -over_way(normal, feed)
-    feeds = heard and memory[_SILENT] < _NEWS
+    velocity, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
+    compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
+    if memory[IN_CONTACT] > 0.0:
+        beyond_wall = memory[_WALL_DEPTH] - work_along(normal, error)
+        beyond_wall -= work_along(normal, memory[_MOTOR_WRENCH])
+        if beyond_wall > 0.0:
+            compliance, inward_speed = 1.0 - memory[_DISPLAYED_SHARE], -work_along(normal, feed)
+    feeds_forward = connected and memory[_SILENCE] < _FEEDFORWARD_S
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
-            gap[i] += yields * over * p[METRIC][g] * normal[i]
-        away, most = length(gap, g), _FASTER * ARM[g]
-        rate = 1.0 / _FOLLOW
-        if away > 0.0:
-            rate = min(rate, _STOPPING * math.sqrt(2.0 * most / away))
+            error[i] += compliance * beyond_wall * p[METRIC][g] * normal[i]
+        distance, acceleration = length(error, g), _MAX_ACCELERATION * ANGLE_PER_LENGTH[g]
+        rate = 1.0 / _COMMAND_FILTER_S
+        if distance > 0.0:
+            rate = min(rate, _BRAKING_FACTOR * math.sqrt(2.0 * acceleration / distance))
         for i in range(3 * g, 3 * g + 3):
-            gap[i] *= rate
-            if feeds:
-                gap[i] += feed[i] + yields * fast * p[METRIC][g] * normal[i]
-        left = max(memory[LEDGER][g] - MARGIN * p[RESERVE][g], 0.0)
-        limit(gap, g, math.sqrt(2.0 * left / (HEAVY * p[MASS][g])))
+            error[i] *= rate
+            if feeds_forward:
+                error[i] += feed[i] + compliance * inward_speed * p[METRIC][g] * normal[i]
+        available = max(memory[LEDGER][g] - MARGIN * p[SLAVE_RESERVE][g], 0.0)
+        limit(error, g, math.sqrt(2.0 * available / (MASS_FACTOR * p[MASS][g])))
         for i in range(3 * g, 3 * g + 3):
-            gap[i] -= going[i]
-        limit(gap, g, most * T)
+            error[i] -= velocity[i]
+        limit(error, g, acceleration * T)
         for i in range(3 * g, 3 * g + 3):
-            going[i] += gap[i]
+            velocity[i] += error[i]
 
 
 @njit(cache=True)
-def _clamp(command, pose, twist, p, memory):
+def _limit_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved.
 
     The command generator then continues from there, at most as fast as the slave.
     """
-    pull, changed = memory[_PULL], False
-    difference_into(command, pose, pull)
+    motor_wrench, changed = memory[_MOTOR_WRENCH], False
+    difference_into(command, pose, motor_wrench)
     for g in range(2):
-        K, D = _STIFF * p[STIFFNESS][g], _DAMPED * p[DAMPING][g]
+        K, D = _STIFFNESS_FACTOR * p[STIFFNESS][g], _DAMPING_FACTOR * p[DAMPING][g]
         for i in range(3 * g, 3 * g + 3):
-            pull[i] = K * pull[i] - D * twist[i]
-        if _hold_back(g, D, twist, p, memory):
+            motor_wrench[i] = K * motor_wrench[i] - D * twist[i]
+        if _limit_motor_wrench(g, D, twist, p, memory):
             changed = True
-            going = memory[COMMAND_TWIST]
-            if length(going, g) > length(twist, g) or dot(going, twist, g) < 0.0:
+            velocity = memory[COMMAND_TWIST]
+            if length(velocity, g) > length(twist, g) or dot(velocity, twist, g) < 0.0:
                 for i in range(3 * g, 3 * g + 3):
-                    going[i] = twist[i]
+                    velocity[i] = twist[i]
         for i in range(3 * g, 3 * g + 3):
-            pull[i] = (pull[i] + D * twist[i]) / K
+            motor_wrench[i] = (motor_wrench[i] + D * twist[i]) / K
     if changed:
-        moved_into(pose, pull, command)
+        moved_into(pose, motor_wrench, command)
     return changed
 
 
 @njit(cache=True)
-def _hold_back(g, damping, twist, p, memory):
+def _limit_motor_wrench(g, damping, twist, p, memory):
     """Limit the motors' wrench to the available energy, or brake; return whether it changed."""
-    pull, velocity, held = memory[_PULL], memory[VELOCITY_HERE], memory[_CONTACT]
-    size, speed, mass = length(pull, g), length(twist, g), HEAVY * p[MASS][g]
-    still = length(velocity, g) < _STILL * ARM[g]
-    margin, account, changed = MARGIN * p[RESERVE][g], memory[_ACCOUNT][g], False
-    pushing = dot(pull, twist, g) > 0.0 or dot(pull, velocity, g) > 0.0
-    touched, room, least = length(held, g), account, 0.0
-    if touches(held, p) and dot(pull, held, g) < 0.0:
-        unpaid = _UNPAID * LEVER[g] * ARM[g]
-        spring = (1.0 + memory[_STAYED]) * unpaid * unpaid / (2.0 * max(memory[_STIFFNESS], 1.0))
-        room = min(account, min(p[RESERVE][g], spring) + memory[_PAID][g])
-        if still or not pushing:
-            # Motors that are late earn a little by standing: with an empty account they give way.
-            least = touched * min(max(account / margin, 0.0), 1.0)
-    if not pushing:
-        least += mass * speed / _HORIZON  # comes to rest, and does not bounce
-    reach = _HORIZON * (speed + memory[_PERIOD] * size / mass)
-    if size * reach > max(room - margin, least * reach):
-        scale(pull, g, max(max(room - margin, 0.0) / reach, least) / size)
+    motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
+    contact = memory[_CONTACT_WRENCH]
+    size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
+    stands = length(velocity, g) < _STANDSTILL_SPEED * ANGLE_PER_LENGTH[g]
+    margin, balance, changed = MARGIN * p[SLAVE_RESERVE][g], memory[_BALANCE][g], False
+    pushes = dot(motor_wrench, twist, g) > 0.0 or dot(motor_wrench, velocity, g) > 0.0
+    pressed, available, permitted = length(contact, g), balance, 0.0
+    if is_contact(contact, p) and dot(motor_wrench, contact, g) < 0.0:
+        free, k = (
+            _FREE_FORCE_N * TORQUE_PER_FORCE[g] * ANGLE_PER_LENGTH[g],
+            memory[_CONTACT_STIFFNESS],
+        )
+        spring = (1.0 + memory[_EXTRA_GAIN]) * free * free / (2.0 * max(k, 1.0))
+        available = min(balance, min(p[SLAVE_RESERVE][g], spring) + memory[_CONTACT_INPUT][g])
+        if stands or not pushes:
+            # Delayed motors gain a little energy at standstill; with an empty balance they yield.
+            permitted = pressed * min(max(balance / margin, 0.0), 1.0)
+    if not pushes:
+        permitted += mass * speed / _HORIZON_S  # stops without a rebound
+    reach = _HORIZON_S * (speed + memory[_PERIOD] * size / mass)
+    if size * reach > max(available - margin, permitted * reach):
+        scale(motor_wrench, g, max(max(available - margin, 0.0) / reach, permitted) / size)
         changed = True
-    if account < margin and not still:
-        brake = min(damping * speed, mass * _DECELERATION * ARM[g] * (1.0 - account / margin))
-        if -brake * speed < dot(pull, twist, g):
+    if balance < margin and not stands:
+        strongest = mass * _DECELERATION * ANGLE_PER_LENGTH[g] * (1.0 - balance / margin)
+        brake = min(damping * speed, strongest)
+        if -brake * speed < dot(motor_wrench, twist, g):
             for i in range(3 * g, 3 * g + 3):
-                pull[i] = -brake * twist[i] / max(speed, 1e-12)
+                motor_wrench[i] = -brake * twist[i] / max(speed, 1e-12)
             changed = True
     return changed
 
 
 @njit(cache=True)
-def _model(received, heard, T, p, memory, gap):
+def _step_servo_model(received, connected, T, p, memory, error):
     """Advance the servo model (S6) by implicit Euler, which is stable for every servo."""
-    model, going = memory[MODEL], memory[_MODEL_TWIST]
-    gap[:] = 0.0
-    if heard:
-        difference_into(received[POSE], model, gap)
+    model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
+    error[:] = 0.0
+    if connected:
+        difference_into(received[POSE], model, error)
     for i in range(6):
         stiff, damped = p[STIFFNESS][i // 3] / p[MASS][i // 3], p[DAMPING][i // 3] / p[MASS][i // 3]
-        going[i] = (going[i] + T * stiff * gap[i]) / (1.0 + T * damped + T * T * stiff)
-        gap[i] = T * going[i]
-    moved_into(model, gap, model)
+        velocity[i] = (velocity[i] + T * stiff * error[i]) / (1.0 + T * damped + T * T * stiff)
+        error[i] = T * velocity[i]
+    moved_into(model, error, model)
 
 
 @njit(cache=True)
-def command_left(wanted, command, pose, twist, p, memory):
+def command_sent(requested, command, pose, twist, p, memory):
     """Limit the command after the safe state changed it (S5); see `methods.Methods`."""
     for i in range(7):
-        if command[i] != wanted[i]:
-            if _clamp(command, pose, twist, p, memory):
+        if command[i] != requested[i]:
+            if _limit_motor_energy(command, pose, twist, p, memory):
                 put(memory, COMMAND_POSE.start, command, 0, 7)
             return

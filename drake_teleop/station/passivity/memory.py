@@ -45,11 +45,11 @@ LEDGER = _memory.vector(2)  #: energy that this end may still release, by group 
 RECEIVED = _memory.vector(2)  #: accounted value of the other end's counter [J]
 SENT = _memory.vector(2)  #: this end's counter of sent energy [J]
 LOST = _memory.vector(2)  #: energy that the method removed from the loop here [J]
-HELD = _memory.vector(6)  #: wrench at this port since the last step
-OF_LOAD = _memory.vector(6)  #: part of the slave's wrench from its load's weight and inertia
+HELD_WRENCH = _memory.vector(6)  #: wrench at this port since the last step
+LOAD_WRENCH = _memory.vector(6)  #: part of the slave's wrench from its load's weight and inertia
 COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and twist
 #: Remaining time in which the slave keeps its command while a new channel fills [s].
-FILLS = _memory.number()
+FILL_TIME = _memory.number()
 HAND_VELOCITY = _memory.vector(6)  #: filtered, at the master, see `retreat`
 PACKET = _memory.vector(38)  #: last sent packet, see `packet`
 _OWN = _memory.rest()

@@ -62,7 +62,7 @@ class Methods:
     The module of the field's class is the method. Its config has `pack_into(p)`. The module
     contains the compiled `master_step` and `slave_step`, with the arguments of those below except
     the first. Optional: `initialize(p, memory)` prepares the memory of an end; the compiled
-    `command_left(wanted, command, pose, twist, p, memory)` receives the command after the safe
+    `command_sent(requested, command, pose, twist, p, memory)` receives the command after the safe
     state; `AT_THE_MOTOR = True` marks an energy balance at the slave's motors instead of its
     command.
     """
@@ -80,12 +80,12 @@ class Methods:
 
 
 _FIELDS = {entry.metadata.get("method", entry.name): entry for entry in fields(Methods)}
-_FILES: dict[str, Any] = {"none": none} | {
+_MODULES: dict[str, Any] = {"none": none} | {
     name: import_module(entry.type.__module__) for name, entry in _FIELDS.items()
 }
-METHODS = tuple(_FILES)
+METHODS = tuple(_MODULES)
 """Names of all methods."""
-AT_THE_MOTOR = tuple(name for name, file in _FILES.items() if hasattr(file, "AT_THE_MOTOR"))
+AT_THE_MOTOR = tuple(name for name, file in _MODULES.items() if hasattr(file, "AT_THE_MOTOR"))
 """Methods with an energy balance at the port of the slave's motors."""
 
 
@@ -93,7 +93,7 @@ _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 
 @dataclass
-class _Common:
+class _CommonConfig:
     method: str = choice("none", METHODS, "what keeps the channel passive")
     force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
     torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
@@ -122,7 +122,7 @@ class _Common:
 
 @settings
 @dataclass
-class PassivityConfig(Methods, _Common):
+class PassivityConfig(Methods, _CommonConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
     The servo pulls the slave with K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
@@ -180,39 +180,41 @@ def initial_memory(
     memory = np.zeros(MEMORY)
     memory[COMMAND_POSE] = pose
     memory[PACKET][POSE] = pose
-    if hasattr(_FILES[method], "initialize"):
-        _FILES[method].initialize(parameters, memory)
+    if hasattr(_MODULES[method], "initialize"):
+        _MODULES[method].initialize(parameters, memory)
     return memory
 
 
 @njit(cache=True)
-def _as_wanted(wanted, command, pose, twist, p, memory):
-    """Do nothing, for a method without `command_left`."""
+def _ignore_command(requested, command, pose, twist, p, memory):
+    """Do nothing, for a method without `command_sent`."""
 
 
 _ROW = types.Array(types.float64, 1, "C")
-_MASTER = (_ROW, types.boolean, *[_ROW] * 5, types.float64, *[_ROW] * 4)
-_SLAVE = (_ROW, types.boolean, *[_ROW] * 4, types.float64, *[_ROW] * 4)
-_LEFT = (_ROW,) * 6
-_master_step, _slave_step, _command_left = map(call_at, (_MASTER, _SLAVE, _LEFT))
+_MASTER_ARGUMENTS = (_ROW, types.boolean, *[_ROW] * 5, types.float64, *[_ROW] * 4)
+_SLAVE_ARGUMENTS = (_ROW, types.boolean, *[_ROW] * 4, types.float64, *[_ROW] * 4)
+_SENT_ARGUMENTS = (_ROW,) * 6
+_master_step, _slave_step, _command_sent = map(
+    call_at, (_MASTER_ARGUMENTS, _SLAVE_ARGUMENTS, _SENT_ARGUMENTS)
+)
 
 
 @cache
 def steps_of(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's `master_step`, `slave_step` and `command_left`.
+    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`.
 
     A channel calls them by address: a channel with all methods would compile nine times as long.
     """
-    file = _FILES[method]
+    file = _MODULES[method]
     return (
-        address_of(file.master_step, _MASTER),
-        address_of(file.slave_step, _SLAVE),
-        address_of(getattr(file, "command_left", _as_wanted), _LEFT),
+        address_of(file.master_step, _MASTER_ARGUMENTS),
+        address_of(file.slave_step, _SLAVE_ARGUMENTS),
+        address_of(getattr(file, "command_sent", _ignore_command), _SENT_ARGUMENTS),
     )
 
 
 @njit(cache=True)
-def _finish(healthy, memory, packet):
+def _number_packet(healthy, memory, packet):
     """Number the packet; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[HEALTHY] = 1.0
@@ -255,7 +257,7 @@ def master_step(
             steps[0], received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
         )
         retreat(twist, T, p, memory, wrench)
-    _finish(healthy, memory, packet)
+    _number_packet(healthy, memory, packet)
 
 
 @njit(cache=True)
@@ -281,10 +283,10 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         _slave_step(
             steps[1], received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet
         )
-    _finish(healthy, memory, packet)
+    _number_packet(healthy, memory, packet)
 
 
 @njit(cache=True)
-def command_left(steps, wanted, command, pose, twist, p, memory):
+def command_sent(steps, requested, command, pose, twist, p, memory):
     """Pass the command after the safe state to the method; see `Methods`."""
-    _command_left(steps[2], wanted, command, pose, twist, p, memory)
+    _command_sent(steps[2], requested, command, pose, twist, p, memory)

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD
+from drake_teleop.station.passivity.memory import COMMAND, COMMAND_POSE, COMMAND_TWIST, HELD_WRENCH
 from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrived, fill, limit
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """See `methods.master_step`."""
-    wanted = received[WRENCH]
+    requested = received[WRENCH]
     for i in range(6):
-        wrench[i] = wanted[i]
+        wrench[i] = requested[i]
     for g in range(2):
         limit(wrench, g, limits[g])
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
@@ -30,5 +30,5 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
         put(memory, COMMAND_POSE.start, received, POSE.start, 7)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)

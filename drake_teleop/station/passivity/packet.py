@@ -39,7 +39,7 @@ CONTACT = _places.number()
 LOAD = _places.vector(6)
 
 #: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
-GENTLE = (450.0, 4.5)
+MAX_WRENCH_RATE = (450.0, 4.5)
 
 
 @njit(cache=True)

@@ -26,7 +26,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    HELD,
+    HELD_WRENCH,
     LEDGER,
     LOST,
     RECEIVED,
@@ -54,7 +54,7 @@ _INITIAL, _CEILING = _places.vector(2), _places.vector(2)
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
 # Memory: set position minus position; its requested value.
 _places = own_memory()
-_OFFSET, _WANTED = _places.vector(6), _places.vector(6)
+_OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 
 AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
@@ -93,19 +93,19 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     `before` is the squared offset of the set position at the last step. Energy above the ceiling is
     sent (`shuffle`) or discarded.
     """
-    offset, wanted = memory[_OFFSET], memory[_WANTED]
-    stored, needed = dot(offset, offset, g), dot(wanted, wanted, g)
-    damped = -dot(memory[HELD], dx, g) - 0.5 * stiffness * (stored - before)
+    offset, requested = memory[_OFFSET], memory[_REQUESTED]
+    stored, required = dot(offset, offset, g), dot(requested, requested, g)
+    damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
     ledger, accounted = memory[LEDGER], memory[RECEIVED]
     energy = ledger[g] + damped
-    more = received[ENERGY][g] - accounted[g]
-    if more > 0.0:
-        energy += more
-        accounted[g] += more
-    most = stored + 2.0 * energy / stiffness
-    share = 1.0 if needed <= max(most, 0.0) else math.sqrt(max(most, 0.0) / needed)
+    increase = received[ENERGY][g] - accounted[g]
+    if increase > 0.0:
+        energy += increase
+        accounted[g] += increase
+    available = stored + 2.0 * energy / stiffness
+    share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):
-        offset[i] = share * wanted[i]
+        offset[i] = share * requested[i]
     energy -= 0.5 * stiffness * (dot(offset, offset, g) - stored)
     surplus = max(energy - p[_CEILING][g], 0.0)
     if shuffle:
@@ -119,34 +119,34 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """See `methods.master_step`."""
-    offset, wanted, shown = memory[_OFFSET], memory[_WANTED], received[WRENCH]
+    offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
         before = dot(offset, offset, g)
         for i in range(3 * g, 3 * g + 3):
             offset[i] -= dx[i]
-            wrench[i] = shown[i]
+            wrench[i] = received_wrench[i]
         limit(wrench, g, limits[g])
         for i in range(3 * g, 3 * g + 3):
-            wanted[i] = wrench[i] / K[g]
+            requested[i] = wrench[i] / K[g]
         _modulate(received, g, K[g], dx, before, True, p, memory, packet)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] = K[g] * offset[i] - B[g] * twist[i]
         limit(wrench, g, limits[g])
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
-    offset, wanted = memory[_OFFSET], memory[_WANTED]
-    now, held, K, D = memory[COMMAND_POSE], memory[HELD], p[STIFFNESS], p[DAMPING]
+    offset, requested = memory[_OFFSET], memory[_REQUESTED]
+    now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
     difference_into(now, pose, offset)
-    put(wanted, 0, offset, 0, 6)
+    put(requested, 0, offset, 0, 6)
     if arrived(received):
-        difference_into(received[POSE], pose, wanted)
+        difference_into(received[POSE], pose, requested)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     for g in range(2):
         _modulate(received, g, K[g], dx, before[g], False, p, memory, packet)
@@ -158,18 +158,18 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def command_left(wanted, command, pose, twist, p, memory):
+def command_sent(requested, command, pose, twist, p, memory):
     """Account for the command after the safe state; see `methods.Methods`.
 
     The ledger pays for additional energy of the spring.
     """
-    offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD]
+    offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, offset)
-    difference_into(wanted, pose, other)
+    difference_into(requested, pose, other)
     for i in range(6):
         held[i] = K[i // 3] * offset[i] - D[i // 3] * twist[i]
     put(memory, COMMAND_POSE.start, command, 0, 7)
     for g in range(2):
-        more = dot(offset, offset, g) - dot(other, other, g)
-        memory[LEDGER][g] -= 0.5 * K[g] * more
+        increase = dot(offset, offset, g) - dot(other, other, g)
+        memory[LEDGER][g] -= 0.5 * K[g] * increase

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD, MASS, RETREAT
+from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD_WRENCH, MASS, RETREAT
 from drake_teleop.station.passivity.packet import dot, length, scale
 
-_FILTER = 4e-3  # s, of the velocity: encoders have steps
+_FILTER_S = 4e-3  # s, of the velocity: encoders have steps
 
 
 @njit(cache=True)
@@ -27,14 +27,14 @@ def retreat(twist, T, p, memory, wrench):
         memory: of the master's end, updated.
         wrench: (6,) in W, updated.
     """
-    velocity, rate = memory[HAND_VELOCITY], min(T / _FILTER, 1.0)
+    velocity, rate = memory[HAND_VELOCITY], min(T / _FILTER_S, 1.0)
     for i in range(6):
         velocity[i] += rate * (twist[i] - velocity[i])
     for g in range(2):
         size = length(wrench, g)
         if size > 0.0:
             along = dot(wrench, velocity, g) / size
-            slowing = (along - dot(wrench, twist, g) / size) / _FILTER
+            slowing = (along - dot(wrench, twist, g) / size) / _FILTER_S
             share = max(2.0 - along / p[RETREAT][g], p[MASS][g] * slowing / size, 0.0)
             scale(wrench, g, min(share, 1.0))
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)

@@ -15,23 +15,26 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import Slots
 from drake_teleop.station.passivity.packet import difference_into, length, moved_into
 
-STOP = 0.05  #: time in which a silent end comes to rest [s]
-RESUME = 0.5  #: time of the transition to normal operation [s]
+STOP_TIME = 0.05  #: time in which a silent end comes to rest [s]
+RESUME_TIME = 0.5  #: time of the transition to normal operation [s]
 
 MASTER_WATCH, SLAVE_WATCH = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _places = Slots(MASTER_WATCH)
 SILENT = _places.number()  #: time without packets [s], also at the slave
 _LIMIT = _places.vector(2)  # present limits
-_FALL = _places.vector(2)  # their decrease per second
-_HEARD = _places.number()  # time since the last silence
+_FALL_RATE = _places.vector(2)  # their decrease per second
+_CONNECTED_TIME = _places.number()  # time since the last silence
 # Monitor state of the slave.
 _places = Slots(SLAVE_WATCH, SILENT + 1)
-_STOPPING = _places.number()  # time since it began to stop
-_RESUMING = _places.number()  # time since it began to resume
-_FROM = _places.vector(7)  # command when it began to stop
-_VELOCITY = _places.vector(6)  # its velocity
-_LAST, _BEFORE = _places.vector(7), _places.vector(7)  # last command and the one before
+_STOPPING_TIME = _places.number()  # time since it began to stop
+_RESUMING_TIME = _places.number()  # time since it began to resume
+_STOP_POSE = _places.vector(7)  # command when it began to stop
+_STOP_VELOCITY = _places.vector(6)  # its velocity
+_LAST_COMMAND, _PREVIOUS_COMMAND = (
+    _places.vector(7),
+    _places.vector(7),
+)  # last command and the one before
 
 
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -43,7 +46,7 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
     if full is None:
         watch[SILENT] = np.inf
     else:
-        watch[_LIMIT], watch[_HEARD] = full, RESUME
+        watch[_LIMIT], watch[_CONNECTED_TIME] = full, RESUME_TIME
     return watch
 
 
@@ -51,13 +54,13 @@ def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the slave's state (SLAVE_WATCH,): the command rests at `pose` (7,)."""
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
-    for part in (_FROM, _LAST, _BEFORE):
+    for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
         watch[part] = pose
     return watch
 
 
 @njit(cache=True)
-def _listen(alive, fault, T, watch):
+def _update_silence(alive, fault, T, watch):
     if fault:
         watch[SILENT] = np.inf
     else:
@@ -78,61 +81,61 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
         watch: (MASTER_WATCH,) updated.
         limits: (2,) written [N, N m].
     """
-    _listen(alive, fault, T, watch)
-    heard = watch[SILENT] <= timeout
-    watch[_HEARD] = min(watch[_HEARD] + T, RESUME) if heard else 0.0
-    present, fall = watch[_LIMIT], watch[_FALL]
+    _update_silence(alive, fault, T, watch)
+    connected = watch[SILENT] <= timeout
+    watch[_CONNECTED_TIME] = min(watch[_CONNECTED_TIME] + T, RESUME_TIME) if connected else 0.0
+    present, fall = watch[_LIMIT], watch[_FALL_RATE]
     for g in range(2):
         size, limit = length(held, g), present[g]
-        if heard:
+        if connected:
             fall[g] = 0.0
-            start = size if watch[_HEARD] < RESUME else limit
-            limit = min(full[g], start + full[g] * T / RESUME)
+            start = size if watch[_CONNECTED_TIME] < RESUME_TIME else limit
+            limit = min(full[g], start + full[g] * T / RESUME_TIME)
         else:
             if fall[g] == 0.0:
                 limit = min(limit, size)
-                fall[g] = limit / STOP
+                fall[g] = limit / STOP_TIME
             limit = max(0.0, limit - fall[g] * T)
         present[g] = limits[g] = limit
 
 
 @njit(cache=True)
-def slave_command_into(alive, fault, T, timeout, wanted, watch, command):
+def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     """Write the command that is sent to the slave at this step.
 
     Args:
         alive: whether a new packet of a healthy master came at this step.
         fault: whether the slave's data are not finite, or a new packet reports this of the hand.
         T, timeout: [s].
-        wanted: (7,) X_WS requested by the method.
+        requested: (7,) X_WS from the method.
         watch: (SLAVE_WATCH,) updated.
         command: (7,) written, X_WS.
     """
-    _listen(alive, fault, T, watch)
-    last, before = watch[_LAST], watch[_BEFORE]
-    start, velocity = watch[_FROM], watch[_VELOCITY]
+    _update_silence(alive, fault, T, watch)
+    last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
+    start, velocity = watch[_STOP_POSE], watch[_STOP_VELOCITY]
     step = np.empty(6)
     if watch[SILENT] <= timeout:
-        watch[_RESUMING] = min(watch[_RESUMING] + T, RESUME)
-    elif watch[_RESUMING] > 0.0:
+        watch[_RESUMING_TIME] = min(watch[_RESUMING_TIME] + T, RESUME_TIME)
+    elif watch[_RESUMING_TIME] > 0.0:
         difference_into(last, before, velocity)
         for i in range(6):
             velocity[i] /= T
         put(start, 0, last, 0, 7)
-        watch[_STOPPING] = watch[_RESUMING] = 0.0
-    if watch[_RESUMING] == RESUME:
-        put(command, 0, wanted, 0, 7)
+        watch[_STOPPING_TIME] = watch[_RESUMING_TIME] = 0.0
+    if watch[_RESUMING_TIME] == RESUME_TIME:
+        put(command, 0, requested, 0, 7)
     else:
         # A blend from the stopping motion to the requested command keeps the velocity continuous
         # even if the end resumes before it has stopped.
-        watch[_STOPPING] += T
-        u = min(watch[_STOPPING] / STOP, 1.0)
+        watch[_STOPPING_TIME] += T
+        u = min(watch[_STOPPING_TIME] / STOP_TIME, 1.0)
         for i in range(6):  # velocity falls as 1 - 3 u^2 + 2 u^3
-            step[i] = velocity[i] * STOP * u * (1.0 - u * u * (1.0 - 0.5 * u))
+            step[i] = velocity[i] * STOP_TIME * u * (1.0 - u * u * (1.0 - 0.5 * u))
         moved_into(start, step, command)
-        u = watch[_RESUMING] / RESUME
+        u = watch[_RESUMING_TIME] / RESUME_TIME
         if u > 0.0:
-            difference_into(wanted, command, step)
+            difference_into(requested, command, step)
             for i in range(6):
                 step[i] *= u * u * u * (10.0 + u * (6.0 * u - 15.0))
             moved_into(command, step, command)

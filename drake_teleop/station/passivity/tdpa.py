@@ -26,7 +26,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    HELD,
+    HELD_WRENCH,
     LEDGER,
     LOST,
     MOTION_SCALE,
@@ -39,8 +39,8 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
-    GENTLE,
     INTEGRAL,
+    MAX_WRENCH_RATE,
     OTHER_ENERGY,
     POSE,
     SEQUENCE,
@@ -56,22 +56,28 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
-_SHARE_KEPT = 0.5
-_QUICK = 0.1  # s, onset and end of a wrench that needs no delay filter: slower than hand and servo
-_GONE = 0.1  # a wrench below this share of the filtered one ends
-_COMPLETE = 0.98  # share at which a quick onset is complete
+_KEPT_SHARE = 0.5
+_ONSET_S = (
+    0.1  # s, onset and end of a wrench that needs no delay filter: slower than hand and servo
+)
+_END_SHARE = 0.1  # a wrench below this share of the filtered one ends
+_ONSET_COMPLETE = 0.98  # share at which a quick onset is complete
 # By group: travel over which the contact stiffness is averaged [m, rad]; speed below which the drag
 # fades [m/s, rad/s].
-_TRAVEL = (1e-3, 1e-2)
-_FADING = (0.02, 0.2)
+_STIFFNESS_TRAVEL = (1e-3, 1e-2)
+_DRAG_SPEED = (0.02, 0.2)
 
 # In the packet: number of the master's newest packet; the slave's ledger.
-_ECHO, _SLAVES_LEDGER = INTEGRAL.start, OTHER_ENERGY
+_ECHO, _SLAVE_LEDGER = INTEGRAL.start, OTHER_ENERGY
 
 # Parameters.
 _places = own_parameters()
 _RELEASE, _DRAIN, _DRIFT_RATE = _places.number(), _places.number(), _places.number()
-_RESERVE, _DRAG, _HAND = _places.vector(2), _places.vector(2), _places.vector(2)  # in power units
+_RESERVE, _DRAG, _HAND_STIFFNESS = (
+    _places.vector(2),
+    _places.vector(2),
+    _places.vector(2),
+)  # in power units
 _SPEED = _places.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _places = own_memory()
@@ -79,11 +85,11 @@ _WITHHELD_SHARE, _KEPT = _places.vector(2), _places.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _places = own_memory()
-_IN, _OUT = _places.vector(2), _places.vector(2)
-_IN_COMMAND, _OUT_COMMAND = _places.vector(2), _places.vector(2)
+_INPUT, _OUTPUT = _places.vector(2), _places.vector(2)
+_COMMAND_INPUT, _COMMAND_OUTPUT = _places.vector(2), _places.vector(2)
 _WITHHELD, _FILTERED = _places.vector(6), _places.vector(6)
-_CONTACT, _ONSET = _places.vector(2), _places.vector(2)
-_BEFORE = _places.vector(7)  # the command of the last step
+_STIFFNESS_ESTIMATE, _ONSET_PACKET = _places.vector(2), _places.vector(2)
+_LAST_COMMAND = _places.vector(7)  # the command of the last step
 
 
 @settings
@@ -125,7 +131,7 @@ class TdpaConfig:
         """See `Methods`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
-        p[_HAND] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
+        p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
         p[_SPEED] = self.speed
 
 
@@ -150,9 +156,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     """See `methods.master_step`."""
     receive(received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
-    wanted = received[WRENCH]
+    requested = received[WRENCH]
     for i in range(6):
-        wrench[i] = wanted[i]
+        wrench[i] = requested[i]
     ledger, kept, withheld = memory[LEDGER], memory[_KEPT], memory[_WITHHELD_SHARE]
     for g in range(2):
         limit(wrench, g, limits[g])
@@ -160,45 +166,47 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
         drained = dot(wrench, dx, g)
         stored = ledger[g] + kept[g]
         if share * drained > drain * stored:
-            share = _shortened(g, drained, drain, stored, share, T, p, memory[HELD], wrench)
+            share = _permitted_share(
+                g, drained, drain, stored, share, T, p, memory[HELD_WRENCH], wrench
+            )
         withheld[g] = 1.0 - share
         memory[LOST][g] += (1.0 - share) * drained
         scale(wrench, g, share)
-        _drag(g, received[_SLAVES_LEDGER][g], dx, limits, T, p, memory, wrench)
-        _account(g, dot(wrench, dx, g), p, memory)
+        _add_drag(g, received[_SLAVE_LEDGER][g], dx, limits, T, p, memory, wrench)
+        _account_for_work(g, dot(wrench, dx, g), p, memory)
         if p[_DRAG][g] > 0.0:
-            _pass_on(g, p, memory)
+            _send_surplus(g, p, memory)
         packet[ENERGY][g] = memory[SENT][g]
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
     packet[_ECHO] = received[SEQUENCE]
 
 
 @njit(cache=True)
-def _shortened(g, drained, drain, stored, share, T, p, held, wrench):
+def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
     """Return the share of the wrench that may be rendered in this step.
 
     The full wrench would drain `drained`. The limit is the share `drain` of the stored energy, or
     all of it where the wrench would otherwise drop abruptly.
     """
-    least, size = length(held, g) - GENTLE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
+    least, size = length(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
     share = min(share, max(drain * stored / drained, least / size))
     return min(share, stored / drained)
 
 
 @njit(cache=True)
-def _drag(g, slaves_ledger, dx, limits, T, p, memory, wrench):
+def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
     """Add drag along -dx to the wrench, which never drains the ledger."""
     drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_KEPT][g]
-    if drag > 0.0 and min(level, slaves_ledger) < p[_RESERVE][g]:
-        damping = drag / max(length(dx, g), _FADING[g] * T)
+    if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
+        damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
             wrench[i] -= damping * dx[i]
         limit(wrench, g, limits[g])
 
 
 @njit(cache=True)
-def _pass_on(g, p, memory):
+def _send_surplus(g, p, memory):
     """Send energy of the master beyond the reserve back to the slave."""
     ledger = memory[LEDGER]
     surplus = ledger[g] + memory[_KEPT][g] - p[_RESERVE][g]
@@ -208,14 +216,14 @@ def _pass_on(g, p, memory):
 
 
 @njit(cache=True)
-def _account(g, drained, p, memory):
+def _account_for_work(g, drained, p, memory):
     """Subtract drained work from the ledger, then from the kept energy; or send the input."""
     ledger, kept = memory[LEDGER], memory[_KEPT]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)
     else:
-        more = min(-_SHARE_KEPT * drained, max(p[_RESERVE][g] - kept[g], 0.0))
+        more = min(-_KEPT_SHARE * drained, max(p[_RESERVE][g] - kept[g], 0.0))
         memory[SENT][g] -= drained + more
     kept[g] = max(kept[g] + more, 0.0)
 
@@ -224,31 +232,31 @@ def _account(g, drained, p, memory):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
     receive(received, memory)
-    put(memory, _BEFORE.start, memory, COMMAND_POSE.start, 7)
+    put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot(wrench, dx, g)
-        memory[_IN][g] += max(work, 0.0)
-        memory[_OUT][g] += max(-work, 0.0)
+        memory[_INPUT][g] += max(work, 0.0)
+        memory[_OUTPUT][g] += max(-work, 0.0)
     if arrived(received):
-        _follow(received, wrench, T, p, memory)
+        _move_command(received, wrench, T, p, memory)
     for g in range(2):
-        paid = _paid(memory, g)
-        credit = min(memory[_IN][g], memory[_IN_COMMAND][g]) + min(paid, 0.0)
+        available = _available_energy(memory, g)
+        credit = min(memory[_INPUT][g], memory[_COMMAND_INPUT][g]) + min(available, 0.0)
         # Unpaid output is repaid before energy is sent.
         memory[SENT][g] = max(memory[SENT][g], credit)
-        memory[LEDGER][g] = paid
+        memory[LEDGER][g] = available
         packet[ENERGY][g] = memory[SENT][g]
-        packet[_SLAVES_LEDGER][g] = memory[LEDGER][g]
+        packet[_SLAVE_LEDGER][g] = memory[LEDGER][g]
         _filter(g, received, dx, wrench, T, p, memory)
     put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, memory[_FILTERED], packet)
 
 
 @njit(cache=True)
 def _filter(g, received, dx, wrench, T, p, memory):
     """Filter the wrench that is sent (T44)."""
-    filtered, hand = memory[_FILTERED], p[_HAND][g]
+    filtered, hand = memory[_FILTERED], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
         gain = max(_contact_stiffness(g, dx, wrench, T, memory), 0.0) / hand
@@ -256,15 +264,15 @@ def _filter(g, received, dx, wrench, T, p, memory):
         round_trip = max(memory[STEPS] - received[_ECHO], 1.0) * T
         lag = round_trip + p[DAMPING][g] / p[STIFFNESS][g]
         size, filtered_size = length(wrench, g), length(filtered, g)
-        quick = min(T / _QUICK, 1.0)
+        onset_rate = min(T / _ONSET_S, 1.0)
         rate = min(T / (lag * (1.0 + math.e * gain)), 1.0)
-        if size < _GONE * filtered_size:
-            rate = max(rate, quick)
+        if size < _END_SHARE * filtered_size:
+            rate = max(rate, onset_rate)
         else:
-            if filtered_size * (1.0 + gain) < _COMPLETE * size:
-                onset = quick
-                memory[_ONSET][g] = memory[STEPS]
-            if lag > _QUICK and received[_ECHO] < memory[_ONSET][g]:
+            if filtered_size * (1.0 + gain) < _ONSET_COMPLETE * size:
+                onset = onset_rate
+                memory[_ONSET_PACKET][g] = memory[STEPS]
+            if lag > _ONSET_S and received[_ECHO] < memory[_ONSET_PACKET][g]:
                 rate = 0.0
     for i in range(3 * g, 3 * g + 3):
         now = filtered[i]
@@ -274,38 +282,38 @@ def _filter(g, received, dx, wrench, T, p, memory):
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
     """Return the contact's -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
-    size, stiffness = length(dx, g), memory[_CONTACT]
-    if size > _TRAVEL[g] * T:
-        change = dot(wrench, dx, g) - dot(memory[HELD], dx, g)
-        forget = min(size / _TRAVEL[g], 1.0)
+    size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
+    if size > _STIFFNESS_TRAVEL[g] * T:
+        change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
+        forget = min(size / _STIFFNESS_TRAVEL[g], 1.0)
         stiffness[g] += forget * (-change / (size * size) - stiffness[g])
     return stiffness[g]
 
 
 @njit(cache=True)
-def _paid(memory, g):
+def _available_energy(memory, g):
     """Return the input of the hand minus the output; negative if the servo released too much."""
-    return memory[RECEIVED][g] - max(memory[_OUT][g], memory[_OUT_COMMAND][g])
+    return memory[RECEIVED][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
 
 
 @njit(cache=True)
-def _follow(received, wrench, T, p, memory):
+def _move_command(received, wrench, T, p, memory):
     """Move the command towards the received pose within the available energy."""
     now, withheld = memory[COMMAND_POSE], memory[_WITHHELD]
     step = memory[COMMAND_TWIST]
-    later = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
+    remaining_share = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
     difference_into(received[POSE], now, step)
     for i in range(6):
-        step[i] -= later * withheld[i]
+        step[i] -= remaining_share * withheld[i]
     for g in range(2):
         limit(step, g, p[_SPEED][g] * T)
-        pressing, paid = -dot(wrench, step, g), max(_paid(memory, g), 0.0)
-        if pressing > paid:
-            scale(step, g, paid / pressing)
-            memory[LOST][g] += pressing - paid
-            pressing = paid
-        memory[_OUT_COMMAND][g] += max(pressing, 0.0)
-        memory[_IN_COMMAND][g] += max(-pressing, 0.0)
+        pressing, available = -dot(wrench, step, g), max(_available_energy(memory, g), 0.0)
+        if pressing > available:
+            scale(step, g, available / pressing)
+            memory[LOST][g] += pressing - available
+            pressing = available
+        memory[_COMMAND_OUTPUT][g] += max(pressing, 0.0)
+        memory[_COMMAND_INPUT][g] += max(-pressing, 0.0)
     moved_into(now, step, now)
     difference_into(received[POSE], now, withheld)
     for i in range(6):
@@ -316,20 +324,20 @@ def _follow(received, wrench, T, p, memory):
 def _account_command(command, sign, memory):
     """Add (`sign` 1) or remove (-1) the work of the command step that ends at `command`."""
     step = np.empty(6)
-    difference_into(command, memory[_BEFORE], step)
+    difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
-        work = sign * dot(memory[HELD], step, g)
+        work = sign * dot(memory[HELD_WRENCH], step, g)
         into = work if work * sign > 0.0 else 0.0
-        memory[_IN_COMMAND][g] += into
-        memory[_OUT_COMMAND][g] += into - work
+        memory[_COMMAND_INPUT][g] += into
+        memory[_COMMAND_OUTPUT][g] += into - work
 
 
 @njit(cache=True)
-def command_left(wanted, command, pose, twist, p, memory):
+def command_sent(requested, command, pose, twist, p, memory):
     """Account for the command after the safe state; see `methods.Methods`."""
     for i in range(7):
-        if command[i] != wanted[i]:
-            _account_command(wanted, -1.0, memory)
+        if command[i] != requested[i]:
+            _account_command(requested, -1.0, memory)
             _account_command(command, 1.0, memory)
             put(memory, COMMAND_POSE.start, command, 0, 7)
             return

@@ -24,7 +24,7 @@ from drake_teleop.station.passivity.memory import (
     COMMAND_POSE,
     COMMAND_TWIST,
     DAMPING,
-    HELD,
+    HELD_WRENCH,
     LEDGER,
     LOST,
     MASS,
@@ -54,10 +54,10 @@ _places = own_parameters()
 _SEND, _DRAIN = _places.number(), _places.number()
 _INITIAL, _LEVEL, _CAPACITY = _places.vector(2), _places.vector(2), _places.vector(2)
 _DAMPER, ACCELERATION = _places.vector(2), _places.vector(2)
-_RESERVE = 0.01  # share of the capacity
+_RESERVE_SHARE = 0.01  # share of the capacity
 # Memory of the slave: wrench of the spring, wrench of the damper.
 _places = own_memory()
-_SPRING, _BRAKE = _places.vector(6), _places.vector(6)
+_SPRING_WRENCH, _BRAKE_WRENCH = _places.vector(6), _places.vector(6)
 
 AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
 
@@ -101,14 +101,14 @@ def initialize(p, memory):
 def _exchange(received, dx, T, p, memory, packet):
     """Account for the held wrench, received and sent energy, before a new wrench is limited."""
     ledger, accounted, sent_so_far = memory[LEDGER], memory[RECEIVED], memory[SENT]
-    held, capacity = memory[HELD], p[_CAPACITY]
+    held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot(held, dx, g)
         more = received[ENERGY][g] - accounted[g]
         if more > 0.0:
             level += more
             accounted[g] += more
-        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE * capacity[g], 0.0)
+        sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)
         sent_so_far[g] += sent
@@ -124,7 +124,7 @@ def _cost(f, dx, g, acceleration, T):
 
 
 @njit(cache=True)
-def _afford(f, dx, g, acceleration, T, memory):
+def _limit_to_tank(f, dx, g, acceleration, T, memory):
     """Shorten group g of a wrench to the energy in the tank."""
     cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
@@ -135,51 +135,51 @@ def _afford(f, dx, g, acceleration, T, memory):
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """See `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
-    ledger, wanted = memory[LEDGER], received[WRENCH]
+    ledger, requested = memory[LEDGER], received[WRENCH]
     for g in range(2):
         damping = p[_DAMPER][g] * max(p[_LEVEL][g] - ledger[g], 0.0)
         for i in range(3 * g, 3 * g + 3):
-            wrench[i] = wanted[i] - damping * twist[i]
+            wrench[i] = requested[i] - damping * twist[i]
         limit(wrench, g, limits[g])
         drained = dot(wrench, dx, g)
-        most = min(T * p[_DRAIN], 1.0) * max(ledger[g], 0.0)
-        if drained > most:
-            scale(wrench, g, most / drained)
-        _afford(wrench, dx, g, p[ACCELERATION][g], T, memory)
-    put(memory, HELD.start, wrench, 0, 6)
+        drainable = min(T * p[_DRAIN], 1.0) * max(ledger[g], 0.0)
+        if drained > drainable:
+            scale(wrench, g, drainable / drained)
+        _limit_to_tank(wrench, dx, g, p[ACCELERATION][g], T, memory)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
-    spring, brake = memory[_SPRING], memory[_BRAKE]
+    spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
     _exchange(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
     if arrived(received):
         target = received[POSE]
     difference_into(target, pose, spring)
-    pull, K, D = memory[HELD], p[STIFFNESS], p[DAMPING]
+    motor_wrench, K, D = memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             spring[i] *= K[g]
             brake[i] = -D[g] * twist[i]
-            pull[i] = spring[i] + brake[i]
+            motor_wrench[i] = spring[i] + brake[i]
         # The spring is shortened first and leaves the reserve, so that an empty tank can brake.
-        room = max(memory[LEDGER][g] - _RESERVE * p[_CAPACITY][g], 0.0)
-        most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
-        if _cost(pull, dx, g, most, T) > room:
-            most = p[ACCELERATION][g] + length(brake, g) / p[MASS][g]
-            room -= _cost(brake, dx, g, most, T)
-            most = p[ACCELERATION][g] + length(spring, g) / p[MASS][g]
-            cost = _cost(spring, dx, g, most, T)
-            share = min(max(room / cost, 0.0), 1.0) if cost > 0.0 else 0.0
+        available = max(memory[LEDGER][g] - _RESERVE_SHARE * p[_CAPACITY][g], 0.0)
+        acceleration = p[ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+        if _cost(motor_wrench, dx, g, acceleration, T) > available:
+            acceleration = p[ACCELERATION][g] + length(brake, g) / p[MASS][g]
+            available -= _cost(brake, dx, g, acceleration, T)
+            acceleration = p[ACCELERATION][g] + length(spring, g) / p[MASS][g]
+            cost = _cost(spring, dx, g, acceleration, T)
+            share = min(max(available / cost, 0.0), 1.0) if cost > 0.0 else 0.0
             for i in range(3 * g, 3 * g + 3):
-                pull[i] = share * spring[i] + brake[i]
-            most = p[ACCELERATION][g] + length(pull, g) / p[MASS][g]
-            _afford(pull, dx, g, most, T, memory)
+                motor_wrench[i] = share * spring[i] + brake[i]
+            acceleration = p[ACCELERATION][g] + length(motor_wrench, g) / p[MASS][g]
+            _limit_to_tank(motor_wrench, dx, g, acceleration, T, memory)
         for i in range(3 * g, 3 * g + 3):
-            spring[i] = (pull[i] - brake[i]) / K[g]
+            spring[i] = (motor_wrench[i] - brake[i]) / K[g]
     moved_into(pose, spring, memory[COMMAND_POSE])
     put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)
     put(command, 0, memory, COMMAND.start, 13)
@@ -187,9 +187,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 
 @njit(cache=True)
-def command_left(wanted, command, pose, twist, p, memory):
+def command_sent(requested, command, pose, twist, p, memory):
     """Note the servo's wrench at the command after the safe state; see `methods.Methods`."""
-    spring, held, K, D = memory[_SPRING], memory[HELD], p[STIFFNESS], p[DAMPING]
+    spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):
         held[i] = K[i // 3] * spring[i] - D[i // 3] * twist[i]

@@ -25,8 +25,8 @@ from drake_teleop.station.passivity.memory import (
     COMMAND,
     COMMAND_POSE,
     COMMAND_TWIST,
-    FILLS,
-    HELD,
+    FILL_TIME,
+    HELD_WRENCH,
     LEDGER,
     LOST,
     MOTION_SCALE,
@@ -37,8 +37,8 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import (
     ENERGY,
-    GENTLE,
     INTEGRAL,
+    MAX_WRENCH_RATE,
     POSE,
     SEQUENCE,
     arrived,
@@ -56,10 +56,10 @@ _FILTER, _MATCHING = _places.number(), _places.number()
 _PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
 # Memory: integrals of the played and the sent wave; wave of this step; silence [s].
 _places = own_memory()
-_PLAYED, _INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
-_SILENT, _DRIFT = _places.number(), _places.vector(6)
+_PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
+_SILENCE, _DRIFT = _places.number(), _places.vector(6)
 # At the master: 1 from a missing packet until the wrench has caught up; newest packet number.
-_MISSING, _NEWEST = _places.number(), _places.number()
+_CATCHING_UP, _NEWEST_PACKET = _places.number(), _places.number()
 
 
 @settings
@@ -94,7 +94,7 @@ def _play(received, T, p, memory, wave):
     Playing the share a of the rest d in each step costs a |d|^2 / (2 T (2 - a)) in all. a is that
     of the filter, or small enough for the stored energy (T34).
     """
-    ledger, accounted, played = memory[LEDGER], memory[RECEIVED], memory[_PLAYED]
+    ledger, accounted, played = memory[LEDGER], memory[RECEIVED], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
         more = received[ENERGY][g] - accounted[g]
@@ -116,12 +116,12 @@ def _play(received, T, p, memory, wave):
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """See `methods.master_step`."""
-    wave, integral, sent = memory[_WAVE], memory[_INTEGRAL], packet[INTEGRAL]
+    wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
-    missing, newest = memory[_MISSING], received[SEQUENCE]
-    if newest > memory[_NEWEST] + 1.0:
-        missing = 1.0
-    memory[_MISSING], memory[_NEWEST] = 0.0 if fresh else 1.0, newest
+    catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
+    if newest > memory[_NEWEST_PACKET] + 1.0:
+        catching_up = 1.0
+    memory[_CATCHING_UP], memory[_NEWEST_PACKET] = 0.0 if fresh else 1.0, newest
     for g in range(2):
         b = p[IMPEDANCE][g]
         for i in range(3 * g, 3 * g + 3):
@@ -131,21 +131,21 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
             sent[i] = integral[i]
         limit(wrench, g, limits[g])
         energy = 0.5 * T * dot(wave, wave, g)
-        if missing > 0.0:
-            most = GENTLE[g] * T / p[MOTION_SCALE][g]
-            if _approach(g, energy, dx, most, memory[HELD], wrench):
-                memory[_MISSING] = 1.0
+        if catching_up > 0.0:
+            most = MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g]
+            if _limit_change(g, energy, dx, most, memory[HELD_WRENCH], wrench):
+                memory[_CATCHING_UP] = 1.0
             limit(wrench, g, limits[g])
         # Shortening a wrench leaves more energy than the reflected wave has, so `left` is >= 0.
         left = energy - dot(wrench, dx, g)
         memory[SENT][g] += max(left, 0.0)
         packet[ENERGY][g] = memory[SENT][g]
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
-def _approach(g, energy, dx, most, held, wrench):
+def _limit_change(g, energy, dx, most, held, wrench):
     """Limit the change of the wrench to `most` if that drains at most `energy`.
 
     Returns:
@@ -169,32 +169,32 @@ def _approach(g, energy, dx, most, held, wrench):
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
-    memory[_SILENT] = 0.0 if fresh else memory[_SILENT] + T
-    if memory[FILLS] > 0.0:
-        memory[FILLS] -= T
+    memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
+    if memory[FILL_TIME] > 0.0:
+        memory[FILL_TIME] -= T
         step[:] = 0.0
-        _stand(received, wrench, T, p, memory)
-    elif memory[_SILENT] <= p[_PATIENCE]:
+        _fill_line(received, wrench, T, p, memory)
+    elif memory[_SILENCE] <= p[_PATIENCE]:
         _reflect(received, wrench, T, p, memory)
         if arrived(received):
-            _correct(received, wrench, T, p, memory)
+            _correct_drift(received, wrench, T, p, memory)
         moved_into(now, step, now)
         for i in range(6):
             step[i] /= T
     else:
         step[:] = 0.0
-        _rest(wrench, T, p, memory)
-    put(packet, INTEGRAL.start, memory, _INTEGRAL.start, 6)
+        _play_rest(wrench, T, p, memory)
+    put(packet, INTEGRAL.start, memory, _SENT_INTEGRAL.start, 6)
     put(packet, ENERGY.start, memory, SENT.start, 2)
     put(command, 0, memory, COMMAND.start, 13)
-    put(memory, HELD.start, wrench, 0, 6)
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)
     fill(pose, twist, wrench, packet)
 
 
 @njit(cache=True)
 def _reflect(received, wrench, T, p, memory):
     """Compute the command's step from wave and contact wrench, and the reflected wave."""
-    wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_INTEGRAL]
+    wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_SENT_INTEGRAL]
     _play(received, T, p, memory, wave)
     for g in range(2):
         b, damper = p[IMPEDANCE][g], p[_MATCHING] * p[IMPEDANCE][g]
@@ -208,13 +208,13 @@ def _reflect(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _rest(wrench, T, p, memory):
+def _play_rest(wrench, T, p, memory):
     """Play the wave that keeps the slave at rest while the stored energy suffices.
 
     It is reflected as by a rigid wall.
     """
     wave, ledger = memory[_WAVE], memory[LEDGER]
-    played, integral = memory[_PLAYED], memory[_INTEGRAL]
+    played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         for i in range(3 * g, 3 * g + 3):
             wave[i] = -wrench[i] / math.sqrt(2.0 * p[IMPEDANCE][g])
@@ -228,14 +228,14 @@ def _rest(wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _stand(received, wrench, T, p, memory):
+def _fill_line(received, wrench, T, p, memory):
     """Reflect as a rigid wall while a new line fills, and prepare the steady state.
 
     So the line begins with the energy of the present contact, f^2 / 4 b over a round trip and both
     filter times, as if it had played the wave of `wrench` for long. This energy is given once.
     """
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
-    played, integral = memory[_PLAYED], memory[_INTEGRAL]
+    played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
         accounted[g] = max(accounted[g], received[ENERGY][g])
         for i in range(3 * g, 3 * g + 3):
@@ -247,7 +247,7 @@ def _stand(received, wrench, T, p, memory):
 
 
 @njit(cache=True)
-def _correct(received, wrench, T, p, memory):
+def _correct_drift(received, wrench, T, p, memory):
     """Add a step towards the received pose in a group where it does not increase contact force."""
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     difference_into(received[POSE], memory[COMMAND_POSE], drift)

@@ -35,7 +35,7 @@ from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 _ELIMINATION = np.array([0.0, 0.0, 1.0])
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
-OLDEST = 0.05
+MAX_SAMPLE_AGE = 0.05
 _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
     int, (Fault.NONE, Fault.STALE, Fault.READING, Fault.JOINTS, Fault.LOAD)
 )
@@ -108,20 +108,20 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 
 @njit(cache=True)
-def fault_of(sample, estimate, time, believed):
+def fault_of(sample, estimate, time, valid_range):
     """Return the `Fault` of sample and load estimate.
 
     Args:
         sample: of the wrist sensor, see `drake_teleop.load.regressor`.
         estimate: (16,) [offsets; phi].
         time: now [s].
-        believed: (7,) largest valid wrench [N, N m], largest age [s].
+        valid_range: (7,) largest wrench [N, N m], largest age [s].
     """
-    if not abs(time - sample[TIME]) <= believed[6]:
+    if not abs(time - sample[TIME]) <= valid_range[6]:
         return _STALE
     reading = sample[SATURATED] < LOST and sound(sample[MOTION])
     for i in range(6):
-        reading = reading and abs(sample[i]) <= believed[i]
+        reading = reading and abs(sample[i]) <= valid_range[i]
     if not reading:
         return _READING
     if not sound(sample[BEFORE_JOINTS:TIME]):
@@ -138,20 +138,20 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 
 @njit(cache=True, borrows=True)
-def _all_into(sample, estimate, gripper, change, time, elimination, believed, out):
+def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_range, out):
     """Write F' with the scales at `time`, the contact wrench, and the fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
     _scaled_into(sample, estimate, gripper, elimination, out[6:12])
-    out[12] = fault_of(sample, estimate, time, believed)
+    out[12] = fault_of(sample, estimate, time, valid_range)
 
 
 @njit(cache=True)
-def _felt_into(sample, estimate, gripper, change, time, arm, R_WB, believed, contact, out):
+def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
     """Write the wrench to render from F'; the orientation of S is of the same sample.
 
     `contact` is 1, or 0 for the load's part alone.
     """
-    if fault_of(sample, estimate, time, believed) != _NONE:
+    if fault_of(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
         return
     scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
@@ -199,11 +199,11 @@ class ForceScaling(LeafSystem):
         arm: ArmModel,
         R_WB: NDArray[np.float64],
         largest_wrench: NDArray[np.float64] | None = None,
-        oldest: float = OLDEST,
+        oldest: float = MAX_SAMPLE_AGE,
     ) -> None:
         super().__init__()
         largest = np.full(6, np.inf) if largest_wrench is None else largest_wrench
-        self._believed = np.append(largest, oldest)
+        self._valid_range = np.append(largest, oldest)
         self._gripper: NDArray[np.float64] | None = None
         if config.gripper_phi is not None:
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
@@ -225,7 +225,7 @@ class ForceScaling(LeafSystem):
             self.DeclareVectorOutputPort(name, 6, weak_callback(calc), inputs)
         self.DeclareVectorOutputPort("fault", 1, weak_callback(self._calc_fault), inputs)
         self.DeclareVectorOutputPort(
-            "scaled_contact_and_fault", 13, weak_callback(self._calc_all), inputs
+            "scaled_contact_and_fault", 13, weak_callback(self._calc_log_row), inputs
         )
 
     def SetScales(
@@ -245,26 +245,28 @@ class ForceScaling(LeafSystem):
         Raises:
             DrakeTeleopError: for a scale or duration that is negative or not finite.
         """
-        wanted = np.array([sigma_gripper, sigma_object, gamma, force_scale, duration], dtype=float)
-        if not (wanted >= 0.0).all() or not np.isfinite(wanted).all():
+        requested = np.array(
+            [sigma_gripper, sigma_object, gamma, force_scale, duration], dtype=float
+        )
+        if not (requested >= 0.0).all() or not np.isfinite(requested).all():
             raise DrakeTeleopError(
                 "scales and duration are not finite or negative", where="SetScales"
             )
         parameter = context.get_mutable_numeric_parameter(self._change)
         now, start = np.empty(4), context.get_time()
         scales_at(parameter.value(), start, now)
-        parameter.SetFromVector(np.concatenate([now, wanted[:4], [start, wanted[4]]]))
+        parameter.SetFromVector(np.concatenate([now, requested[:4], [start, requested[4]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
         _scaled_now_into(*self._inputs(context), output.get_mutable_value())
 
-    def _calc_all(self, context: Context, output: BasicVector) -> None:
+    def _calc_log_row(self, context: Context, output: BasicVector) -> None:
         inputs = self._inputs(context)
-        _all_into(*inputs, _ELIMINATION, self._believed, output.get_mutable_value())
+        _log_row_into(*inputs, _ELIMINATION, self._valid_range, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         sample, estimate, _, _, time = self._inputs(context)
-        output[0] = fault_of(sample, estimate, time, self._believed)
+        output[0] = fault_of(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
         _scaled_into(*self._inputs(context)[:3], _ELIMINATION, output.get_mutable_value())
@@ -280,14 +282,14 @@ class ForceScaling(LeafSystem):
         )
 
     def _calc_wrench_B(self, context: Context, output: BasicVector) -> None:
-        self._calc_felt(context, 1.0, output)
+        self._calc_rendered(context, 1.0, output)
 
     def _calc_load_wrench_B(self, context: Context, output: BasicVector) -> None:
-        self._calc_felt(context, 0.0, output)
+        self._calc_rendered(context, 0.0, output)
 
-    def _calc_felt(self, context: Context, contact: float, output: BasicVector) -> None:
-        constants = self._arm, self._R_WB, self._believed, contact
-        _felt_into(*self._inputs(context), *constants, output.get_mutable_value())
+    def _calc_rendered(self, context: Context, contact: float, output: BasicVector) -> None:
+        constants = self._arm, self._R_WB, self._valid_range, contact
+        _rendered_into(*self._inputs(context), *constants, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
         """Return sample, estimate, gripper's part of it, change of the scales, and time."""

@@ -66,9 +66,9 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
     offset = rotate(R_WB, (pose[4] - master[4], pose[5] - master[5], pose[6] - master[6]))
     now = (pose[0], pose[1], pose[2], pose[3])
     reference = (master[0], master[1], master[2], master[3])
-    turn_B = scaled_rotation(multiply(now, conjugate(reference)), rotation_scale)
-    turn_W = multiply(multiply(R_WB, turn_B), conjugate(R_WB))
-    orientation = normalized(multiply(turn_W, (command[0], command[1], command[2], command[3])))
+    rotation_B = scaled_rotation(multiply(now, conjugate(reference)), rotation_scale)
+    rotation_W = multiply(multiply(R_WB, rotation_B), conjugate(R_WB))
+    orientation = normalized(multiply(rotation_W, (command[0], command[1], command[2], command[3])))
     for k in range(4):
         out[k] = orientation[k]
     for k in range(3):

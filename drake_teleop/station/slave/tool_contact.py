@@ -13,9 +13,9 @@ from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodie
 from drake_teleop.station.environment.point_contact import (
     BODY,
     WIDTH,
-    apart,
     contact_force,
     indentation,
+    separation,
 )
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import Contact
@@ -106,7 +106,7 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
             _place(pair, bodies, placed)
         else:
             put(placed, 0, pair, 0, WIDTH)
-        if apart(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
+        if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
             return WATCHED
     for pair in pairs:
         box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
