@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike, NDArray
 
-_METADATA_KEY = "drake_teleop.station.signals"
+_METADATA_KEY = "drake_teleop.signals"
 # A part of a log is named after the number of its first row.
 # More points than this on a line are drawn as the least and the largest of their neighbours.
 _DRAWN = 20_000
