@@ -140,10 +140,6 @@ def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
     return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))
 
 
-CHUNK = 2**15
-"""Samples per pass over a long record."""
-
-
 @dataclass(frozen=True, eq=False)
 class Options:
     """Options of an estimator, as for `identify_batch`."""

@@ -29,7 +29,6 @@ _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
 _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
-_CHUNK = 2**13  # samples per pass, 4 MB of V
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
