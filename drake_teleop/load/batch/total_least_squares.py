@@ -60,11 +60,7 @@ class NormalForm(NamedTuple):
 
 
 def total_least_squares(
-    moments: Moments,
-    noise: Noise,
-    wrench_noise: Array,
-    *,
-    offsets: bool = True,
+    moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
     """Return offsets and load for noise of the wrench (6,) [N, N m] and of the motion.
 

@@ -58,8 +58,7 @@ def prior_dominated(
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
-            f"needs positive numbers of shape {deviations.shape}",
-            where="prior_std",
+            f"needs positive numbers of shape {deviations.shape}", where="prior_std"
         )
     return np.asarray(deviations >= share * prior)
 
