@@ -127,11 +127,6 @@ def values_of(tolerance: Tolerance, phi: Array) -> Array:
 def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
     """Return the tolerances (k,) in the units of `UNITS`."""
     m, _, inertia = mass_com_inertia(phi)
-    size = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
-    return np.array(
-        [
-            size[name] * getattr(tolerance, name)
-            for name in tolerance.required
-            for _ in ENTRIES[name]
-        ]
-    )
+    scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
+    sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required]
+    return np.repeat(sizes, [len(ENTRIES[name]) for name in tolerance.required])

@@ -21,10 +21,7 @@ from numpy.typing import ArrayLike
 
 from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.load.inertia import (
-    is_physically_consistent,
-    pseudo_inertia,
-)
+from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 
 _BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]
 _CONSTRAINT = [np.zeros((4, 4)), *_BASIS]

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.moments import (
+    CHUNK,
     coefficients,
     excited_columns,
     inverse_root,
     normal_equations,
 )
-from drake_teleop.load.batch.total_least_squares import CHUNK, Fit, NormalForm, Record
+from drake_teleop.load.batch.total_least_squares import Fit, NormalForm, Record
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
@@ -80,11 +81,11 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
     backwards, used = record.every(-1), kept[::-1]
     after = np.zeros((6, 16))
     for start in range(0, len(used), CHUNK):
-        used_block = slice(start, start + CHUNK)
-        rows = np.zeros((len(used[used_block]), 6, 16))
+        part = slice(start, start + CHUNK)
+        rows = np.zeros((len(used[part]), 6, 16))
         rows[:, np.arange(6), np.arange(6)] = 1.0
-        rows[:, :, 6:] = regressor(*(table[used_block] for table in backwards.arrays[1:]))
-        rows = fit.form.weights @ (rows * used[used_block, None, None])
+        rows[:, :, 6:] = regressor(*(table[part] for table in backwards.arrays[1:]))
+        rows = fit.form.weights @ (rows * used[part, None, None])
         sums = after + np.cumsum(rows, axis=0)
         after = sums[-1]
         sums -= rows

@@ -31,6 +31,7 @@ from drake_teleop.load.batch.covariance import (
     with_prior,
 )
 from drake_teleop.load.batch.moments import (
+    CHUNK,
     Moments,
     Noise,
     excited_columns,
@@ -39,7 +40,6 @@ from drake_teleop.load.batch.moments import (
     residual_covariance,
 )
 from drake_teleop.load.batch.total_least_squares import (
-    CHUNK,
     Fit,
     NormalForm,
     Options,

@@ -21,7 +21,8 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import regressor
 
-_CHUNK = 2**15
+CHUNK = 2**15
+"""Samples per pass over a long record."""
 # Limits of singular directions of the scaled Gram and of excitation [m/s^2, rad/s^2], as in
 # `normal_equations`.
 _MIN_EIGENVALUE, _MIN_EXCITATION = 1e-12, 1e-9
@@ -98,9 +99,9 @@ class Moments:
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else checked("weights", weights, n)
-        for start in range(0, n, _CHUNK):
+        for start in range(0, n, CHUNK):
             part = np.zeros((19, 19))
-            stop = start + _CHUNK
+            stop = start + CHUNK
             _accumulate(*(table[start:stop] for table in rows), weight[start:stop], part)
             self._sums += part + np.triu(part, 1).T
 

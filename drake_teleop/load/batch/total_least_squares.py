@@ -60,11 +60,7 @@ class NormalForm(NamedTuple):
 
 
 def total_least_squares(
-    moments: Moments,
-    noise: Noise,
-    wrench_noise: Array,
-    *,
-    offsets: bool = True,
+    moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
     """Return offsets and load for noise of the wrench (6,) [N, N m] and of the motion.
 
@@ -138,10 +134,6 @@ def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
     if excess(0.0) <= 0.0:  # no residual
         return 0.0
     return highest if excess(highest) >= 0.0 else float(brentq(excess, 0.0, highest, rtol=1e-14))
-
-
-CHUNK = 2**15
-"""Samples per pass over a long record."""
 
 
 @dataclass(frozen=True, eq=False)

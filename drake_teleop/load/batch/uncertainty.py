@@ -29,7 +29,6 @@ _UNITS = ("N",) * 3 + ("N m",) * 3 + ("kg",) + ("kg m",) * 3 + ("kg m^2",) * 6
 _MIN_EIGENVALUE, _MIN_COEFFICIENT = 1e-12, 1e-6
 # Terms of a combination, relative to the largest, that appear with a number, or as "...".
 _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
-_CHUNK = 2**13  # samples per pass, 4 MB of V
 
 
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
@@ -59,8 +58,7 @@ def prior_dominated(
     deviations, prior = np.asarray(standard_deviations), np.asarray(prior_std)
     if deviations.shape != prior.shape or not (prior > 0.0).all():
         raise DrakeTeleopError(
-            f"needs positive numbers of shape {deviations.shape}",
-            where="prior_std",
+            f"needs positive numbers of shape {deviations.shape}", where="prior_std"
         )
     return np.asarray(deviations >= share * prior)
 

@@ -33,6 +33,37 @@ from drake_teleop.load.regressor import (
     regressor_into,
 )
 
+STATES = ("known", "disturbed", "changed", "identified")
+"""States of the monitor, by index."""
+KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
+
+BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
+"""Durations [s]: of a block, until a filter restarts, until a new load counts, of a model error."""
+BOUND = 0.0025
+"""Default bound: four standard deviations are 1 % of the change of mass."""
+OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
+"""Default standard deviation of the offsets' drift since the identification [N, N m]."""
+
+# Standard deviations of a grasped or released object [kg, kg m, kg m^2].
+OBJECT_STD = PRIOR_STD[6:]
+# Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
+# the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
+# blocks of noise reach the return limit.
+_SLACK, _ALARM, _RETURN = 12.0, 60.0, -30.0
+# Factor of the bound for first moments relative to that of the mass, and smallest size [m].
+_MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
+# Standard deviations below zero at which the mass of a new load is impossible.
+_IMPOSSIBLE_DEVIATIONS = 4.0
+
+# Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
+# then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
+_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _RETURN_SUM, _AGE, _START, _NEW_COUNT, _POWER = range(10)
+_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
+_WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
+
+SIZE = _KNOWN + 816
+"""Length of the memory of `change_update`."""
+
 # Smallest variance of a row relative to the sum of its terms, as in `recursive`.
 _RESOLUTION = 1e-10
 
@@ -108,38 +139,6 @@ def update_estimate(estimate, V, wrench, root):
             for j in range(16):
                 P[i, j] -= gain[i] * gain[j] / total
     return chi
-
-
-STATES = ("known", "disturbed", "changed", "identified")
-"""States of the monitor, by index."""
-KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
-
-BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
-"""Durations [s]: of a block, until a filter restarts, until a new load counts, of a model error."""
-BOUND = 0.0025
-"""Default bound: four standard deviations are 1 % of the change of mass."""
-OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
-"""Default standard deviation of the offsets' drift since the identification [N, N m]."""
-
-# Standard deviations of a grasped or released object [kg, kg m, kg m^2].
-OBJECT_STD = PRIOR_STD[6:]
-# Cumulative sum of the blocks' chi-squared (six degrees of freedom): slack, alarm, and return to
-# the known load. With a slack of twice the mean, noise reaches the alarm once in 1e10 blocks; five
-# blocks of noise reach the return limit.
-_SLACK, _ALARM, _RETURN = 12.0, 60.0, -30.0
-# Factor of the bound for first moments relative to that of the mass, and smallest size [m].
-_MOMENT_FACTOR, _MIN_SIZE_M = 10.0, 0.03
-# Standard deviations below zero at which the mass of a new load is impossible.
-_IMPOSSIBLE_DEVIATIONS = 4.0
-
-# Indices into the memory: status; squared residuals of the known and the new load; sums of a block;
-# then [theta (16); P (256)] of the known load, of its filter, and of the new load's filter.
-_STATE, _BASE, _IN_BLOCK, _SAMPLES, _SUM, _RETURN_SUM, _AGE, _START, _NEW_COUNT, _POWER = range(10)
-_RESIDUAL, _SQUARES, _WRENCH, _MOTION, _V, _KNOWN = 10, 16, 22, 28, 37, 97
-_WATCH, _NEW = _KNOWN + 272, _KNOWN + 544
-
-SIZE = _KNOWN + 816
-"""Length of the memory of `change_update`."""
 
 
 @njit(cache=True)

@@ -35,6 +35,12 @@ RIDGE = 1e-13
 # Indices of the wrench and of the products w_i w_j in z, and z in the order of `moments`.
 _WRENCH, _PRODUCTS = 13, np.array([[7, 10, 11], [10, 8, 12], [11, 12, 9]])
 _ORDER = [0, *range(7, 19), *range(1, 7)]
+# Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
+_EXCESS = 4.0
+# Smallest pivot relative to its diagonal element that is not rounding.
+_MIN_PIVOT = 1e-13
+# Fewest samples for the noise scale from residuals.
+_MIN_SCALE_SAMPLES = 20
 
 
 @cache
@@ -237,14 +243,6 @@ class MomentEstimator(RecursiveEstimator):
         """Return the covariance with variances limited to the prior's, same correlations."""
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
         return np.asarray(covariance * np.outer(shrink, shrink))
-
-
-# Smallest excess of information over noise after compensation, in units of sqrt(2 / samples).
-_EXCESS = 4.0
-# Smallest pivot relative to its diagonal element that is not rounding.
-_MIN_PIVOT = 1e-13
-# Fewest samples for the noise scale from residuals.
-_MIN_SCALE_SAMPLES = 20
 
 
 @njit(cache=True)
