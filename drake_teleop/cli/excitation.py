@@ -82,6 +82,7 @@ def excite_command(
         until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
         package_paths, acceleration, payload: see `RobotFromModel`.
         criterion, period, harmonics, seconds, seed: see `excite`.
+        progress: False: no progress bars; `quiet`: no tables either.
 
     Returns:
         The summary and the content of session.json.

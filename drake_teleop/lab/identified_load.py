@@ -63,6 +63,7 @@ def identified_load(
     """Return the load of a scenario from the cache, or identify and cache it.
 
     Args:
+        progress: True shows progress bars; a `Stage` receives the progress.
         fresh: True ignores a cached load.
 
     Raises:

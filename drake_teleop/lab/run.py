@@ -76,6 +76,7 @@ def run_command(
         drive: recorded drive that is repeated instead.
         seed: replaces the scenario's seed.
         fresh: True ignores a cached load.
+        progress: False: no progress bars; `quiet`: no tables either.
 
     Returns:
         The summary and the content of session.json.
@@ -148,6 +149,11 @@ def run_scenario(
     fresh: bool = False,
 ) -> ScenarioRun:
     """Run a scenario, with its load as described at the top.
+
+    Args:
+        progress: True shows progress bars; a `Stage` receives the progress.
+        log: log folder, see `simulate`.
+        fresh: True ignores a cached load.
 
     Raises:
         DrakeTeleopError: for an unusable scenario or a joint outside its range.

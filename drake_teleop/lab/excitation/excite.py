@@ -74,6 +74,7 @@ def excite(
         period: [s].
         harmonics: N of Eq. (9), at least 2.
         seed, starts, seconds: see `design`.
+        progress: True shows progress bars; a `Stage` receives the progress.
 
     Raises:
         DrakeTeleopError: if no trajectory respects all limits.

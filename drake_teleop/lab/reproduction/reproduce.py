@@ -68,6 +68,10 @@ def reproduce_command(
 ) -> Values:
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
+    Args:
+        seed: of all noise; None: 0.
+        progress: False: no progress bars; `quiet`: no tables either.
+
     Returns:
         The summary, and the speed (not reproducible).
     """

@@ -72,7 +72,11 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run the remaining runs of all studies; write and return the answer."""
+    """Run the remaining runs of all studies; write and return the answer.
+
+    Args:
+        jobs, cluster, repeats, yes, quiet, progress: as for `study_command`.
+    """
     make_folder(out)
     rows = {}
     for name in (*(f"scaling_{task}" for task in TASKS), _OBJECT_STUDY):

@@ -89,6 +89,7 @@ def study_command(
         jobs: number of processes; -1: one for each core.
         cluster: address of a Dask scheduler, or "local".
         repeats: replaces the value of the file.
+        progress: False: no progress bars; `quiet`: no tables either.
         yes: True permits more than 1e5 runs; or a function that answers.
 
     Raises:
