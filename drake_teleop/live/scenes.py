@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drake_teleop.live.session import live_scenario
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 #: Scene -> a shipped scenario; "own" is what the drive was begun with.

@@ -47,6 +47,7 @@ from drake_teleop.station.passivity.packet import (
     length,
     limit,
     moved_into,
+    new_energy,
     scale,
 )
 
@@ -163,9 +164,8 @@ def find_direction(wrench, round_trip, T, p, memory):
 @njit(cache=True)
 def receive(g, received, memory):
     """Add newly received energy to the ledger of group `g` and return it."""
-    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
-    memory[RECEIVED][g] += new
     return new
 
 

@@ -12,7 +12,7 @@ import math
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply, normalized
-from drake_teleop.station.passivity.memory import Slots
+from drake_teleop.station.passivity.memory import RECEIVED, Slots
 
 PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
@@ -47,6 +47,14 @@ def arrived(received):
     """Return whether any packet was received: a receiver contains zeros before."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
+
+
+@njit(cache=True)
+def new_energy(g, received, memory):
+    """Return the energy of group g that was received since the last call [J]."""
+    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    memory[RECEIVED][g] += new
+    return new
 
 
 @njit(cache=True)
