@@ -36,7 +36,7 @@ from drake_teleop.live.pace import without_garbage_collection
 from drake_teleop.live.scenarios import live_scenario, with_device
 from drake_teleop.live.session import Session
 from drake_teleop.live.virtual_device import VirtualDevice, tapping
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.operator.operator import GRIPS
 from drake_teleop.station.scenario import LoadScenario, replace
 

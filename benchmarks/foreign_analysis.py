@@ -45,7 +45,7 @@ from drake_teleop.lab.analysis.sampled_loop import sampled_two_port
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.two_port import absorb
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.operator.operator import GRIPS, MinimumJerk
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace

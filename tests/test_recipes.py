@@ -152,7 +152,7 @@ else:
 def test_a_recorded_drive_is_the_same_after_a_method_is_entered_first(copy, tmp_path):
     first = tmp_path / "checkout"
     shutil.copytree(copy, first)
-    methods = first / "drake_teleop" / "passivity" / "methods.py"
+    methods = first / "drake_teleop" / "station" / "passivity" / "methods.py"
     line = "    share: ShareConfig = field(default_factory=ShareConfig)\n"
     source = methods.read_text().replace(line, "", 1)
     wave = "    wave: WaveConfig ="

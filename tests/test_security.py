@@ -40,7 +40,6 @@ EXPLAINED = {
     ("logs/read/tables.py", "np.load"), ("logs/read/tables.py", "allow_pickle"),
     # Processes that this one starts: what they say to each other goes through pipes.
     ("lab/studies/processes.py", "joblib"), ("lab/comparison/compare_passivity.py", "joblib"),
-    ("lab/studies/runs.py", "pickled"),
     # A module of the package by its name.
     ("station/passivity/methods.py", "import_module"),
     ("__init__.py", "import_module"),

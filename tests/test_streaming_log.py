@@ -165,7 +165,10 @@ def test_long_lines_are_drawn_with_their_peaks():
 def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
     """Runs ENDLESS until it has written three parts and sends the signal: stderr and status."""
     (folder / "endless.yaml").write_text(ENDLESS)
-    command = "from drake_teleop import cli, simulation; simulation._PART_ROWS = 500; cli.main()"
+    command = (
+        "from drake_teleop.cli.main import main; from drake_teleop.station import simulation;"
+        " simulation._PART_ROWS = 500; main()"
+    )
     arguments = ["run", "endless.yaml", "--out", "out", "--quiet"]
     with hearing_ctrl_c():
         process = subprocess.Popen(
@@ -173,7 +176,7 @@ def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
             cwd=folder,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"PYTHONPATH": str(Path(simulation.__file__).parents[1])},
+            env=os.environ | {"PYTHONPATH": str(Path(simulation.__file__).parents[2])},
         )
     while process.poll() is None and len(list((folder / "out").glob("log.parquet/*"))) < 3:
         time.sleep(0.02)

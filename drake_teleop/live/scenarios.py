@@ -11,7 +11,7 @@ from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.inputs import NETWORKS, OWN, SENSORS, Inputs
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import longest_delay
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.master.data_sheets import LEADER, PHANTOM, Master
 from drake_teleop.station.operator.operator import GRIPS

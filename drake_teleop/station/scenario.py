@@ -27,12 +27,10 @@ from drake_teleop.common.resources import scenarios_dir
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.environment.block import Block
-from drake_teleop.station.environment.box import Box
 from drake_teleop.station.environment.environment import Environment, Several
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.estimation.load_estimator import LoadEstimatorConfig
 from drake_teleop.station.master.data_sheets import Master, figures_of

@@ -9,9 +9,8 @@ from drake_teleop.lab.analysis.task_direction import OneAxisFromScenario, task_d
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig
-from drake_teleop.station.environment.block import Block
 from drake_teleop.station.environment.sheet_spring import SheetSpring
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Block, Wall
 from drake_teleop.station.master import phantom
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 

@@ -88,7 +88,7 @@ def test_the_ports_count_the_work_of_the_hand(load_estimate):
     assert np.abs(work).max() > 1e-4
 
 
-def test_what_the_load_has_in_the_wrench_is_told_as_the_wrench_is():
+def test_load_wrench_is_transformed_as_the_wrench():
     """In the same axes and units, with a base that is turned and unequal scales."""
     scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])
     scenario = moving(kinematic_scaling=scaling, passivity=PassivityConfig(method="ledger"))
@@ -107,7 +107,7 @@ def test_what_the_load_has_in_the_wrench_is_told_as_the_wrench_is():
     np.testing.assert_allclose(ends[MEMORY_S][LOAD_WRENCH], 0.5 * held, atol=1e-15)
 
 
-def test_what_is_in_flight_belongs_to_the_context():
+def test_packets_in_transit_belong_to_the_context():
     """Two that go on from the same instant, side by side, each receive what each has sent."""
     block = MakeChannel(moving(channel__delay=0.01)).GetSubsystemByName("channel")
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
@@ -145,7 +145,7 @@ def test_directions_may_differ():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"channel": Channel(network="lan", delay=0.1)}, r"channel\.network.*says all"),
+        ({"channel": Channel(network="lan", delay=0.1)}, r"channel\.network.*cannot be combined"),
         (
             {"channel": Channel(rate_hz=10.0, timeout=0.15)},
             r"channel\.timeout.*less than two packets",
@@ -153,7 +153,7 @@ def test_directions_may_differ():
         ({"channel": Channel(backward=NetworkConfig(loss=0.9, burst_loss=0.5))}, r"loss"),
     ],
 )
-def test_a_channel_that_cannot_be_is_refused(changes, message, load_estimate):
+def test_invalid_channel_is_rejected(changes, message, load_estimate):
     with pytest.raises(DrakeTeleopError, match=message):
         MakeTeleopStation(replace(Scenario(), **changes), load_estimate=load_estimate)
 

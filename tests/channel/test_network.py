@@ -116,7 +116,7 @@ def oracle(config: NetworkConfig, seed: int) -> np.ndarray:
 @example(replace(ROUGH, playout=0.05), 1)
 @example(replace(ROUGH, playout=0.05, redundant=True, rate_hz=300.0), 2)
 @example(replace(ROUGH, delay=0.1, playout=0.05, redundant=True), 3)
-def test_the_step_form_says_what_the_vectorised_form_says(config, seed):
+def test_step_form_equals_the_vectorised_form(config, seed):
     packets = random_packets()
     received, newest, fresh = exchange(config, packets, seed)
     np.testing.assert_array_equal(newest, newest_packets(config, seed, FORWARD, STEPS, PERIOD))
@@ -178,7 +178,7 @@ def test_no_packet_is_received_before_the_least_delay(config, seed):
         np.testing.assert_array_equal(newest, np.maximum(np.arange(200) - least, -1))
 
 
-def test_what_was_overtaken_is_never_received():
+def test_overtaken_packets_are_never_received():
     delays = packet_delays(replace(ROUGH, duplicate=0.0), 0, FORWARD, STEPS, PERIOD)[:, 0]
     arrival = np.where(delays >= 0, np.arange(STEPS) + delays, 10 * STEPS)
     overtaken = [k for k in range(STEPS) if (arrival[k + 1 :] <= arrival[k]).any()]
@@ -499,7 +499,7 @@ def test_losses_add_to_those_of_a_trace(tmp_path):
         ("", ["net.csv"]),
     ],
 )
-def test_a_bad_trace_is_refused_by_file_column_and_row(tmp_path, text, named):
+def test_invalid_trace_is_rejected_with_file_column_and_row(tmp_path, text, named):
     with pytest.raises(DrakeTeleopError) as error:
         parameters(write_trace(tmp_path / "net.csv", text), 0, FORWARD, PERIOD)
     message = str(error.value)
@@ -508,7 +508,7 @@ def test_a_bad_trace_is_refused_by_file_column_and_row(tmp_path, text, named):
         assert word in message
 
 
-def test_a_trace_that_is_not_there_is_named():
+def test_missing_trace_file_is_named():
     with pytest.raises(DrakeTeleopError, match=r"nowhere\.csv: no such file"):
         parameters(NetworkConfig(trace="nowhere.csv"), 0, FORWARD, PERIOD)
 
@@ -529,7 +529,7 @@ def test_a_trace_that_is_not_there_is_named():
         ({"loss": 0.5, "burst_loss": 0.4}, "network:loss"),
     ],
 )
-def test_values_that_cannot_be_right_are_refused(change, named):
+def test_invalid_values_are_rejected(change, named):
     with pytest.raises(DrakeTeleopError, match=f"^{named}: "):
         parameters(NetworkConfig(**change), 0, FORWARD, PERIOD)
 

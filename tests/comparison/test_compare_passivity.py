@@ -19,7 +19,7 @@ from drake_teleop.lab.comparison.one_dof import OneDof, Task
 from drake_teleop.lab.comparison.report import COLUMNS, cells
 from drake_teleop.lab.identified_load import identified_load
 from drake_teleop.station.channel.network import PRESETS
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario
 
 

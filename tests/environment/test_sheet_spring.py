@@ -8,7 +8,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.station.environment.sheet_spring import AddSheetSpring, SheetSpring
+from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
@@ -18,7 +18,7 @@ from drake_teleop.station.station import MakeTeleopStation
 def leaf(sheet: SheetSpring):
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-    AddSheetSpring(plant, sheet)
+    sheet.AddTo(plant)
     plant.mutable_gravity_field().set_gravity_vector([0.0, 0.0, 0.0])
     plant.Finalize()
     return plant, Simulator(builder.Build())

@@ -20,7 +20,6 @@ from drake_teleop.station.environment.slot import (
     TIP_BALL,
     UPPER_BALL,
     Slot,
-    UseSlotMaterial,
     _boxes,
 )
 from drake_teleop.station.replay import ReplayScene
@@ -49,7 +48,7 @@ def pairs_of_a_ball(slot: Slot) -> np.ndarray:
     plant.RegisterCollisionGeometry(tool, RigidTransform(), ball, "ball", friction)
     environment = AddEnvironment(plant, slot).instances
     plant.Finalize()
-    UseSlotMaterial(plant, scene_graph, slot, tool.index())
+    slot.PrepareContact(plant, scene_graph, tool.index())
     shapes = dict.fromkeys(plant.GetCollisionGeometriesForBody(tool), RigidTransform())
     inspector = scene_graph.model_inspector()
     pairs = ContactPairs(plant, inspector, shapes, environment, slot.slip).known
@@ -83,7 +82,7 @@ def test_the_stand_reaches_from_the_ground_to_the_lowest_of_the_boxes():
     assert slot.stand[2:] == (0.5, -0.2, slot.foot)
 
 
-def test_both_sides_of_a_contact_together_are_what_the_slot_says():
+def test_materials_of_both_sides_combine_to_those_of_the_slot():
     slot = Slot(stiffness=3e3, dissipation=0.7, friction=0.45)
     pairs = slave_at(slot).contact_pairs
     assert len(pairs) == 2 * 7
@@ -92,7 +91,7 @@ def test_both_sides_of_a_contact_together_are_what_the_slot_says():
     )
 
 
-def test_a_ball_that_leaves_quickly_is_let_go():
+def test_contact_does_not_pull_a_fast_ball():
     """Hunt and Crossley: k x (1 + d times the speed inwards), and no pull where that is less."""
     pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
@@ -190,7 +189,7 @@ def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
     np.testing.assert_allclose(force, [0.0, -2 * 1e4 * 0.2e-3, 0.0], atol=1e-6)
 
 
-def test_a_peg_that_is_tilted_by_more_than_its_play_is_wedged():
+def test_peg_tilted_beyond_its_clearance_jams():
     """The walls push its balls apart: a couple against the tilt, and no force."""
     slave, apart = slave_at(DEEP), TIP_BALL - UPPER_BALL
     play = np.arcsin(DEEP.clearance / apart)

@@ -18,8 +18,6 @@ from drake_teleop.common.resources import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise
-from drake_teleop.station.environment.block import Block
-from drake_teleop.station.environment.box import Box
 from drake_teleop.station.environment.environment import Several
 from drake_teleop.station.environment.moving_bodies import (
     JointTable,
@@ -27,7 +25,7 @@ from drake_teleop.station.environment.moving_bodies import (
     interpolate_bodies,
 )
 from drake_teleop.station.environment.sheet_spring import SheetSpring
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Block, Box, Wall
 from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
@@ -60,7 +58,7 @@ SOFT_PAD = """
 """
 
 
-def test_walls_and_boxes_are_drakes_law_of_two_surfaces():
+def test_walls_and_boxes_follow_drakes_contact_law():
     """In a corner of a soft rough floor, a stiff smooth wall and a tilted box: no two alike."""
     corner = Several(
         [
@@ -108,7 +106,7 @@ CABINET = """
 """
 
 
-def test_what_moves_is_drakes_law_wherever_it_is(tmp_path):
+def test_moving_bodies_follow_drakes_contact_law(tmp_path):
     """A block that was pushed and tipped over, and a drawer that slides in a door that turns."""
     (tmp_path / "cabinet.sdf").write_text(CABINET)
     cabinet = Scene(file=str(tmp_path / "cabinet.sdf"), position=[0.4, 0.0, 0.1])
@@ -178,7 +176,7 @@ def pad(tmp_path_factory) -> str:
 
 
 @pytest.mark.parametrize("case", ["block", "pad", "leaf"])
-def test_the_wrist_wrench_is_the_reaction_whatever_is_touched(case, pad):
+def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
     """A block that is pushed, an area of pressure, a leaf beside a wall; at the sensor's 8 kHz."""
     things = {
         "block": [Block(position=[0.561, 0.0, 0.2])],  # which the ball begins 1 mm deep in
@@ -220,7 +218,7 @@ def test_the_wrist_wrench_is_the_reaction_whatever_is_touched(case, pad):
     assert "leaf is not alone" in sensor.beyond
 
 
-def test_what_the_law_does_not_know_drake_tells_between_the_steps(monkeypatch):
+def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
     """With a box inside the ball, which nothing reaches: the same samples, told by Drake."""
     asked, wrench_W = [], ContactTwin.wrench_W
 
@@ -256,7 +254,7 @@ def test_what_the_law_does_not_know_drake_tells_between_the_steps(monkeypatch):
     np.testing.assert_allclose(drake, law, atol=1e-9)
 
 
-def test_how_near_the_tool_is():
+def test_separation_of_tool_and_unmodelled_shapes():
     """A box that only Drake knows counts from 2 cm on; the ball in front of it as it touches."""
     shapes = [Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.1])]
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
@@ -295,7 +293,7 @@ def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
     assert "contact_by" not in summary
 
 
-def test_the_film_shows_what_moved_where_it_was(tmp_path, meshcat):
+def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
     """A block that is turned, and a door that is open, from their poses alone."""
     hinge = '<joint name="hinge" type="revolute">'
     text = (models_dir() / "door.sdf").read_text()
@@ -330,7 +328,7 @@ def test_the_film_shows_what_moved_where_it_was(tmp_path, meshcat):
     assert hinge.get_angle(scene.context) == pytest.approx(0.6, abs=1e-9)
 
 
-def test_the_docs_example_is_what_it_says():
+def test_example_of_the_docs_runs():
     text = (Path(__file__).parents[2] / "docs" / "station.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"^```yaml\n(environment:.*?)^```$", text, re.M | re.S)
     scenario = ScenarioFromData(yaml_load(data=example), "station.md")
@@ -339,7 +337,7 @@ def test_the_docs_example_is_what_it_says():
     assert slave.contact.beyond == ""
 
 
-def test_what_the_law_does_not_know_is_not_linearised():
+def test_unmodelled_contact_is_not_linearised():
     scenario = replace(Scenario(), environment=[Block()])
     with pytest.raises(DrakeTeleopError, match="cannot be linearised: block can move"):
         linearize(scenario)
@@ -357,7 +355,7 @@ def test_what_the_law_does_not_know_is_not_linearised():
         ({"_tag": "!Block", "table": [0.05, 0.05]}, "smaller than the block"),
     ],
 )
-def test_a_thing_that_cannot_be_is_one_error(thing, what):
+def test_invalid_environment_is_one_error(thing, what):
     with pytest.raises(DrakeTeleopError, match=what):
         ScenarioFromData({"environment": [thing]}, "scenario.yaml")
 
@@ -373,14 +371,14 @@ def test_a_thing_that_cannot_be_is_one_error(thing, what):
          "<mesh><uri>lost.obj</uri></mesh>", "shapes are missing of pad"),
     ],
 )  # fmt: skip
-def test_a_scene_that_would_be_left_out_is_one_error(old, new, what, tmp_path):
+def test_scene_that_cannot_be_touched_is_one_error(old, new, what, tmp_path):
     (tmp_path / "pad.sdf").write_text(SOFT_PAD.replace(old, new))
     scene = Scene(file=str(tmp_path / "pad.sdf"), contact="hydroelastic")
     with pytest.raises(DrakeTeleopError, match=what):
         AddSlavePlant(DiagramBuilder(), Slave(), scene)
 
 
-def test_what_moves_without_a_mass_is_one_error(tmp_path):
+def test_moving_body_without_mass_is_one_error(tmp_path):
     (tmp_path / "ghost.urdf").write_text('<robot name="ghost"><link name="ghost"/></robot>')
     scene = Scene(file=str(tmp_path / "ghost.urdf"), fixed=False)
     with pytest.raises(DrakeTeleopError, match="ghost can move, and has no mass"):

@@ -46,7 +46,7 @@ def floor() -> NoiseFloor:
 
 
 @pytest.mark.parametrize("statistic", ["level", "glr"])
-def test_the_block_says_what_the_detector_of_logs_says(arm, statistic):
+def test_block_equals_the_detector_of_logs(arm, statistic):
     """Of a load that moves, and is pushed; samples that are saturated, or none, change nothing.
 
     The wrench drifts much faster than the detector follows.
@@ -107,7 +107,7 @@ def identified():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.015, 0.05])
-def test_the_papers_contact_is_noticed_and_the_hand_knows_after_the_delay(identified, delay):
+def test_contact_is_detected_and_reaches_the_hand_after_the_delay(identified, delay):
     scenario, estimate, noise_floor = identified
     scenario = replace(scenario, channel=Channel(delay=delay))
     station = MakeTeleopStation(scenario, load_estimate=estimate, noise_floor=noise_floor)
@@ -122,7 +122,7 @@ def test_the_papers_contact_is_noticed_and_the_hand_knows_after_the_delay(identi
 
 
 @pytest.mark.slow
-def test_a_station_without_a_detector_has_none_of_it(identified):
+def test_station_without_detector_has_no_contact_signal(identified):
     scenario, estimate, _ = identified
     plain = replace(scenario, contact_detection=None)
     station = MakeTeleopStation(plain, load_estimate=estimate)

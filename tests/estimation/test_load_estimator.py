@@ -71,7 +71,7 @@ def MakeEstimator(initial=None, **config):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["rls", "rtls"])
-def test_in_the_loop_it_is_the_estimator_of_logs(method):
+def test_block_equals_the_estimator_of_logs(method):
     rows = samples(0, duration=0.3)
     rows[20, 15] = 1.0  # saturated: not learnt from
     history = run(MakeEstimator(method=method), rows)
@@ -84,7 +84,7 @@ def test_in_the_loop_it_is_the_estimator_of_logs(method):
 
 
 @pytest.mark.parametrize("method", ["rls", "rtls"])
-def test_settles_and_is_then_right(method):
+def test_settled_estimate_is_right(method):
     rows = samples(1)
     history = run(MakeEstimator(method=method, settled_bound=0.1), rows)
     settled = history[:, 16]
@@ -94,7 +94,7 @@ def test_settles_and_is_then_right(method):
     assert set(settled) == {0.0, 1.0}
 
 
-def test_a_load_that_is_given_stays_until_something_is_learnt():
+def test_given_load_stays_until_the_first_update():
     known = np.concatenate([SENSOR.offset, PHI])
     still = np.zeros((5, 22))
     still[:, :6] = SENSOR.offset
@@ -104,7 +104,7 @@ def test_a_load_that_is_given_stays_until_something_is_learnt():
         assert history[-1, 16] == 0.0
 
 
-def test_total_least_squares_removes_the_bias_that_the_acceleration_noise_makes():
+def test_total_least_squares_removes_the_bias_of_acceleration_noise():
     """The sensor's own noise and filter: the inertias by rls are off by several sigma, not rtls."""
 
     def errors(estimator: RecursiveEstimator, rows):
@@ -119,6 +119,6 @@ def test_total_least_squares_removes_the_bias_that_the_acceleration_noise_makes(
     assert (np.abs(total.mean(axis=0)) < 0.2 * np.abs(least.mean(axis=0))).all()
 
 
-def test_an_unknown_method_is_refused():
+def test_unknown_method_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"method.*'tls' is not known"):
         check_ranges(LoadEstimatorConfig(method="tls"), "load_estimator")

@@ -120,7 +120,7 @@ def test_it_settles_and_freezes(grasped, tool):
 
 
 @pytest.mark.slow
-def test_a_grasp_is_noticed_and_the_object_is_found(grasped):
+def test_grasp_is_detected_and_the_object_identified(grasped):
     """It is known half a second later that it is another load, and soon which one."""
     assert first(grasped, DISTURBED) - GRASP < 0.05
     changed = first(grasped, OTHER_LOAD)
@@ -135,7 +135,7 @@ def test_a_grasp_is_noticed_and_the_object_is_found(grasped):
 
 
 @pytest.mark.slow
-def test_what_is_handed_out_fades_without_a_step(grasped):
+def test_estimate_changes_without_a_step(grasped):
     """Between two known loads nothing is eliminated; each sample goes a hundredth of the way."""
     phi = grasped["load_estimate"][:, 6:]
     faded = phi[grasped.t < first(grasped, SETTLED, first(grasped, OTHER_LOAD))][-1]
@@ -146,7 +146,7 @@ def test_what_is_handed_out_fades_without_a_step(grasped):
 
 
 @pytest.mark.slow
-def test_contacts_are_no_change(known):
+def test_contacts_are_not_a_change_of_load(known):
     """Fig. 8, and pressing down on the leaf for good, still and sliding: nothing fades."""
     touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
     press = MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.075])
@@ -219,7 +219,7 @@ def test_a_push_at_rest_is_neither_an_offset_nor_a_load(known):
 
 
 @pytest.mark.slow
-def test_the_gripper_that_is_known_otherwise_stays_eliminated(known, grasped):
+def test_known_gripper_stays_eliminated(known, grasped):
     names = ("measured_wrench_S", "specific_force_S", "angular_velocity_S")
     rows = np.hstack([grasped[name] for name in (*names, "angular_acceleration_S")])[2500:]
     gripper = 0.5 * known[0][6:]
@@ -229,12 +229,12 @@ def test_the_gripper_that_is_known_otherwise_stays_eliminated(known, grasped):
     assert handed[-1, 6] == pytest.approx(known[0][6] + MASS, rel=0.01)
 
 
-def test_what_cannot_be_watched_is_refused():
+def test_watch_without_a_load_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"load_estimator.method: .*too small.*rtls"):
         replace(SCENARIO, load_estimator__method="rls").check()
     with pytest.raises(DrakeTeleopError, match=r"load_estimator.watch: .*no load to watch"):
         MakeTeleopStation(replace(Scenario(), load_estimator__watch=True))
 
 
-def test_a_station_that_does_not_watch_has_no_such_signal():
+def test_station_without_watch_has_no_load_state():
     assert not MakeTeleopStation(Scenario()).HasOutputPort("load_state")

@@ -330,7 +330,7 @@ def test_no_file(tmp_path):
         with pytest.raises(DrakeTeleopError, match=rf"bad\.json: {message}"):
             Identification.load(tmp_path / "bad.json")
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(DrakeTeleopError, match=r"binary\.json: is no text"):
+    with pytest.raises(DrakeTeleopError, match=r"binary\.json: is not UTF-8 text"):
         Identification.load(tmp_path / "binary.json")
 
 

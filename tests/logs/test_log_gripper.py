@@ -149,7 +149,7 @@ def test_scales_that_do_not_go_together(files: Path) -> None:
     log = files / "total.parquet"
     with pytest.raises(DrakeTeleopError, match=r"sigma_object.*gripper"):
         eliminate_log(log, load, sigma_object=0.5)
-    with pytest.raises(DrakeTeleopError, match="eta goes with"):
+    with pytest.raises(DrakeTeleopError, match="eta requires sigma = 0"):
         eliminate_log(log, load, gripper=gripper, eta=0.5, sigma_object=0.5)
     with pytest.raises(DrakeTeleopError, match="sigma_object: -1 is outside"):
         eliminate_log(log, load, gripper=gripper, sigma_object=-1.0)

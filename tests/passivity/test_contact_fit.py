@@ -16,7 +16,7 @@ def found(stiffness, damping, way, faster, keep=0.8):
 
 
 @pytest.mark.parametrize(("stiffness", "damping"), [(290.0, 17.0), (1100.0, 3.0), (150.0, 0.0)])
-def test_spring_and_damper_are_told_apart(stiffness, damping):
+def test_fit_separates_stiffness_and_damping(stiffness, damping):
     rng = np.random.default_rng(4)
     way, faster = 3e-4 * rng.normal(size=30), 0.01 * rng.normal(size=30)
     k, b = found(stiffness, damping, way, faster)
@@ -25,7 +25,7 @@ def test_spring_and_damper_are_told_apart(stiffness, damping):
     assert k == pytest.approx(stiffness, rel=0.1 * (damping > 0.0), abs=1e-9)
 
 
-def test_what_cannot_be_told_apart_is_a_spring_and_the_past_is_forgotten():
+def test_proportional_speed_is_stiffness_and_old_stretches_fade():
     way = np.full(20, 2e-4)
     k, b = found(300.0, 17.0, way, 10.0 * way)
     assert b <= 17.0 and k + 10.0 * b == pytest.approx(470.0, rel=0.02)
@@ -37,14 +37,14 @@ def test_what_cannot_be_told_apart_is_a_spring_and_the_past_is_forgotten():
     assert k == pytest.approx(100.0, rel=0.01)
 
 
-def test_neither_is_negative():
+def test_stiffness_and_damping_are_not_negative():
     assert update_fit(np.zeros(NUM_SUMS), -1.0, 1e-3, 0.1, 0.5) == (
         0.0,
         pytest.approx(0.0, abs=1e-9),
     )
 
 
-def test_a_slip_is_no_stiffness_and_a_stop_that_is_struck_is_one():
+def test_slip_is_excluded_from_stiffness_and_a_hit_stop_is_not():
     """Of what a way of 0.2 mm changes: up to 0.12 N are a spring's, 0.4 N at most friction's."""
     for sign in (1.0, -1.0):
         assert sign * slip_change(sign * 0.1, sign * 0.12, 0.4) == 0.0

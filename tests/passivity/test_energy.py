@@ -32,20 +32,20 @@ def least(bench: ModuleType) -> dict[str, dict[str, float]]:
 
 
 @pytest.mark.slow
-def test_tdpa_never_gives_out_more_than_was_put_in(least):
+def test_tdpa_output_never_exceeds_input(least):
     assert least["tdpa"]["energy"] >= -1e-9
     assert least["tdpa"]["stronger"] <= 1e-12, "the wrench became stronger"
 
 
 @pytest.mark.slow
-def test_what_is_charged_by_drag_is_not_given_out_twice(least):
+def test_energy_from_drag_is_released_once(least):
     assert least["charged_tdpa"]["energy"] >= -1e-9
     assert least["charged_tdpa"]["stronger"] <= 0.28 + 1e-12, "stronger by more than the drag"
     assert least["charged_tdpa"]["stronger"] > 0.2, "there should have been drag"
 
 
 @pytest.mark.slow
-def test_waves_give_out_the_energy_that_came_and_no_more(least):
+def test_wave_output_is_the_received_energy(least):
     assert least["wave"]["energy"] >= -1e-9
     assert least["wave_hold"]["energy"] < -1e-3, "held waves should have created energy"
 
@@ -58,5 +58,5 @@ def test_a_tank_is_never_overdrawn_at_the_true_port_of_a_held_wrench(least):
 
 
 @pytest.mark.slow
-def test_without_a_method_energy_is_created(least):
+def test_energy_is_created_without_a_method(least):
     assert least["none"]["energy"] < -1.0

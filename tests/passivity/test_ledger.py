@@ -93,7 +93,7 @@ def hard_taps(seed: int, passivity: PassivityConfig, **imperfect) -> OneDofRun:
 
 
 @pytest.mark.parametrize("seed", [1, 9])
-def test_no_energy_comes_out_at_the_actual_motion(seed):
+def test_no_energy_is_created_at_the_actual_motion(seed):
     """From E_0 on, and from nothing if drag earns it.
 
     Of 40 seeds these are the ones in which motors that are not held to the account give out most.
@@ -116,13 +116,13 @@ def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
 
 
 @pytest.mark.parametrize(("servo", "damping"), [(0.8, 1.2), (1.2, 1.2), (1.2, 0.8)])
-def test_a_servo_that_is_not_as_told_and_a_slow_motor_cost_nothing(servo, damping):
+def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
     imperfect = {"believed_stiffness": servo, "believed_damping": damping, "motor_lag": 3e-3}
     for seed in (1, 9):
         assert hard_taps(seed, CHARGED_BEFORE, **imperfect).least(ACTUAL) >= -1e-6
 
 
-def test_a_ledger_is_what_came_less_what_went_and_carries_its_debt():
+def test_ledger_is_input_minus_output_and_keeps_its_deficit():
     """At every step, of hand and slave: with a hand that is pushed and pays for nothing, too."""
     p, method = parameters(CHARGED_BY_DRAG), steps_of("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -154,7 +154,7 @@ def test_a_ledger_is_what_came_less_what_went_and_carries_its_debt():
     assert least < 0.0, "there should have been a debt"
 
 
-def test_motors_may_not_spend_what_the_slave_moves_with():
+def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
     """A = L_s - m v^2 / 2 of each group, the mass taken for 5 % more than was told."""
     p = parameters(PassivityConfig(method="ledger", slave_mass=[4.0, 0.02]))
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -170,7 +170,7 @@ def test_motors_may_not_spend_what_the_slave_moves_with():
 
 
 @pytest.mark.parametrize("seed", [4, 38])
-def test_what_the_safe_state_makes_of_the_command_is_paid_for_too(seed):
+def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     """Pressing hard through silences, with motors that are late: of 40 seeds, where most is lost.
 
     In 38 if the safe state has the last word; in 4 if the motors may brake with all that it asks.
@@ -196,7 +196,7 @@ def test_what_the_safe_state_makes_of_the_command_is_paid_for_too(seed):
         (FIRM, 20e3, 5e-4, 0.0),
     ],
 )
-def test_at_rest_is_felt_what_is_pressed(grip, wall, delay, loss):
+def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
     """With nothing in store at the start, told nothing of the hand."""
     task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
@@ -214,7 +214,7 @@ def test_at_rest_is_felt_what_is_pressed(grip, wall, delay, loss):
 
 
 @pytest.mark.parametrize(("grip", "delay"), [(LIGHT, 0.05), (MEDIUM, 0.05)])
-def test_a_wall_that_damps_and_an_arm_that_rubs_are_felt_as_they_are(grip, delay):
+def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay):
     """Damping that is taken for stiffness is felt without being pressed."""
     axis = model(grip, 2.5e3, wall_damping=300.0, slave_friction=30.0)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
@@ -224,7 +224,7 @@ def test_a_wall_that_damps_and_an_arm_that_rubs_are_felt_as_they_are(grip, delay
 
 
 @pytest.mark.parametrize("grip", [MEDIUM, FIRM])
-def test_a_hard_wall_is_hard_to_a_hand_that_stays(grip):
+def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
     """At 300 ms: 20 kN/m are 1.1 kN/m at the hand, of which the first second shows 300 N/m."""
     axis = model(grip, 20e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
@@ -233,7 +233,7 @@ def test_a_hard_wall_is_hard_to_a_hand_that_stays(grip):
     assert found.felt_force > 0.95 * 0.02 * hard * grip[2] / (hard + grip[2])
 
 
-def test_a_short_silence_does_not_let_a_hand_that_stays_sink():
+def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
     """48 ms without a packet, at a round trip of 100 ms: the slave used to give way by 2.6 mm."""
     network = NetworkConfig(delay=0.05, loss=0.01, burst=0.02)
     run = run_one_dof(
@@ -245,7 +245,7 @@ def test_a_short_silence_does_not_let_a_hand_that_stays_sink():
     assert np.ptp(run.slave[rest]) < 2e-5 and np.ptp(run.felt[rest]) < 0.01
 
 
-def test_a_change_of_grip_leaves_no_motion_behind():
+def test_motion_ends_after_a_change_of_grip():
     t = times(9.0)
     for before, after in ((FIRM, LIGHT), (LIGHT, FIRM)):
         share = np.clip((t - 6.0) / 0.1, 0.0, 1.0)[:, None]
@@ -261,7 +261,7 @@ def test_a_change_of_grip_leaves_no_motion_behind():
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.3])
-def test_a_hand_that_lets_go_is_not_thrown(delay):
+def test_released_hand_is_not_accelerated(delay):
     t = times(10.0)
     grip = np.tile(MEDIUM, (len(t), 1))
     grip[t >= 8.0] = 0.0
@@ -276,7 +276,7 @@ def test_a_hand_that_lets_go_is_not_thrown(delay):
 
 
 @pytest.mark.parametrize("wall", [5.1e3, 20e3])
-def test_a_wall_that_has_gone_is_not_felt_for_long(wall):
+def test_removed_wall_is_rendered_briefly(wall):
     """By taps of 1 Hz: once more, until the slave has been there; a round trip is 100 ms."""
     t = times(10.0)
     x = -0.01 - 0.025 * np.cos(2.0 * np.pi * t)
@@ -295,9 +295,7 @@ def test_a_wall_that_has_gone_is_not_felt_for_long(wall):
     [(LIGHT, 0.05), (MEDIUM, 0.15), (FIRM, 0.05)],
     ids=["light", "medium", "firm"],
 )
-def test_a_wall_that_has_gone_under_a_hand_that_presses_is_felt_until_the_news_is_there(
-    grip, delay
-):
+def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
     """It keeps what was put into it, and so a part of the reserves: no reason for drag yet.
 
     A light hand presses with less than the 1 N that tell at once.
@@ -319,7 +317,7 @@ def test_a_wall_that_has_gone_under_a_hand_that_presses_is_felt_until_the_news_i
     [(LIGHT, 2e3), (LIGHT, 50e3), (FIRM, 20e3)],
     ids=["a touch", "hardly in", "hard"],
 )
-def test_a_wall_that_has_gone_is_felt_for_half_a_round_trip_of_10_ms(grip, wall):
+def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
     """But for the drag that earns back what it kept, 0.28 N."""
     t = times(7.0)
     there = np.stack([np.zeros(len(t)), np.where(t < 6.0, wall, 0.0)], axis=1)
@@ -334,7 +332,7 @@ def test_a_wall_that_has_gone_is_felt_for_half_a_round_trip_of_10_ms(grip, wall)
 
 
 @pytest.mark.parametrize("rate", [0.7, 1.5])
-def test_taps_are_felt_from_the_second_on(rate):
+def test_taps_are_rendered_from_the_second_on(rate):
     """News of each comes when the hand is out again: the remembered wall stands in for it."""
     t = times(9.0)
     x = charging(t, 20.0, 0.0)[:, 0]
@@ -352,7 +350,7 @@ def test_taps_are_felt_from_the_second_on(rate):
     [(FIRM, 5.1e3, 0.15, 6.0, 0.98), (MEDIUM, 20e3, 0.15, 9.0, 0.85), (FIRM, 2e4, 0.05, 12.0, 0.7)],
     ids=["firm", "hard", "both"],
 )
-def test_a_hand_that_was_faster_than_the_news_feels_what_is_pressed(grip, wall, delay, end, share):
+def test_fast_hand_receives_the_contact_force(grip, wall, delay, end, share):
     """30 mm within a second: the slave has spent its reserve before the hand pays."""
     axis = model(grip, wall)
     run = run_one_dof(

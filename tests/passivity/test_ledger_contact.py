@@ -73,7 +73,7 @@ class Hand:
         return felt
 
 
-def test_a_point_that_is_touched_far_from_the_reference_is_one_spring():
+def test_contact_far_from_the_reference_is_one_spring():
     """As deep as the point itself goes, whether the hand moves or turns; the torque goes along."""
     arm, k = np.array([0.0, 0.1, 0.0]), 200.0
     normal = np.array([0.0, 0.0, 1.0, *np.cross(arm, [0.0, 0.0, 1.0])])
@@ -87,7 +87,7 @@ def test_a_point_that_is_touched_far_from_the_reference_is_one_spring():
         np.testing.assert_allclose(hand.rest(50), (2.0 + k * depth) * normal, rtol=0.01, atol=1e-4)
 
 
-def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
+def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
     """News of friction come late: shown as they come they would push a hand that has turned."""
     wrench = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     hand = Hand(wrench, 200.0)
@@ -106,7 +106,7 @@ def test_friction_is_of_the_hands_own_motion_and_at_rest_what_is_measured():
     np.testing.assert_allclose(still, np.zeros(6), atol=1e-9, err_msg="nor where it moves there")
 
 
-def test_friction_does_not_fade_under_a_hand_that_rests():
+def test_friction_stays_under_a_resting_hand():
     """Over 600 ms what the slave measures now is less than what holds the hand."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
@@ -120,7 +120,7 @@ def test_friction_does_not_fade_under_a_hand_that_rests():
 
 
 @pytest.mark.parametrize("way", [1e-3, -1e-3])
-def test_friction_stays_across_a_direction_that_turns(way):
+def test_friction_stays_across_a_rotating_direction(way):
     """An arm that rubs presses aslant at first. What was shown of friction then was 0.2 N along."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
@@ -134,7 +134,7 @@ def test_friction_stays_across_a_direction_that_turns(way):
     assert abs(felt[1]) > 0.4, "friction is still shown"
 
 
-def test_the_brake_on_a_hand_that_was_pushed_fades_with_its_speed():
+def test_brake_of_an_accelerated_hand_fades_with_its_speed():
     """0.5 N above 0.1 m/s, nothing below 0.05, and no edge that would be felt between."""
     hand = Hand(np.array([0.0, 0.0, 6.0, 0.0, 0.0, 0.0]), 200.0)
     hand.rest(1500)
@@ -151,7 +151,7 @@ def test_the_brake_on_a_hand_that_was_pushed_fades_with_its_speed():
 
 
 @pytest.mark.parametrize("turns", [0.6e-3, -0.6e-3])
-def test_friction_whose_torque_hides_a_force_is_no_press(turns):
+def test_friction_force_along_the_contact_is_removed(turns):
     """A point 40 mm off is touched, then one on the other side; 2.6 and 3.4 N of 3 were felt."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.12, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
@@ -165,7 +165,7 @@ def test_friction_whose_torque_hides_a_force_is_no_press(turns):
     assert felt[1] > 0.05, "friction is still shown"
 
 
-def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
+def test_stick_slip_does_not_drive_the_hand():
     """Three times a second to and fro on what is touched, as before a stiff leaf over `internet`.
 
     What is felt of that comes a round trip late, and would keep it going.
@@ -180,7 +180,7 @@ def test_a_tip_that_sticks_and_slips_does_not_drive_the_hand():
 
 
 @pytest.mark.parametrize("turning", [False, True])
-def test_friction_that_is_held_over_a_step_does_not_shake_a_light_hand(turning):
+def test_sampled_friction_does_not_oscillate_with_a_light_hand(turning):
     """Its spring gives out k T / 2; a hand that rubs over `lan` shook at 58 Hz by what it felt."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     axis, inertia, rubs = (4, 2e-4, 0.05) if turning else (1, 0.02, 0.5)
@@ -198,7 +198,7 @@ def test_friction_that_is_held_over_a_step_does_not_shake_a_light_hand(turning):
     assert np.ptp(way[-100:]) < 0.1 * np.ptp(way[:50])
 
 
-def test_friction_is_not_of_the_way_along_the_contact():
+def test_friction_ignores_motion_along_the_contact():
     """A point 40 mm off: the hand goes and turns along n, and feels the wall as without any."""
     normal = np.array([0.0, 0.0, 1.0, 0.04, 0.0, 0.0])
     way = 2e-5 * np.array([0.0, 0.0, 1.0, 0.04 / 0.1**2, 0.0, 0.0])
@@ -216,7 +216,7 @@ def test_friction_is_not_of_the_way_along_the_contact():
     assert abs(felt[1][-1, 2]) > 0.1, "the wall is felt"
 
 
-def test_a_hand_that_lets_go_gets_no_more_than_what_its_ledger_keeps():
+def test_released_hand_receives_at_most_its_ledger():
     """R_m + 0.7 R_s in contact, and what its drag has cost, though the wall follows with 3 N."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.rest(1000)
@@ -241,7 +241,7 @@ def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
     assert got <= 0.0
 
 
-def test_after_missing_packets_the_wrench_goes_over_gradually():
+def test_wrench_cross_fades_after_missing_packets():
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0)
     hand.rest(100)
     hand.packet[WRENCH][2] = 1.0
@@ -279,7 +279,7 @@ def test_friction_that_changes_its_sign_does_not_soften_the_wall():
     assert 180.0 < packet[CONTACT_STIFFNESS] < 350.0, "too stiff is stable, too soft is not"
 
 
-def test_a_tip_that_slips_once_is_no_step_of_what_is_pressed_and_a_wall_that_gives_is():
+def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
     """On a wall of 200 N/m, 0.1 m below So: 0.5 N that held it sideways let go, then 1 N is gone.
 
     The mean of force and friction is no normal, so that the slip is a step along it, by 0.3 N.
@@ -307,7 +307,7 @@ def test_a_tip_that_slips_once_is_no_step_of_what_is_pressed_and_a_wall_that_giv
     assert felt[2505] == pytest.approx(3.0, abs=0.15)
 
 
-def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_another():
+def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
     """At the slave 18 N at a lever of 40 mm, in the master's power units at three scales."""
     config = PassivityConfig(method="ledger")
     contact = np.array([0.0, 0.0, 18.0, 0.0, 0.7, 0.0])
@@ -325,7 +325,7 @@ def test_a_contact_is_the_same_whatever_the_scales_are_and_one_against_it_is_ano
     np.testing.assert_allclose(sizes, np.hypot(18.0, 7.0) / 17.5, rtol=1e-12)
 
 
-def test_the_loads_weight_is_no_contact_and_is_felt_beside_one():
+def test_weight_of_the_load_is_rendered_beside_a_contact():
     """Lowered onto a wall of 200 N/m: the account is of all, touch and prediction are of the wall.
 
     A load that shakes is felt smoothed, over a round trip and the servo's lag.

@@ -155,7 +155,7 @@ def test_the_world_axes_do_not_matter(method):
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, bad):
+def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
     p = parameters(PassivityConfig(method=method))
     memory = initial_memory(method, p, START)
     received, zero = np.zeros(PACKET_SIZE), np.zeros(6)
@@ -174,7 +174,7 @@ def test_what_is_not_finite_gives_no_force_and_leaves_the_ledgers_alone(method, 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_step_stays_within_what_it_is_given(method):
+def test_step_writes_only_into_its_arguments(method):
     """Compiled code does not notice the end of an array: here each lies between other numbers."""
     rng, m = np.random.default_rng(4), steps_of(method)
     around = []
@@ -205,7 +205,7 @@ def test_a_step_stays_within_what_it_is_given(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_slave_stays_until_a_packet_arrives(method):
+def test_slave_keeps_its_pose_until_a_packet_arrives(method):
     rng = np.random.default_rng(3)
     config = PassivityConfig(method=method)
     still = np.tile(START, (50, 1))
@@ -215,7 +215,7 @@ def test_the_slave_stays_until_a_packet_arrives(method):
     np.testing.assert_allclose(command, np.tile([*START, *np.zeros(6)], (50, 1)), atol=1e-12)
 
 
-def test_a_method_that_does_not_exist_is_refused():
+def test_unknown_method_is_rejected():
     with pytest.raises(DrakeTeleopError, match="there is no method 'waves'"):
         initial_memory("waves", np.zeros(1), START)
     with pytest.raises(DrakeTeleopError, match="method"):
@@ -242,7 +242,7 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0])
-def test_a_slave_whose_inertia_is_felt_is_not_left_behind(sigma):
+def test_slave_follows_while_its_inertia_is_rendered(sigma):
     """Accelerating costs energy there; what the master's end has too much of comes back."""
     model = OneDof(sigma=sigma)
     network = NetworkConfig(delay=0.3, jitter=0.25, loss=0.1)
@@ -254,7 +254,7 @@ def test_a_slave_whose_inertia_is_felt_is_not_left_behind(sigma):
 @pytest.mark.parametrize(
     ("stored", "left"), [(2e-3, 3.0 - 0.45 / 2.0), (3e-4, 1.0), (9e-3, 3.0), (0.0, 0.0)]
 )
-def test_a_wrench_falls_by_a_blow_only_if_nothing_pays_for_less(stored, left):
+def test_wrench_drops_abruptly_only_without_energy(stored, left):
     """A hand that feels 3 N and gives way by 0.3 mm in a step, motion scaled by 2: 450 N/s."""
     p = parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
     memory, packet, wrench = initial_memory("tdpa", p, START), np.zeros(PACKET_SIZE), np.zeros(6)
@@ -269,7 +269,7 @@ def test_a_wrench_falls_by_a_blow_only_if_nothing_pays_for_less(stored, left):
     np.testing.assert_allclose(wrench, [0.0, left, 0.0, 0.0, 0.0, 0.0], rtol=1e-12, atol=0.0)
 
 
-def test_a_tank_that_sends_all_at_once_is_not_overdrawn():
+def test_tank_with_fastest_sending_is_not_overdrawn():
     """A thousand times its content in a second, every millisecond and every ten."""
     p = parameters(PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0)))
     for step in (T, 10 * T):
@@ -281,7 +281,7 @@ def test_a_tank_that_sends_all_at_once_is_not_overdrawn():
         np.testing.assert_allclose(memory[LEDGER] + memory[SENT], full, rtol=1e-12)
 
 
-def test_a_tank_that_was_overdrawn_carries_its_debt():
+def test_overdrawn_tank_keeps_its_deficit():
     """What comes repays it first; where it was written off, energy came from nothing."""
     p = parameters(PassivityConfig(method="two_layer"))
     memory, received = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)

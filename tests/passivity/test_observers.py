@@ -31,7 +31,7 @@ def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
         np.testing.assert_allclose(work[-1], [0.6 - 0.2 + 0.5, 0.4 * 2.5], rtol=1e-12)
 
 
-def test_the_pairs_differ_by_what_a_step_is_worth():
+def test_pairs_differ_by_the_work_of_a_step():
     """A spring that is sampled: `mean` is its energy exactly, the others are off by k dx^2 / 2."""
     x, k = np.array([0.0, 0.1, 0.15, 0.4]), 7.0
     pose, wrench = np.zeros((4, 7)), np.zeros((4, 6))
@@ -43,7 +43,7 @@ def test_the_pairs_differ_by_what_a_step_is_worth():
     np.testing.assert_allclose(work["backward"], stored + step)
 
 
-def test_what_tdpa_has_on_its_books_is_the_work_at_the_hand():
+def test_tdpa_ledger_is_the_work_at_the_hand():
     rng = np.random.default_rng(5)
     master, f_e = poses(rng, 1200), wrenches(rng, 1200)
     config = PassivityConfig(method="tdpa", retreat=[1e3, 1e3])  # what that withholds is lost
@@ -57,7 +57,7 @@ def test_what_tdpa_has_on_its_books_is_the_work_at_the_hand():
 
 
 @pytest.mark.parametrize("short", [None, "master", "slave"])
-def test_the_drag_is_felt_only_while_an_end_holds_less_than_the_reserve(short):
+def test_drag_acts_only_below_the_reserve(short):
     """All of it, against the motion, at a speed beyond the fading one."""
     config = PassivityConfig(method="charged_tdpa")
     p, dx, wrench = parameters(config), np.zeros(6), np.zeros(6)
@@ -83,7 +83,7 @@ def test_created_energy_never_falls():
     np.testing.assert_array_equal(created(energy), [0.0, 0.0, 2.0, 2.0, 2.0])
 
 
-def test_what_does_not_fit_is_refused():
+def test_arrays_of_wrong_shape_are_rejected():
     with pytest.raises(DrakeTeleopError, match="there is no pair 'forward'"):
         port_work(np.zeros((3, 6)), np.zeros((3, 7)), "forward")
     with pytest.raises(DrakeTeleopError, match="do not fit"):

@@ -60,7 +60,7 @@ def in_bursts(rng: np.random.Generator, steps: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("method", ["wave", "tdpa", "charged_tdpa"])
-def test_the_backward_pair_creates_nothing_between_hand_and_command(method):
+def test_backward_pair_creates_no_energy_between_hand_and_command(method):
     """Translation and rotation apart; the wrench is limited, and nothing fades it."""
     rng, steps = np.random.default_rng(7), 3000
     config = PassivityConfig(
@@ -85,9 +85,7 @@ def test_the_backward_pair_creates_nothing_between_hand_and_command(method):
 
 @pytest.mark.parametrize(("seed", "timeout"), [(3, 0.1), (4, 1.0)])
 @pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
-def test_tdpa_creates_nothing_at_the_command_and_at_most_a_motion_at_the_slave(
-    method, seed, timeout
-):
+def test_tdpa_creates_at_most_the_kinetic_energy_at_the_slave(method, seed, timeout):
     """A command that jumped, and one that the safe state moved, gave out 0.96 to 1.2 J."""
     found = pressed(method, seed, timeout)
     moving = 0.5 * MEDIUM.force_scale * MEDIUM.slave_mass * TdpaConfig().speed[0] ** 2
@@ -95,7 +93,7 @@ def test_tdpa_creates_nothing_at_the_command_and_at_most_a_motion_at_the_slave(
     assert found.least(COMMAND) > -1e-3  # the hand's pair is the held one here
 
 
-def test_a_wave_end_gives_out_only_what_it_was_given():
+def test_wave_end_releases_only_received_energy():
     """Of what came at hand or command, and by the network, all is in store, sent on or lost.
 
     A wave that is played without being paid for is missing here at once, and at the ports only if
@@ -118,7 +116,7 @@ def test_a_wave_end_gives_out_only_what_it_was_given():
         np.testing.assert_allclose(put_in + end.received, kept, rtol=1e-9)
 
 
-def test_tdpa_repays_what_a_tap_has_cost():
+def test_tdpa_repays_the_energy_of_a_tap():
     """Taps of 50 mm at 2 Hz over 100 ms: 0.16 J in 4 s if it sends before it repays."""
     t = np.arange(4000) * PERIOD
     x = 0.05 * np.sin(4.0 * np.pi * t) * np.minimum(t / 0.5, 1.0)
@@ -131,7 +129,7 @@ def test_tdpa_repays_what_a_tap_has_cost():
 
 
 @pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
-def test_a_debt_at_the_actual_motion_is_repaid_before_anything_is_sent(method):
+def test_tdpa_repays_a_deficit_before_it_sends(method):
     """The slave goes 30 mm into a wall that pushes with 2 N, and is pushed 60 mm out again.
 
     The hand has paid little: in a whole run the energy of `charged_tdpa`'s drag hides a debt that
@@ -152,24 +150,24 @@ def test_a_debt_at_the_actual_motion_is_repaid_before_anything_is_sent(method):
 
 
 @pytest.mark.parametrize("seed", [1, 3])
-def test_tanks_pay_for_a_command_that_jumps(seed):
+def test_tanks_cover_a_jump_of_the_command(seed):
     """0.18 and 0.33 J were created, by a servo that accelerates more than was assumed."""
     found = pressed("two_layer", seed, 1.0)
     assert found.least(ACTUAL) >= 0.0 and found.least(MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(3, 0.1), (4, 1.0)])
-def test_set_positions_are_paid_for_at_motor_and_slave(seed, timeout):
+def test_set_position_modulation_creates_no_energy_at_motor_and_slave(seed, timeout):
     found = pressed("pspm", seed, timeout)
     assert found.least(ACTUAL) >= 0.0 and found.least(MOTOR) >= 0.0
 
 
 @pytest.mark.parametrize(("seed", "timeout"), [(2, 0.1), (4, 1.0)])
-def test_waves_create_nothing_at_the_command(seed, timeout):
+def test_waves_create_no_energy_at_the_command(seed, timeout):
     assert pressed("wave", seed, timeout).least(COMMAND) >= -1e-9
 
 
-def test_force_limit_is_what_the_hand_feels_at_most():
+def test_force_limit_bounds_the_rendered_force():
     """And reaches: the wall pushes back with twice as much; nothing is promised about energy."""
     found = pressed("force_limit", 2, 1.0)
     limit = ForceLimitConfig().force

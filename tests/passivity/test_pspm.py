@@ -129,7 +129,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
     np.testing.assert_allclose(spent, groups(0.5 * shown**2 / K_h), rtol=1e-9)
 
 
-def test_a_command_that_was_held_back_is_pulled_at_as_it_left(monkeypatch):
+def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     """The servo's wrench, and what the spring has more of is paid for; groups unlike each other."""
     monkeypatch.setattr(pspm, "dot", pspm.dot.py_func)
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])

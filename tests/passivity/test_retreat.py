@@ -9,14 +9,14 @@ from drake_teleop.lab.comparison.one_dof import PERIOD, REFERENCE, operators_int
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.passivity.memory import HELD_WRENCH, MEMORY
 from drake_teleop.station.passivity.methods import METHODS, PassivityConfig, parameters
-from drake_teleop.station.passivity.retreat import retreat
+from drake_teleop.station.passivity.safe_state import retreat
 
 LET_GO = 9000
 
 
 @pytest.mark.parametrize("delay", [0.05, 0.3])
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "none"])
-def test_who_lets_go_is_not_thrown(method, delay):
+def test_released_hand_stays_slow(method, delay):
     """Before a wall of 5.1 kN/m, some 4 N undelayed; 1.3 and 4.4 m/s without the limit."""
     intent = operators_intent()[:11000]
     intent[intent[:, 0] > 0.0] *= 1.375
@@ -30,7 +30,7 @@ def test_who_lets_go_is_not_thrown(method, delay):
     assert speed.max() < 0.3
 
 
-def test_only_what_drives_a_fast_hand_fades():
+def test_only_wrench_along_a_fast_hand_fades():
     """Speed and wrench of each group apart, at the hand's scale; inertia that is felt stays."""
     config = PassivityConfig(method="tdpa", slave_mass=[2.0, 0.5])
     p = parameters(config, motion_scale=[2.0, 1.0])
@@ -53,7 +53,7 @@ def test_only_what_drives_a_fast_hand_fades():
     np.testing.assert_allclose(left(fast, slower), [2.0, 1.0], rtol=1e-5)
 
 
-def test_without_a_method_nothing_is_withheld():
+def test_wrench_is_unchanged_without_a_method():
     memory, wrench = np.zeros(MEMORY), np.ones(6)
     retreat(np.full(6, 50.0), 1.0, parameters(PassivityConfig()), memory, wrench)
     np.testing.assert_array_equal(wrench, np.ones(6))

@@ -101,7 +101,7 @@ def test_pressing_anew_after_a_silence_is_as_without_it(tmp_path, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_motion_that_happened_in_silence_is_not_replayed(tmp_path, method):
+def test_motion_during_silence_is_not_replayed(tmp_path, method):
     """The hand swings from 0.5 to 3 s; nothing arrives from 1 to 2.5 s, while it swings."""
     result = run(silent(tmp_path, [(1.0, 2.5)]), method, OneDof())
     t = result.t
@@ -149,7 +149,7 @@ def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_every_rough_network_is_recovered_from(rough_networks, method):
+def test_station_recovers_after_every_rough_network(rough_networks, method):
     """Whatever the network did until 9 s, in contact: it comes to rest, and the slave is there."""
     model = OneDof(wall_stiffness=500.0)
     for forward, backward in rough_networks:
@@ -165,7 +165,7 @@ def test_every_rough_network_is_recovered_from(rough_networks, method):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
-def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, method):
+def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
     """Before the paper's wall, where several methods chatter: not in the 0.5 s after a silence."""
     resumptions = 0
     for forward, backward in rough_networks:
@@ -181,7 +181,7 @@ def test_nothing_steps_up_while_it_resumes_in_rough_networks(rough_networks, met
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_packet_holds_nothing_that_was_in_its_memory_before(method):
+def test_packet_does_not_contain_old_memory(method):
     """What is sent is finite whatever lay where the packet is written."""
     p = parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])

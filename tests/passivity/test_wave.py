@@ -83,7 +83,7 @@ def test_closed_forms_of_the_line(motion, end, delay):
 
 
 @pytest.mark.parametrize("delay", [10, 50, 150])
-def test_the_slave_stays_behind_by_the_momentum_on_the_line(delay):
+def test_steady_position_error_is_the_momentum_on_the_line(delay):
     """x_m - x_s = f (T + filter) / b in a steady contact."""
     b, stiffness, filtering = 10.0, 291.0, 0.003
     config = WaveConfig(impedance=[b, 0.05], filter=filtering)
@@ -102,7 +102,7 @@ def test_a_line_that_filled_in_contact_holds_it(delay):
 
 
 @pytest.mark.parametrize("delay", [1, 40, 300])
-def test_a_line_that_filled_in_contact_gives_out_no_more_than_stood_on_it(delay):
+def test_line_that_filled_in_contact_releases_only_its_energy(delay):
     """f^2 (T + filter) / 2 b for a round trip of 2 T: to a wall that is matched, and a hand that
     gives way as fast as takes the most from it."""
     config, force, begin, steps = WaveConfig(), 5.0, 2 * delay + 100, 3 * delay + 300
@@ -123,7 +123,7 @@ def test_a_line_that_filled_in_contact_gives_out_no_more_than_stood_on_it(delay)
     assert 0.3 * stood < max(given) <= stood
 
 
-def test_what_fills_a_line_is_accounted_for_once():
+def test_energy_that_fills_a_line_counts_once():
     """f^2 / 4 b goes back, in store is what the filter lags, and what has come is spent."""
     config, force, n = WaveConfig(), 5.0, 100
     p = parameters(PassivityConfig(method="wave", wave=config))
@@ -146,7 +146,7 @@ def test_what_fills_a_line_is_accounted_for_once():
 
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
-def test_what_comes_after_missing_packets_is_no_blow(missing):
+def test_wrench_rate_is_bounded_after_missing_packets(missing):
     """In contact while the hand moves on: 450 N/s at most, where it would be 1 to 7 N in a step."""
     pressed, begin = 0.01 * (1.0 - np.cos(np.arange(600) * T / 0.15)), 150
     f, _ = line(
@@ -162,7 +162,7 @@ def test_what_comes_after_missing_packets_is_no_blow(missing):
 
 
 @pytest.mark.parametrize(("touch", "rest"), [(0.0, (1 - 3 * T) ** 200), (1e-9, 1.0)])
-def test_a_drift_fades_at_its_rate_unless_that_presses(touch, rest):
+def test_drift_fades_unless_that_increases_contact_force(touch, rest):
     """The wave line brings velocities; what the command lacks of the position is added slowly."""
     p = parameters(PassivityConfig(method="wave", wave=WaveConfig(drift_rate=3.0)))
     start, zero = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(6)

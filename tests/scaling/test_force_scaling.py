@@ -88,13 +88,13 @@ def test_each_scale_that_is_set_while_running_scales_its_own_part(arm):
     assert np.linalg.norm(gripper) > 1.0
 
 
-def test_what_the_hand_feels_is_the_scaled_reaction(arm):
+def test_rendered_wrench_is_the_scaled_reaction(arm):
     out = outputs(ForceScalingConfig(sigma=1.0), arm)
     force_S, force_B = out["scaled_wrench_S"][:3], out["wrench_B"][:3]
     assert np.linalg.norm(force_B) == pytest.approx(np.linalg.norm(force_S) / 17.5)
 
 
-def test_what_the_load_has_in_it_is_the_rest_of_the_contacts(arm):
+def test_load_wrench_is_the_rest_beside_the_contact(arm):
     contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
     touched = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)
     assert not touched["load_wrench_B"].any()
@@ -114,12 +114,12 @@ def test_what_the_load_has_in_it_is_the_rest_of_the_contacts(arm):
         ForceScalingConfig(sigma=0.0, eta=0.5),
     ],
 )
-def test_eta_asks_for_sigma_0_gamma_1_and_a_gripper(config, arm):
+def test_eta_requires_sigma_0_gamma_1_and_a_gripper(config, arm):
     with pytest.raises(DrakeTeleopError, match=r"force_scaling\.eta"):
         ForceScaling(config, arm, np.eye(3))
 
 
-def test_scales_that_cannot_be_are_refused(arm):
+def test_invalid_scales_are_rejected(arm):
     block = ForceScaling(ForceScalingConfig(), arm, np.eye(3))
     context = block.CreateDefaultContext()
     scales = dict(sigma_gripper=0.0, sigma_object=0.0, gamma=1.0, force_scale=np.nan)

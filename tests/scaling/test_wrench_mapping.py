@@ -10,8 +10,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.quaternions import exponential
+from drake_teleop.station.scaling.force_scaling import wrench_to_master, wrench_to_master_into
 from drake_teleop.station.scaling.kinematic_scaling import scale_pose_into
-from drake_teleop.station.scaling.wrench_mapping import wrench_to_master, wrench_to_master_into
 
 TOOL_DOWN = np.diag([1.0, -1.0, -1.0])
 angles = st.floats(-3, 3)

@@ -20,7 +20,7 @@ from drake_teleop.lab.analysis.linearization import linearize, linearize_station
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.environment.sheet_spring import SheetSpring
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate

@@ -20,7 +20,7 @@ from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.station.environment.point_contact import STIFFNESS
-from drake_teleop.station.environment.wall import Wall
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch

@@ -117,6 +117,7 @@ class PoseMotion:
 
     @property
     def spacing(self) -> float:
+        """Distance of the knots [s]."""
         return self.splines.spacing
 
 

@@ -67,6 +67,7 @@ class Grid:
 
     @cached_property
     def length(self) -> int:
+        """Number of samples of the transform."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
@@ -93,6 +94,7 @@ class Bands:
 
     @property
     def count(self) -> int:
+        """Number of bands."""
         return int(self.band[-1]) + 1
 
     @cached_property

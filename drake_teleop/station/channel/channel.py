@@ -63,17 +63,19 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 class Channel(NetworkConfig):
     """Network between master and slave; its own fields are those of `custom`."""
 
-    network: str = choice("custom", _NETWORKS, "a preset, or the network that these fields say")
+    network: str = choice(
+        "custom", _NETWORKS, "a preset, or custom for the network of these fields"
+    )
     backward: NetworkConfig | None = plain(
-        None, "from slave to master; null: as from master to slave"
+        None, "network from slave to master; null: as from master to slave"
     )
     timeout: float | None = quantity(
         None,
         "s",
         1e-3,
         LONGEST_TIMEOUT,
-        "without a packet for so long, an end goes into its safe state; null: half as much again "
-        "as the longest silence in a minute of this network, but 0.1 s at least",
+        "silence after which an end enters its safe state; null: 1.5 times the longest silence in "
+        "a minute of this network, at least 0.1 s",
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
@@ -88,9 +90,9 @@ class Channel(NetworkConfig):
             return own, own if self.backward is None else self.backward
         if own != NetworkConfig() or self.backward is not None:
             raise DrakeTeleopError(
-                f"'{self.network}' says all about the network",
+                f"preset '{self.network}' cannot be combined with other fields",
                 where=f"{where}.network",
-                remedy="leave the other fields out, or set network: custom",
+                remedy="remove these fields, or set network: custom",
             )
         return PRESETS[self.network], PRESETS[self.network]
 

@@ -8,13 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 from pydrake.geometry import (
+    AddContactMaterial,
     CollisionFilterDeclaration,
     GeometryId,
     GeometrySet,
+    ProximityProperties,
     SceneGraph,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     BodyIndex,
     ModelInstanceIndex,
@@ -170,3 +172,10 @@ def ExcludeContact(
         GeometrySet(list(shapes)), GeometrySet(others)
     )
     scene_graph.collision_filter_manager().Apply(between)
+
+
+def ContactMaterial(stiffness: float, dissipation: float, friction: float) -> ProximityProperties:
+    """Return a material for Drake's point contact, with equal static and dynamic friction."""
+    properties = ProximityProperties()
+    AddContactMaterial(properties, dissipation, stiffness, CoulombFriction(friction, friction))
+    return properties

@@ -13,7 +13,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, PrismaticSpring
+from pydrake.multibody.tree import BodyIndex, PrismaticSpring
 
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
@@ -78,7 +78,24 @@ class SheetSpring(Environment):
         return Stand(0.34, 0.24, x + 0.065, y, z - _BENCH_HEIGHT)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        AddSheetSpring(plant, self)
+        """Add the leaf to a plant that is registered with a scene graph, before Finalize.
+
+        Its one degree of freedom, "bending", is the deflection of its end along z_W [m], 0 at rest.
+        """
+        tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
+        # Drake fixes a body's mass when it parses it, so the mass is written into the text.
+        tree.find(".//link[@name='leaf']/inertial/mass").text = repr(self.effective_mass)  # type: ignore[union-attr]
+        # Otherwise the prefix becomes ns0 and Drake drops the leaf's contact properties.
+        ElementTree.register_namespace("drake", "drake.mit.edu")
+        text = ElementTree.tostring(tree.getroot(), encoding="unicode")
+        (instance,) = Parser(plant).AddModelsFromString(text, "sdf")
+        base = plant.GetFrameByName("base", instance)
+        plant.WeldFrames(plant.world_frame(), base, RigidTransform(self.position))
+        bending = plant.GetJointByName("bending", instance)
+        bending.set_default_damping(self.damping)
+        plant.AddForceElement(
+            PrismaticSpring(bending, nominal_position=0.0, stiffness=self.stiffness)
+        )
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
@@ -89,23 +106,3 @@ class SheetSpring(Environment):
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]
         shapes = plant.GetCollisionGeometriesForBody(leaf)
         ExcludeContact(plant, scene_graph, shapes, others)
-
-
-def AddSheetSpring(plant: MultibodyPlant, sheet: SheetSpring) -> ModelInstanceIndex:
-    """Add the leaf to a plant that is registered with a scene graph, before Finalize.
-
-    Its one degree of freedom, "bending", is the deflection of its end along z_W [m], 0 at rest.
-    """
-    tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
-    # Drake fixes a body's mass when it parses it, so the mass is written into the text.
-    tree.find(".//link[@name='leaf']/inertial/mass").text = repr(sheet.effective_mass)  # type: ignore[union-attr]
-    # Otherwise the prefix becomes ns0 and Drake drops the leaf's contact properties.
-    ElementTree.register_namespace("drake", "drake.mit.edu")
-    text = ElementTree.tostring(tree.getroot(), encoding="unicode")
-    (instance,) = Parser(plant).AddModelsFromString(text, "sdf")
-    base = plant.GetFrameByName("base", instance)
-    plant.WeldFrames(plant.world_frame(), base, RigidTransform(sheet.position))
-    bending = plant.GetJointByName("bending", instance)
-    bending.set_default_damping(sheet.damping)
-    plant.AddForceElement(PrismaticSpring(bending, nominal_position=0.0, stiffness=sheet.stiffness))
-    return instance

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.geometry import (
-    AddContactMaterial,
     Box,
     ProximityProperties,
     RoleAssign,
@@ -24,12 +23,12 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, SpatialInertia
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
-from drake_teleop.station.environment.environment import Environment, Stand
+from drake_teleop.station.environment.environment import ContactMaterial, Environment, Stand
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second
 #: (E) is as high as the nut above it permits in the deepest slot.
@@ -92,50 +91,35 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        AddSlot(plant, self)
+        """Add the slot and the tool's second ball to a plant with the tool, before Finalize.
+
+        The body "slot" is welded to the world. The second ball has no mass. Without a scene graph
+        there are no shapes.
+        """
+        body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
+        if not plant.geometry_source_is_registered():
+            return
+        tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL])
+        ball, properties = Sphere(PEG_RADIUS), _material(self)
+        plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
+        plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
+        for name, (X_MBox, box) in _boxes(self).items():
+            plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
+            plant.RegisterVisualGeometry(body, X_MBox, box, name, _BLOCK_COLOUR)
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        UseSlotMaterial(plant, scene_graph, self, tool)
-
-
-def AddSlot(plant: MultibodyPlant, slot: Slot) -> ModelInstanceIndex:
-    """Add the slot and the tool's second ball to a plant with the tool, before Finalize.
-
-    The body "slot" is welded to the world. The second ball has no mass. Without a scene graph there
-    are no shapes.
-    """
-    instance = plant.AddModelInstance("slot")
-    body = plant.AddRigidBody("slot", instance, SpatialInertia.Zero())
-    plant.WeldFrames(plant.world_frame(), body.body_frame(), slot.X_WM)
-    if not plant.geometry_source_is_registered():
-        return instance
-    tool, above = plant.GetBodyByName("tool"), RigidTransform([0.0, 0.0, UPPER_BALL])
-    ball, properties = Sphere(PEG_RADIUS), _material(slot)
-    plant.RegisterCollisionGeometry(tool, above, ball, "upper_ball", properties)
-    plant.RegisterVisualGeometry(tool, above, ball, "upper_ball", _BALL_COLOUR)
-    for name, (X_MBox, box) in _boxes(slot).items():
-        plant.RegisterCollisionGeometry(body, X_MBox, box, name, properties)
-        plant.RegisterVisualGeometry(body, X_MBox, box, name, _BLOCK_COLOUR)
-    return instance
-
-
-def UseSlotMaterial(
-    plant: MultibodyPlant, scene_graph: SceneGraph, slot: Slot, tool: BodyIndex
-) -> None:
-    """Give the tool's balls the slot's material."""
-    source = plant.get_source_id()
-    for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
-        scene_graph.AssignRole(source, ball, _material(slot), RoleAssign.kReplace)
+        """Give the tool's balls the slot's material."""
+        source = plant.get_source_id()
+        for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
+            scene_graph.AssignRole(source, ball, _material(self), RoleAssign.kReplace)
 
 
 def _material(slot: Slot) -> ProximityProperties:
     """Return the material of either side: springs in series, equal dissipation and friction."""
-    properties = ProximityProperties()
-    friction = CoulombFriction(slot.friction, slot.friction)
-    AddContactMaterial(properties, slot.dissipation, 2 * slot.stiffness, friction)
-    return properties
+    return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
 
 
 def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:

@@ -36,16 +36,16 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_into
 class ContactDetectionConfig:
     """Settings of the contact detector; a scenario without this block has none."""
 
-    statistic: str = choice("glr", STATISTICS, "what is compared with the threshold")
+    statistic: str = choice("glr", STATISTICS, "statistic that is compared with the threshold")
     margin: float = quantity(
-        MARGIN, "1", 1.0, 10.0, "threshold over the most that the identification's motion reached"
+        MARGIN, "1", 1.0, 10.0, "threshold over the largest value in the identification's motion"
     )
-    hold: float = quantity(0.02, "s", 0.0, 1.0, "quiet after which a contact is over")
+    hold: float = quantity(0.02, "s", 0.0, 1.0, "time below the threshold that ends a contact")
     drift_time: float = quantity(
-        5.0, "s", 0.5, 1e4, "within which the detector follows the offsets while nothing stands out"
+        5.0, "s", 0.5, 1e4, "time constant of the offset tracking without contact"
     )
     recovery: float = quantity(
-        5e-3, "s", 0.0, 1.0, "for which a saturation still shows in the sensor's low-pass"
+        5e-3, "s", 0.0, 1.0, "recovery time of the sensor's low-pass after a saturation"
     )
 
 

@@ -39,21 +39,29 @@ class LoadEstimatorConfig:
 
     enabled: bool = plain(
         False,
-        "learn from every sample; only in free motion: a contact wrench would be taken for load",
+        "update with every sample; only for free motion: a contact wrench would count as load",
     )
     forgetting: float = quantity(1.0, "1", 0.9, 1.0, "forgetting factor a sample; 1 = none")
     method: str = choice(
         "rls", tuple(METHODS), "recursive least squares, or total: allows for noisy accelerations"
     )
     settled_bound: float = quantity(
-        0.05, "1", 1e-6, 10.0, "predicted uncertainty that counts as settled, of a natural value"
+        0.05,
+        "1",
+        1e-6,
+        10.0,
+        "predicted uncertainty of a settled load, relative to a natural value",
     )
     watch: bool = plain(
         False,
-        "freeze a load that has settled, or was given with its covariance; notice when it changes",
+        "freeze a settled load, or one that is given with its covariance; detect its change",
     )
     model_error: float = quantity(
-        0.0, "1", 0.0, 0.5, "watch: share of the wrench that gains, cross-talk and delays make"
+        0.0,
+        "1",
+        0.0,
+        0.5,
+        "watch: error of the wrench by gains, cross-talk and delays, as a share of it",
     )
 
     def check(self, where: str) -> None:

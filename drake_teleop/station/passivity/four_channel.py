@@ -50,7 +50,11 @@ class FourChannelConfig:
     """Parameters of the four-channel architecture."""
 
     stiffness: list[float] = quantity(
-        [100.0, 1.0], "N/m, N m/rad", 0.0, 1e6, "of C_m, between the hand and the slave it hears of"
+        [100.0, 1.0],
+        "N/m, N m/rad",
+        0.0,
+        1e6,
+        "of C_m, between the hand and the received pose of the slave",
     )
     damping: list[float] = quantity([10.0, 0.05], "N s/m, N m s/rad", 0.0, 1e6, "of C_m")
     slave_feedback: float = quantity(

@@ -119,19 +119,23 @@ class LedgerConfig:
         "J",
         0.0,
         1e3,
-        "E_0, in both reserves at the start; drag earns what is missing",
+        "E_0, energy in both ledgers at the start; drag earns the rest of the reserves",
     )
     reserve: list[float] = quantity(
-        [0.1, 0.01], "J", 1e-9, 1e3, "of the slave: energy of its fastest motion, scaled"
+        [0.1, 0.01],
+        "J",
+        1e-9,
+        1e3,
+        "reserve of the slave: scaled kinetic energy of its fastest motion",
     )
     hand_reserve: list[float] = quantity(
-        [0.02, 1e-3], "J", 1e-9, 1e3, "of the master, to push the hand back"
+        [0.02, 1e-3], "J", 1e-9, 1e3, "reserve of the master, to push the hand back"
     )
     drag: list[float] = quantity(
-        [0.28, 5e-3], "N, N m", 0.0, 10.0, "on the hand until both reserves are full"
+        [0.28, 5e-3], "N, N m", 0.0, 10.0, "drag on the hand until both reserves are full"
     )
     touch: list[float] = quantity(
-        [0.01, 1e-3], "N, N m", 0.0, 1e3, "at the hand; a wrench below it is no contact"
+        [0.01, 1e-3], "N, N m", 0.0, 1e3, "contact threshold of the wrench at the hand"
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:

@@ -47,6 +47,7 @@ from drake_teleop.station.passivity.packet import (
     length,
     limit,
     moved_into,
+    new_energy,
     scale,
 )
 
@@ -113,6 +114,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
+    """Filter the velocity of this end, with `share` of the new twist."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -163,9 +165,8 @@ def find_direction(wrench, round_trip, T, p, memory):
 @njit(cache=True)
 def receive(g, received, memory):
     """Add newly received energy to the ledger of group `g` and return it."""
-    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
-    memory[RECEIVED][g] += new
     return new
 
 

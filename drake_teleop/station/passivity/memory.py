@@ -22,6 +22,7 @@ class Slots:
         self._size, self._next = size, first
 
     def number(self) -> int:
+        """Reserve the place of one number."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
@@ -36,6 +37,7 @@ class Slots:
         return slice(first, self._next)
 
     def rest(self) -> slice:
+        """Reserve all remaining places."""
         return self.vector(self._size - self._next)
 
 

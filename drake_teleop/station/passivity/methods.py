@@ -48,7 +48,7 @@ from drake_teleop.station.passivity.memory import (
 )
 from drake_teleop.station.passivity.packet import HEALTHY, PACKET_SIZE, POSE, SEQUENCE, finite
 from drake_teleop.station.passivity.pspm import PspmConfig
-from drake_teleop.station.passivity.retreat import retreat
+from drake_teleop.station.passivity.safe_state import retreat
 from drake_teleop.station.passivity.tdpa import TdpaConfig, charged
 from drake_teleop.station.passivity.two_layer import TwoLayerConfig
 from drake_teleop.station.passivity.wave import WaveConfig
@@ -94,15 +94,15 @@ _SLAVE_MASS = [15.13, 0.5]  # kg, kg m^2 (E)
 
 @dataclass
 class _CommonConfig:
-    method: str = choice("none", METHODS, "what keeps the channel passive")
-    force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest force that the hand shall feel")
-    torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest torque that the hand shall feel")
+    method: str = choice("none", METHODS, "passivity method of the channel")
+    force_limit: float = quantity(37.5, "N", 0.0, 1e4, "largest rendered force at the hand")
+    torque_limit: float = quantity(0.17, "N m", 0.0, 1e3, "largest rendered torque at the hand")
     retreat: list[float] = quantity(
         [0.1, 1.0],
         "m/s, rad/s",
         1e-3,
         1e3,
-        "of the hand along the wrench, where that begins to fade; at twice as much it is gone",
+        "speed of the hand along the wrench where it starts to fade; zero at twice this speed",
     )
     servo_stiffness: list[float] = quantity(
         [2.1e5, 6.8e3], "N/m, N m/rad", 1.0, 1e9, "K of the slave's servo, in the slave's units (E)"
@@ -115,7 +115,7 @@ class _CommonConfig:
         "kg, kg m^2",
         1e-6,
         1e6,
-        "of arm and tool where they are pushed, likewise; null: 15.13, 0.5 (E), but with ledger"
+        "mass of arm and tool at the tool, likewise; null: 15.13, 0.5 (E), with ledger"
         " mass and servo of the station's arm at the start",
     )
 

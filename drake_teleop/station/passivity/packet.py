@@ -12,7 +12,7 @@ import math
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply, normalized
-from drake_teleop.station.passivity.memory import Slots
+from drake_teleop.station.passivity.memory import RECEIVED, Slots
 
 PACKET_SIZE = 38
 _places = Slots(PACKET_SIZE)
@@ -50,6 +50,14 @@ def arrived(received):
 
 
 @njit(cache=True)
+def new_energy(g, received, memory):
+    """Return the energy of group g that was received since the last call [J]."""
+    new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
+    memory[RECEIVED][g] += new
+    return new
+
+
+@njit(cache=True)
 def fill(pose, twist, wrench, packet):
     """Write pose, twist and wrench of the sender into its packet."""
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
@@ -75,6 +83,7 @@ def length(a, g):
 
 @njit(cache=True)
 def scale(a, g, s):
+    """Multiply the force (g = 0) or torque (g = 1) of a wrench by `share`."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 

@@ -29,7 +29,6 @@ from drake_teleop.station.passivity.memory import (
     HELD_WRENCH,
     LEDGER,
     LOST,
-    RECEIVED,
     SENT,
     STIFFNESS,
     own_memory,
@@ -46,6 +45,7 @@ from drake_teleop.station.passivity.packet import (
     fill,
     limit,
     moved_into,
+    new_energy,
 )
 
 # Parameters, for translation and rotation.
@@ -66,13 +66,13 @@ class PspmConfig:
 
     initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "E at the start")
     ceiling: list[float] = quantity(
-        [0.015, 3e-4], "J", 0.0, 1e6, "of E; what is above is sent to the slave, there lost"
+        [0.015, 3e-4], "J", 0.0, 1e6, "largest E; the rest is sent to the slave, which discards it"
     )
     stiffness: list[float] = quantity(
-        [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, through which the hand feels"
+        [1000.0, 10.0], "N/m, N m/rad", 1e-6, 1e9, "K_h, spring between set position and hand"
     )
     damping: list[float] = quantity(
-        [0.5, 0.005], "N s/m, N m s/rad", 0.0, 1e6, "B, shown to the hand"
+        [0.5, 0.005], "N s/m, N m s/rad", 0.0, 1e6, "B, damper at the hand"
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
@@ -83,6 +83,7 @@ class PspmConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
+    """Store the initial energy."""
     memory[LEDGER] = p[_INITIAL]
 
 
@@ -96,12 +97,9 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     stored, required = dot(offset, offset, g), dot(requested, requested, g)
     damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
-    ledger, accounted = memory[LEDGER], memory[RECEIVED]
+    ledger = memory[LEDGER]
     energy = ledger[g] + damped
-    increase = received[ENERGY][g] - accounted[g]
-    if increase > 0.0:
-        energy += increase
-        accounted[g] += increase
+    energy += new_energy(g, received, memory)
     available = stored + 2.0 * energy / stiffness
     share = 1.0 if required <= max(available, 0.0) else math.sqrt(max(available, 0.0) / required)
     for i in range(3 * g, 3 * g + 3):

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.passivity.memory import Slots
-from drake_teleop.station.passivity.packet import difference_into, length, moved_into
+from drake_teleop.station.passivity.memory import HAND_VELOCITY, HELD_WRENCH, MASS, RETREAT, Slots
+from drake_teleop.station.passivity.packet import difference_into, dot, length, moved_into, scale
 
 STOP_TIME = 0.05  #: time in which a silent end comes to rest [s]
 RESUME_TIME = 0.5  #: time of the transition to normal operation [s]
 
+_RETREAT_FILTER_S = 4e-3  # of the velocity: encoders have steps
 MASTER_WATCH, SLAVE_WATCH = 6, 30  #: lengths of the monitor states
 # Monitor state of the master.
 _places = Slots(MASTER_WATCH)
@@ -141,3 +142,27 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
             moved_into(command, step, command)
     put(before, 0, last, 0, 7)
     put(last, 0, command, 0, 7)
+
+
+@njit(cache=True)
+def retreat(twist, T, p, memory, wrench):
+    """Shorten the wrench (6,) at the hand in the master's power units.
+
+    Args:
+        twist: (6,) of the command before the channel [v; omega], in W.
+        T: time between steps [s].
+        p: parameters of the method.
+        memory: of the master's end, updated.
+        wrench: (6,) in W, updated.
+    """
+    velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
+    for i in range(6):
+        velocity[i] += rate * (twist[i] - velocity[i])
+    for g in range(2):
+        size = length(wrench, g)
+        if size > 0.0:
+            along = dot(wrench, velocity, g) / size
+            slowing = (along - dot(wrench, twist, g) / size) / _RETREAT_FILTER_S
+            share = max(2.0 - along / p[RETREAT][g], p[MASS][g] * slowing / size, 0.0)
+            scale(wrench, g, min(share, 1.0))
+    put(memory, HELD_WRENCH.start, wrench, 0, 6)

@@ -52,6 +52,7 @@ from drake_teleop.station.passivity.packet import (
     length,
     limit,
     moved_into,
+    new_energy,
     scale,
 )
 
@@ -101,30 +102,34 @@ class TdpaConfig:
         0.02, "s", 0.0, 10.0, "time in which a shortened wrench may come back (force-jump filter)"
     )
     drain_rate: float = quantity(
-        200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may drain in a second"
+        200.0, "1/s", 0.0, 1e6, "share of the ledger that the wrench may use in a second"
     )
     drift_rate: float = quantity(
-        20.0, "1/s", 0.0, 1e3, "rate at which a withheld command is made up for, if it is paid for"
+        20.0,
+        "1/s",
+        0.0,
+        1e3,
+        "rate of the correction of a withheld command, within the available energy",
     )
     speed: list[float] = quantity(
         [1.0, 10.0],
         "m/s, rad/s",
         1e-3,
         1e3,
-        "of the slave's command; its kinetic energy may be created where the slave hits a wall",
+        "largest speed of the slave's command; its kinetic energy may be created at an impact",
     )
     reserve: list[float] = quantity(
-        [2e-3, 1e-4], "J", 0.0, 1e3, "that the master keeps of what the hand puts in"
+        [2e-3, 1e-4], "J", 0.0, 1e3, "part of the hand's input that the master keeps"
     )
     drag: list[float] = quantity(
-        [0.0, 0.0], "N, N m", 0.0, 10.0, "on the hand while an end holds less than the reserve"
+        [0.0, 0.0], "N, N m", 0.0, 10.0, "drag on the hand while an end has less than the reserve"
     )
     hand_stiffness: list[float] = quantity(
         [0.0, 0.0],
         "N/m, N m/rad",
         0.0,
         1e5,
-        "of the hand, to which the filter of the returned wrench is set; 0: no filter",
+        "stiffness of the hand for the filter of the returned wrench; 0: no filter",
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
@@ -141,20 +146,10 @@ def charged() -> TdpaConfig:
 
 
 @njit(cache=True)
-def receive(received, memory):
-    """Add the other end's newly received input to this end's ledger."""
-    ledger, accounted, counter = memory[LEDGER], memory[RECEIVED], received[ENERGY]
-    for g in range(2):
-        more = counter[g] - accounted[g]
-        if more > 0.0:
-            ledger[g] += more
-            accounted[g] += more
-
-
-@njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
     """See `methods.master_step`."""
-    receive(received, memory)
+    for g in range(2):
+        memory[LEDGER][g] += new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
     requested = received[WRENCH]
     for i in range(6):
@@ -231,7 +226,8 @@ def _account_for_work(g, drained, p, memory):
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
     """See `methods.slave_step`."""
-    receive(received, memory)
+    for g in range(2):
+        memory[LEDGER][g] += new_energy(g, received, memory)
     put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
     for g in range(2):
         work = dot(wrench, dx, g)

@@ -28,7 +28,6 @@ from drake_teleop.station.passivity.memory import (
     LEDGER,
     LOST,
     MASS,
-    RECEIVED,
     SENT,
     STIFFNESS,
     own_memory,
@@ -46,6 +45,7 @@ from drake_teleop.station.passivity.packet import (
     length,
     limit,
     moved_into,
+    new_energy,
     scale,
 )
 
@@ -69,14 +69,18 @@ class TwoLayerConfig:
 
     send_rate: float = quantity(5.0, "1/s", 0.0, 1e6, "share of a tank that is sent in a second")
     drain_rate: float = quantity(
-        10.0, "1/s", 0.0, 1e6, "share of the master's tank that the wrench may drain in a second"
+        10.0, "1/s", 0.0, 1e6, "share of the master's tank that the wrench may use in a second"
     )
-    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "what a tank holds at the start")
+    initial: list[float] = quantity([0.01, 2e-4], "J", 0.0, 1e3, "energy of a tank at the start")
     level: list[float] = quantity(
-        [0.01, 2e-4], "J", 0.0, 1e3, "below which the hand is damped to fill the master's tank"
+        [0.01, 2e-4],
+        "J",
+        0.0,
+        1e3,
+        "level below which a damper on the hand fills the master's tank",
     )
     capacity: list[float] = quantity(
-        [0.015, 3e-4], "J", 0.0, 1e6, "what a tank holds at most; the rest is lost"
+        [0.015, 3e-4], "J", 0.0, 1e6, "largest energy of a tank; the rest is discarded"
     )
     damper: list[float] = quantity(
         [500.0, 100.0], "N s/m/J, N m s/rad/J", 0.0, 1e6, "damping of the hand for each J missing"
@@ -94,20 +98,18 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
+    """Fill the tank with its initial energy."""
     memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _exchange(received, dx, T, p, memory, packet):
     """Account for the held wrench, received and sent energy, before a new wrench is limited."""
-    ledger, accounted, sent_so_far = memory[LEDGER], memory[RECEIVED], memory[SENT]
+    ledger, sent_so_far = memory[LEDGER], memory[SENT]
     held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
         level = ledger[g] - dot(held, dx, g)
-        more = received[ENERGY][g] - accounted[g]
-        if more > 0.0:
-            level += more
-            accounted[g] += more
+        level += new_energy(g, received, memory)
         sent = min(T * p[_SEND], 1.0) * max(level - _RESERVE_SHARE * capacity[g], 0.0)
         level -= sent
         lost = max(level - capacity[g], 0.0)

@@ -47,6 +47,7 @@ from drake_teleop.station.passivity.packet import (
     fill,
     limit,
     moved_into,
+    new_energy,
 )
 
 # Parameters.
@@ -72,13 +73,17 @@ class WaveConfig:
     )
     filter: float = quantity(0.003, "s", 0.0, 10.0, "time constant of the filter of either wave")
     matching: float = quantity(
-        1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1 reflects nothing"
+        1.0, "1", 0.0, 100.0, "damper at the slave's end over b; 1: no reflection"
     )
     patience: float = quantity(
-        0.03, "s", 0.0, 10.0, "silence after which the slave stays where it is, until it ends"
+        0.03,
+        "s",
+        0.0,
+        10.0,
+        "silence after which the slave keeps its command until the next packet",
     )
     drift_rate: float = quantity(
-        2.0, "1/s", 0.0, 1e3, "rate at which drift is corrected where that takes no work"
+        2.0, "1/s", 0.0, 1e3, "rate of the drift correction where it takes no work"
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
@@ -94,13 +99,10 @@ def _play(received, T, p, memory, wave):
     Playing the share a of the rest d in each step costs a |d|^2 / (2 T (2 - a)) in all. a is that
     of the filter, or small enough for the stored energy (T34).
     """
-    ledger, accounted, played = memory[LEDGER], memory[RECEIVED], memory[_PLAYED_INTEGRAL]
+    ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
-        more = received[ENERGY][g] - accounted[g]
-        if more > 0.0:
-            ledger[g] += more
-            accounted[g] += more
+        ledger[g] += new_energy(g, received, memory)
         for i in range(3 * g, 3 * g + 3):
             wave[i] = integral[i] - played[i]
         left, store = dot(wave, wave, g), 2.0 * T * ledger[g]

@@ -1,4 +1,4 @@
-"""Movable block on a table, a rigid body that slides, turns, tips and falls.
+"""Solids with Drake's point contact: fixed wall and box, movable block on a table.
 
 Drake's point contact reduces the contact of two boxes to one point, which cannot carry a box. So
 the block stands on balls of 2 mm radius in its corners; the tool touches the box.
@@ -10,27 +10,127 @@ from itertools import product
 
 import numpy as np
 from pydrake.geometry import Box as BoxShape
-from pydrake.geometry import SceneGraph, Sphere
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.geometry import ProximityProperties, SceneGraph, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
-from drake_teleop.station.environment.box import AddFixedBox
 from drake_teleop.station.environment.environment import (
     BodiesOfTool,
+    ContactMaterial,
+    Environment,
     ExcludeContact,
     LetFloat,
     NewInstance,
     Stand,
 )
-from drake_teleop.station.environment.surface import Surface
 
+_BOX_COLOUR = np.array([0.78, 0.66, 0.50, 1.0])
+_THICKNESS = 0.1  # m; deep enough that a tool leaves through the face
 _FOOT_RADIUS, _TABLE_THICKNESS = 0.002, 0.05  # m: radius of the balls, thickness of the table
 _NAME, _FOOT_NAME = "block", "foot_of_block_"
-_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
+_BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
+
+
+@settings
+@dataclass
+class Surface(Environment):
+    """Surface of the object alone; Drake combines it with that of the other object.
+
+    Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean,
+    2 mu1 mu2 / (mu1 + mu2). The tool's ball has 4e5 N/m and 0.2.
+    """
+
+    stiffness: float = quantity(
+        1e4, "N/m", 1e2, 1e7, "of its surface, in series with that of the other object (E)"
+    )
+    dissipation: float = quantity(
+        1.0, "s/m", 0.0, 100.0, "of its surface, by Hunt and Crossley: damping k x d (E)"
+    )
+    friction: float = quantity(
+        0.2, "1", 0.0, 2.0, "of its surface, at rest and in motion; tool and surface average (E)"
+    )
+
+    @property
+    def slip(self) -> float:
+        """Slip at which friction is complete [m/s] (E)."""
+        return 1e-3
+
+    def material(self) -> ProximityProperties:
+        """Return the properties for Drake's point contact."""
+        return ContactMaterial(self.stiffness, self.dissipation, self.friction)
+
+
+@settings
+@dataclass
+class Box(Surface):
+    """Pose, size and surface of a fixed box."""
+
+    position: list[float] = quantity(
+        [0.55, 0.0, 0.1], "m", -2.0, 2.0, "p_WBox, the middle of the box, in W"
+    )
+    rotation: list[float] = quantity(
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of R_WBox"
+    )
+    size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """Add the box, fixed in the world."""
+        X_WBox = RigidTransform(RollPitchYaw(self.rotation), self.position)
+        AddFixedBox(plant, "box", X_WBox, self.size, self)
+
+
+def AddFixedBox(
+    plant: MultibodyPlant, name: str, X_WBox: RigidTransform, size: list[float], surface: Surface
+) -> None:
+    """Weld a box to the world; without a scene graph it has no shape.
+
+    Args:
+        plant: not finalized.
+        name: of the body, and of the model instance (with a number if the name exists).
+        X_WBox: pose of the box.
+        size: (3,) lengths of its edges [m].
+        surface: its surface.
+    """
+    body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
+    plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
+    if plant.geometry_source_is_registered():
+        shape, here = BoxShape(*size), RigidTransform()
+        plant.RegisterCollisionGeometry(body, here, shape, name, surface.material())
+        plant.RegisterVisualGeometry(body, here, shape, name, _BOX_COLOUR)
+
+
+@settings
+@dataclass
+class Wall(Surface):
+    """Pose, size and surface of a flat wall."""
+
+    position: list[float] = quantity(
+        [0.55, 0.0, 0.15], "m", -2.0, 2.0, "p_WWall, the middle of its face, in W"
+    )
+    normal: list[float] = quantity(
+        [0.0, 0.0, 1.0], "1", -1.0, 1.0, "out of the wall, in W; its length does not matter"
+    )
+    size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
+
+    def check(self, where: str) -> None:
+        """Check that the normal has a direction."""
+        if np.linalg.norm(self.normal) < 1e-3:
+            raise DrakeTeleopError(
+                "has no direction",
+                where=f"{where}.normal",
+                remedy="point it to where the tool comes from, such as [0, 0, 1]",
+            )
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """Add a box behind the face, with z along the normal."""
+        R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
+        X_WWall = RigidTransform(R_WWall, self.position)
+        behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])
+        AddFixedBox(plant, "wall", X_WWall @ behind, [*self.size, _THICKNESS], self)
 
 
 @settings
@@ -59,6 +159,7 @@ class Block(Surface):
 
     @property
     def stand(self) -> Stand | None:
+        """Stand below the table of the block in a replay."""
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
@@ -80,7 +181,7 @@ class Block(Surface):
             return
         here, box = RigidTransform(), BoxShape(*self.size)
         plant.RegisterCollisionGeometry(body, here, box, _NAME, self.material())
-        plant.RegisterVisualGeometry(body, here, box, _NAME, _COLOUR)
+        plant.RegisterVisualGeometry(body, here, box, _NAME, _BLOCK_COLOUR)
         for k, corner in enumerate(product((-1.0, 1.0), repeat=3)):
             place = RigidTransform(np.array(corner) * (np.array(self.size) / 2 - _FOOT_RADIUS))
             ball = Sphere(_FOOT_RADIUS)
