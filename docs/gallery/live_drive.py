@@ -2,9 +2,8 @@
 A drive, and the network that changes in contact
 ================================================
 
-What `drake-teleop drive` does with a mouse a script does here: the hand goes down onto the leaf and
-presses; at 1.5 s an internet comes between it and the arm, with a method that keeps it passive, and
-nothing steps; at 2.5 s σ goes to 0.5, and half of the tool hangs on the hand. A film of the page:
+A script moves the hand here, instead of a mouse in `drake-teleop drive`. The hand presses on the
+leaf. At 1.5 s the network becomes `internet` with a passivity method, at 2.5 s σ becomes 0.5.
 
 .. image:: /figures/drive.webp
    :alt: A drive in the browser: free motion, a press on the leaf, and σ to 1 and back
