@@ -1,9 +1,8 @@
 """
-Somebody puts something into the gripper
-========================================
+A gripper takes up an object
+============================
 
-At 5 s the moving tool takes up 0.8 kg, and nobody tells. A watch on what elimination leaves tells a
-touch from another load, and knows the new one when the motion has shown enough of it.
+At 5 s the moving tool takes up 0.8 kg. The watch distinguishes it from a touch, and identifies it.
 """
 
 import matplotlib.pyplot as plt
@@ -11,20 +10,14 @@ import numpy as np
 
 from drake_teleop.load.batch.methods import identify_batch
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
-from drake_teleop.load.online.change import (
-    STATES,
-    change_memory,
-    change_parameters,
-    identified_load,
-    watch_load,
-)
+from drake_teleop.load.online import change
 from drake_teleop.load.regressor import non_contact_wrench
 
 tool = phi_from_mass_com_inertia(3.13, [0, 0, 0.085], np.diag([12e-3, 11e-3, 4e-3]))
 held = phi_from_mass_com_inertia(0.8, [0.04, 0, 0.16], np.diag([8e-4, 8e-4, 4e-4]))
 rng, t, dt = np.random.default_rng(1), np.arange(0, 15, 1e-3), 1e-3
 tilt = 0.4 * np.sin(np.outer(t, [4.0, 5.2]))
-omega, alpha = (np.zeros((len(t), 3)) for _ in range(2))
+omega = np.zeros((len(t), 3))
 omega[:, :2] = np.gradient(tilt, dt, axis=0)  # small turns about x and y, slow ones about z
 omega[:, 2] = 0.9 * np.sin(3.1 * t)
 alpha = np.gradient(omega, dt, axis=0)
@@ -35,13 +28,13 @@ noise = np.repeat([0.25, 0.012], 3)
 known = identify_batch(free + noise * rng.normal(size=free.shape), s, omega, alpha).identification
 
 wrench = free + (t > 5.0)[:, None] * non_contact_wrench(s, omega, alpha, held)
-parameters = change_parameters(noise, np.full(9, 1e-3), dt)
-memory = change_memory(np.concatenate([known.offsets, known.phi]), known.covariance)
+parameters = change.change_parameters(noise, np.full(9, 1e-3), dt)
+memory = change.change_memory(np.concatenate([known.offsets, known.phi]), known.covariance)
 measured = wrench + noise * rng.normal(size=free.shape)
-states = watch_load(memory, parameters, measured, s, omega, alpha)
-mass = identified_load(memory, known).mass
+states = change.watch_load(memory, parameters, measured, s, omega, alpha)
+mass = change.identified_load(memory, known).mass
 print(f"held: {mass - known.mass:.3f} kg")
 figure, axes = plt.subplots(figsize=(7, 2.8))
 axes.step(t, states)
-axes.set_yticks(range(len(STATES)), STATES)
+axes.set_yticks(range(len(change.STATES)), change.STATES)
 axes.set(xlabel="t [s]", title=f"the load counts as, in the end {mass:.3f} kg")
