@@ -1,0 +1,114 @@
+"""Docstrings, comments and constants of the package are in plain language."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "drake_teleop"
+NOT_FIRST = frozenset(
+    "What Of By That It How Where Who Which For With Without From At To Towards If When Likewise"
+    " As And But".split()
+)
+"""A docstring begins with a verb or a noun phrase; properties may begin with "Whether"."""
+GLOSSARY = re.compile(
+    r"\b(house|rooms?|attic|felt|feels?|told|tells?|learnt|watched|knocks?|mend(s|ed)?|wanted"
+    r"|to and fro|goes over|left behind|hunts|shaken|believe[ds]?|believable|nobody|somebody"
+    r"|knows?|hears?|forgets?|riddles?)\b"
+)
+VAGUE = re.compile(
+    r"_(MOST|LEAST|NEAR|FAR|SAME|SURE|STANDS|HALF|FIRST|LAST|SMALL|LARGE|LONG|SHORT|FEW|FEWEST|MANY"
+    r"|ENOUGH|OVER|BEYOND|GONE|WORTH|FITS|KEPT|RESTED|BELIEVED|BELIEVABLE|SHOWN)"
+)
+MAX_WORDS = 32
+EXCEPTIONS = {
+    "felt": "name of a column or port that users read",
+    "watched": "name of a module or of a state that users read",
+    "left behind": "verdict of `compare-passivity` that its page explains",
+    "room": "attribute of a posture: distance to the nearest limit",
+    "tell": "in a table of summary names",
+}
+"""Glossary words that may be in docstrings, in at most `MAX_EXCEPTIONS` places, and why."""
+MAX_EXCEPTIONS = 20
+
+
+def docstrings() -> Iterator[tuple[str, str]]:
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = path.relative_to(PACKAGE).as_posix()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                if text := ast.get_docstring(node):
+                    yield f"{name}: {getattr(node, 'name', '')}", text
+
+
+def first_words() -> list[str]:
+    return [
+        f"{where}: {text.splitlines()[0]}"
+        for where, text in docstrings()
+        if text.split()[0].strip('`"(,.:') in NOT_FIRST
+    ]
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Return the sentences outside of tables, lists and code."""
+    prose = re.sub(r"^(\s{2,}.*|.*={3,}.*|.*\S {2,}\S.*|- .*)$", "", text, flags=re.M)
+    for sentence in re.split(r"(?<=[.!?:;])\s+|\n\n", prose):
+        if "=" not in sentence and "`" not in sentence:
+            yield " ".join(sentence.split())
+
+
+def long_sentences() -> list[str]:
+    return [
+        f"{where}: {sentence}"
+        for where, text in docstrings()
+        for sentence in sentences(text)
+        if len(sentence.split()) > MAX_WORDS
+    ]
+
+
+def glossary_words() -> list[str]:
+    return [
+        f"{where}: {match.group()}"
+        for where, text in docstrings()
+        for match in GLOSSARY.finditer(text)
+    ]
+
+
+def vague_constants() -> list[str]:
+    found = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+        names = {token.string for token in tokens if token.type == tokenize.NAME}
+        found += [f"{path.name}: {name}" for name in sorted(names) if VAGUE.fullmatch(name)]
+    return found
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
+    assert first_words() == []
+
+
+def test_sentences_are_short() -> None:
+    assert long_sentences() == []
+
+
+def test_docstrings_use_the_terms_of_the_field() -> None:
+    found = glossary_words()
+    assert [line for line in found if line.rpartition(": ")[2] not in EXCEPTIONS] == []
+    assert len(found) <= MAX_EXCEPTIONS
+
+
+def test_constants_have_a_noun() -> None:
+    assert vague_constants() == []
+
+
+@pytest.mark.parametrize(
+    "line", ["It tells what is felt.", "Of any.", "The hand hears of the wall to and fro."]
+)
+def test_a_riddle_is_found(line: str) -> None:
+    assert line.split()[0] in NOT_FIRST or GLOSSARY.search(line)
