@@ -59,7 +59,9 @@ def detect_log(
         path, load, cutoff_hz=cutoff_hz, delay=delay, free=free, statistic=statistic
     )
     if found.log.static:
-        raise DrakeTeleopError("contains poses at rest, which have no contact", where=found.log.source)
+        raise DrakeTeleopError(
+            "contains poses at rest, which have no contact", where=found.log.source
+        )
     if found.detection is None:
         raise DrakeTeleopError(
             f"{len(found.log)} samples are too few to separate contact from noise",

@@ -6,8 +6,8 @@ from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
@@ -19,7 +19,6 @@ from drake_teleop.logs.read.description import UNITS, Description
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
-Array = NDArray[np.float64]
 _CUTOFF_HZ = 3.0
 _WORST_CONDITION = 1e8
 _SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
