@@ -100,7 +100,7 @@ def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
     return Finding(
         "units",
         f"{text} they are neither in mm nor in m; multiply pose.position.scale (1 by default) by"
-        f" {kappa:.3g}",
+        f" {kappa:.4g}",
     )
 
 
