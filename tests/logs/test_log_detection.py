@@ -102,7 +102,7 @@ def test_detect_and_eliminate_report_the_same_contacts_as_with_free_motion(tmp_p
     most = tmp_path / "most.parquet"
     table.with_columns(f_y=pl.col("f_y") - pushed).write_parquet(most)
     (note,) = detect_log(most, load, free=free, delay=0.0).notes
-    assert "is 6 N from" in note
+    assert "differ by 6 N from" in note
     out = tmp_path / "out"
     arguments = ["eliminate", str(log), "--load", str(load), "--free", str(free), "--delay", "0"]
     result = CliRunner().invoke(cli, [*arguments, "--out", str(out)])
