@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "drake_teleop"
-NOT_FIRST = frozenset(
-    "What Of By That It How Where Who Which For With Without From At To Towards If When Likewise"
-    " As And But".split()
-)
+NOT_FIRST = {
+    *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),
+    *("From", "At", "To", "Towards", "If", "When", "Likewise", "As", "And", "But"),
+}
 """A docstring begins with a verb or a noun phrase; properties may begin with "Whether"."""
 GLOSSARY = re.compile(
     r"\b(house|rooms?|attic|felt|feels?|told|tells?|learnt|watched|knocks?|mend(s|ed)?|wanted"
@@ -42,9 +42,9 @@ def docstrings() -> Iterator[tuple[str, str]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-                if text := ast.get_docstring(node):
-                    yield f"{name}: {getattr(node, 'name', '')}", text
+            documented = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            if documented and (text := ast.get_docstring(node)):
+                yield f"{name}: {getattr(node, 'name', '')}", text
 
 
 def first_words() -> list[str]:

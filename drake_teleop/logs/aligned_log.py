@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.compensation import contact_wrench
@@ -40,7 +41,7 @@ class AlignedLog:
 
 def aligned_log(
     path: str | Path,
-    phi: NDArray[np.float64],
+    phi: Array,
     usual_s: float,
     cutoff_hz: float | None,
     delay: str | float,
@@ -111,7 +112,7 @@ def accelerated(log: Log) -> Log:
     return replace(log, specific_force=log.specific_force + log.gravity)
 
 
-def _spread(aligned: AlignedLog, phi: NDArray[np.float64], cutoff_hz: float | None) -> float:
+def _spread(aligned: AlignedLog, phi: Array, cutoff_hz: float | None) -> float:
     log = aligned.log
     left = low_pass(contact_wrench(log.wrench, np.zeros(6), *log.motion, phi), log.dt, cutoff_hz)
     left = np.sort(left[~aligned.edge], axis=0)

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 
 MODES = ("delayed", "predicted")
@@ -31,14 +31,12 @@ class CausalWrench:
 
     mode: str
     lag_s: float
-    contact: NDArray[np.float64]
-    scaled: NDArray[np.float64]
-    offsets: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    contact: Array
+    scaled: Array
+    offsets: Array = field(default_factory=lambda: np.zeros(6))
 
 
-def causal_low_pass(
-    x: NDArray[np.float64], dt: float, cutoff_hz: float | None, ahead_s: float = 0.0
-) -> NDArray[np.float64]:
+def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
     """Filter along the first axis, settled at the first sample.
 
     Args:
@@ -67,7 +65,7 @@ def causal_low_pass(
 
 def low_pass_coefficients(
     dt: float, cutoff_hz: float, ahead_s: float = 0.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array, Array]:
     """Return b (3,), a (3,) and the state (2,) settled at 1 of `causal_low_pass`."""
     # Imported here, because the import takes longer than the rest of the command.
     from scipy.signal import bilinear, lfilter_zi
@@ -85,13 +83,7 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
 
 
 def causal_wrenches(
-    contact: NDArray[np.float64],
-    scaled: NDArray[np.float64],
-    dt: float,
-    *,
-    cutoff_hz: float | None,
-    delay_s: float,
-    mode: str,
+    contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalWrench:
     """Return the output of a loop at each instant.
 
@@ -113,7 +105,7 @@ def causal_wrenches(
     lag = wait * dt + filter_lag(dt, cutoff_hz)
     ahead = lag if mode == "predicted" else 0.0
 
-    def late(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    def late(wrench: Array) -> Array:
         filtered = causal_low_pass(wrench, dt, cutoff_hz, ahead)
         rows = np.maximum(np.arange(len(filtered)) - wait, 0)
         return filtered[rows]

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.contact.detection import RARE, ContactDetector, statistics, wrench_axis
 from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, statistic_index
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor
@@ -43,11 +44,11 @@ _CONTACT_SHARE_OF_SHIFT = 0.2
 class Samples(NamedTuple):
     """Input of the detector, N samples: F_c (N, 6); s, omega, alpha and a, (N, 3)."""
 
-    contact: NDArray[np.float64]
-    s: NDArray[np.float64]
-    omega: NDArray[np.float64]
-    alpha: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    contact: Array
+    s: Array
+    omega: Array
+    alpha: Array
+    acceleration: Array
 
     def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
         """Return some of the samples."""
@@ -72,7 +73,7 @@ class Detection:
     floor: NoiseFloor
     statistic: str
     threshold: float
-    statistics: NDArray[np.float64]
+    statistics: Array
     touched: NDArray[np.bool_]
     free_s: float
     force_threshold: float
@@ -84,7 +85,7 @@ class Detection:
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
-def samples_of(log: Log, contact: NDArray[np.float64], cutoff_hz: float | None) -> Samples:
+def samples_of(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
     """Return the detector's input from a log and its (N, 6) low-passed contact wrench."""
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
@@ -98,8 +99,8 @@ def detect_contact(
     rows: Samples,
     dt: float,
     cutoff_hz: float | None,
-    covariance: NDArray[np.float64],
-    usual: NDArray[np.float64],
+    covariance: Array,
+    usual: Array,
     *,
     edge: NDArray[np.bool_] | None = None,
     free: tuple[Samples, float] | None = None,
@@ -167,12 +168,7 @@ def _judged_samples(
 
 
 def _floor_from_record(
-    rows: Samples,
-    dt: float,
-    hold: int,
-    fade: float,
-    covariance: NDArray[np.float64],
-    statistic: str,
+    rows: Samples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, Samples]:
     """Return floor, threshold and free motion of a record that contains contacts."""
     from scipy.ndimage import maximum_filter1d
@@ -205,13 +201,13 @@ def _floor_from_record(
     return floor, _RECORD_MARGIN * reached, rows.at(quiet)
 
 
-def _quieter_half(level: NDArray[np.float64], block: int) -> NDArray[np.bool_]:
+def _quieter_half(level: Array, block: int) -> NDArray[np.bool_]:
     of = np.minimum(np.arange(len(level)) // block, len(level) // block - 1)
     power = np.bincount(of, level**2) / np.bincount(of)
     return np.asarray((power <= np.median(power))[of])
 
 
-def _extrapolated(values: NDArray[np.float64], block: int, samples: int) -> float:
+def _extrapolated(values: Array, block: int, samples: int) -> float:
     """Extrapolate the maximum of quiet blocks to a number of samples, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
@@ -230,7 +226,7 @@ def _without_hold(touched: NDArray[np.bool_], hold: int) -> NDArray[np.bool_]:
 
 
 def _remove_marginal(
-    touched: NDArray[np.bool_], values: NDArray[np.float64], threshold: float, hold: int
+    touched: NDArray[np.bool_], values: Array, threshold: float, hold: int
 ) -> None:
     for start, stop in _spans(touched):
         if 2 * (stop - start) < hold and values[start:stop].max() < MARGIN * threshold:
@@ -242,7 +238,7 @@ def _spans(touched: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def _detection_notes(
-    floor: NoiseFloor, touched: NDArray[np.bool_], usual: NDArray[np.float64]
+    floor: NoiseFloor, touched: NDArray[np.bool_], usual: Array
 ) -> tuple[str, ...]:
     remedy = "; give a log of free motion with --free"
     if touched.mean() > _MAX_CONTACT_SHARE:
@@ -260,7 +256,7 @@ def _detection_notes(
     return ()
 
 
-def offset_shift_note(shift: NDArray[np.float64], found: Detection) -> tuple[str, ...]:
+def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
     """Return a note if most of a record seems to be contact: its offsets are `shift` (6,) from the
     free motion's.
     """
@@ -273,7 +269,7 @@ def offset_shift_note(shift: NDArray[np.float64], found: Detection) -> tuple[str
     )
 
 
-def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def robust_offsets(residual: Array) -> tuple[Array, float]:
     """Return the offsets (6,) that most samples of a residual (N, 6) agree on, and their share, Eq.
     (T12).
     """
@@ -294,7 +290,7 @@ def robust_offsets(residual: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     return offsets, float(agrees.mean())
 
 
-def noise_floor(contact: NDArray[np.float64]) -> NDArray[np.float64]:
+def noise_floor(contact: Array) -> Array:
     """Return the (6,) noise of a contact wrench (N, 6) that is calm for half of the record, Eq.
     (T12).
     """
@@ -311,13 +307,11 @@ def noise_floor(contact: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.maximum(floor, _RESOLUTION)
 
 
-def _quiet(contact: NDArray[np.float64], floor: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
     return np.asarray((np.abs(contact) <= _QUIET_DEVIATIONS * floor).all(axis=1))
 
 
-def contacts_of(
-    t: NDArray[np.float64], contact: NDArray[np.float64], touched: NDArray[np.bool_]
-) -> list[dict[str, Any]]:
+def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Return start, stop, peaks, direction and point of each contact, from (N, 6) F_c."""
     rows = []
     for start, stop in _spans(touched):

@@ -87,8 +87,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import (
     PARAMETERS,
@@ -193,10 +193,10 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
     """Return rms and peak values of the wrenches."""
 
-    def rms(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rms(x: Array) -> Array:
         return np.sqrt(np.mean(x**2, axis=0))
 
-    def peak(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def peak(x: Array) -> Array:
         return np.abs(x).max(axis=0)
 
     inner, weightless = ~found.edge, found.gravity_only
@@ -225,7 +225,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
     if found.causal is not None:
         late, contact = found.causal.contact[~found.edge], found.contact[~found.edge]
 
-        def rms(name: str, wrench: NDArray[np.float64]) -> dict[str, float]:
+        def rms(name: str, wrench: Array) -> dict[str, float]:
             force, torque = np.sqrt(np.mean(wrench**2, axis=0).reshape(2, 3).sum(axis=1))
             return {f"{name}_rms": float(force), f"{name}_torque_rms": float(torque)}
 
@@ -242,10 +242,7 @@ def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[s
 
 
 def _reduced(
-    name: str,
-    suffix: str,
-    wrench: NDArray[np.float64] | None,
-    reduce: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    name: str, suffix: str, wrench: Array | None, reduce: Callable[[Array], Array]
 ) -> dict[str, Any]:
     keys = (f"{name}_{suffix}", f"{name}_torque_{suffix}", f"{name}_{suffix}_per_channel")
     if wrench is None:

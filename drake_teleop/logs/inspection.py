@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, one_line
 from drake_teleop.common.writing import make_folder, output_folder, write_json, write_text
 from drake_teleop.logs.check.conventions import check_conventions
@@ -192,8 +193,8 @@ def _stream(
         findings.append(
             Finding(
                 "nan",
-                f"{at}: {figures['nan_rows']} rows contain no finite number, the first is row"
-                f" {first}, the longest block {figures['nan_longest']} rows; cut or repair them",
+                f"{at}: {figures['nan_rows']} rows are not finite, the first is row {first},"
+                f" the longest block {figures['nan_longest']} rows; cut or repair them",
             )
         )
     same = np.zeros(len(values), bool)
@@ -228,11 +229,7 @@ def _stream(
 
 
 def _repeated(
-    at: str,
-    values: NDArray[np.float64],
-    same: NDArray[np.bool_],
-    rate: float | None,
-    time: Any,
+    at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
     """Return a finding if the recorder repeated rows, with the rate of new rows.
 
@@ -260,12 +257,7 @@ def _repeated(
 
 
 def _clock(
-    at: str,
-    time: Any,
-    table: Table,
-    description: Description,
-    rows: int,
-    figures: dict[str, Any],
+    at: str, time: Any, table: Table, description: Description, rows: int, figures: dict[str, Any]
 ) -> list[Finding]:
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
@@ -323,7 +315,7 @@ def _longest(flags: NDArray[np.bool_]) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _saturated(x: NDArray[np.float64], same: NDArray[np.bool_]) -> int:
+def _saturated(x: Array, same: NDArray[np.bool_]) -> int:
     """Count samples at the ends of the range, if only these repeat."""
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.style import (
     BLACK,
     BLUE,
@@ -74,7 +74,7 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
         imsave(unfinished, np.concatenate([imread(upper), imread(lower)]), format="png")
 
 
-def spectrum(x: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
     """Return the one-sided amplitude spectral density by Welch's method.
 
     Args:
@@ -219,7 +219,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     return figure
 
 
-def _rms_words(norms: Sequence[tuple[str, NDArray[np.float64], str]]) -> str:
+def _rms_words(norms: Sequence[tuple[str, Array, str]]) -> str:
     return ", ".join(f"{name} {np.sqrt(np.mean(values**2)):.3g}" for name, values, _ in norms)
 
 
@@ -230,12 +230,7 @@ def _channel_axes(figure: Any) -> list[Axes]:
     return list(grid.T.ravel())
 
 
-def _draw(
-    axes: Axes,
-    t: NDArray[np.float64],
-    curves: Sequence[tuple[str, NDArray[np.float64], str]],
-    static: bool,
-) -> None:
+def _draw(axes: Axes, t: Array, curves: Sequence[tuple[str, Array, str]], static: bool) -> None:
     # More points than pixels only make the drawing slow.
     every = max(1, len(t) // _MAX_POINTS)
     for order, (name, values, colour) in enumerate(curves):

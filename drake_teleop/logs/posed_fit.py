@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, worth_stating
@@ -134,7 +135,7 @@ def _fit(
     return BatchResult(load, noise, rejected, _note(found, gain_std), equations)
 
 
-def _consistent(found: PoseEstimate) -> NDArray[np.float64]:
+def _consistent(found: PoseEstimate) -> Array:
     """(16,) nearest physically consistent load; a negative mass remains."""
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import number
+from drake_teleop.common.arrays import Array, number
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
@@ -40,12 +40,7 @@ from drake_teleop.logs.contact import (
     robust_offsets,
     samples_of,
 )
-from drake_teleop.logs.explained_log import (
-    explain_log,
-    explained_load,
-    named_frame,
-    removed_note,
-)
+from drake_teleop.logs.explained_log import explain_log, explained_load, named_frame, removed_note
 from drake_teleop.logs.posed_fit import ROBUST, fit_posed
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, undelayed
 from drake_teleop.logs.read.canonical import Log
@@ -79,7 +74,7 @@ class IdentifiedLog:
 
     log: Log
     identification: Identification
-    predicted: NDArray[np.float64]
+    predicted: Array
     delay_source: str
     rejected: NDArray[np.bool_]
     base: BaseParameters
@@ -117,18 +112,18 @@ class EliminatedLog:
     """
 
     log: Log
-    phi: NDArray[np.float64]
+    phi: Array
     point_mass: tuple[str, ...]
-    offsets: NDArray[np.float64]
+    offsets: Array
     tare_fraction: float
     delay_s: float
     delay_source: str
-    measured: NDArray[np.float64]
-    non_contact: NDArray[np.float64]
-    contact: NDArray[np.float64]
-    scaled: NDArray[np.float64]
-    gravity_only: NDArray[np.float64] | None
-    noise_floor: NDArray[np.float64]
+    measured: Array
+    non_contact: Array
+    contact: Array
+    scaled: Array
+    gravity_only: Array | None
+    noise_floor: Array
     causal: CausalWrench | None
     edge: NDArray[np.bool_]
     detection: Detection | None = None
@@ -384,7 +379,7 @@ def eliminate_log(
 def _eliminated(
     path: str | Path,
     identification: Identification,
-    phi_gripper: NDArray[np.float64],
+    phi_gripper: Array,
     scales: dict[str, float],
     *,
     cutoff_hz: float | None,
@@ -416,7 +411,7 @@ def _eliminated(
     known = measured(log, cutoff_hz)
     edge = aligned.edge[known]
 
-    def smooth(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+    def smooth(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
     offsets, fraction = identification.offsets, 1.0
@@ -475,7 +470,7 @@ def _eliminated(
     )
 
 
-def _start_samples(log: Log, length_s: float, wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
     rows = log.t - log.t[0] < length_s
     if rows.all() or rows.sum() < _MIN_TARE_SAMPLES:
         raise DrakeTeleopError(
@@ -486,7 +481,7 @@ def _start_samples(log: Log, length_s: float, wrench: NDArray[np.float64]) -> ND
     return wrench[rows]
 
 
-def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
     """Replace unidentified inertias by those of a point mass; return phi (10,) and their names.
 
     m (c'c E - c c') is the smallest inertia about So for this mass and centre of mass.
@@ -499,10 +494,7 @@ def usable_phi(identification: Identification) -> tuple[NDArray[np.float64], tup
 
 
 def _suspected_errors(
-    path: Path,
-    wrench: NDArray[np.float64],
-    contact: NDArray[np.float64],
-    load: Identification,
+    path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
     """Return errors of the description if the load leaves 30 % of the median force."""
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.common.writing import output_folder, write_json, write_table, write_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -20,8 +20,6 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.figures import plain
 from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
-
-Array = NDArray[np.float64]
 
 MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
 INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])

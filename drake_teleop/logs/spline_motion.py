@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.pose_motion.estimate import (
     PoseEstimate,
@@ -40,7 +41,7 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
 
 
 def motion_of_known_load(
-    log: Log, delay: str | float, load: NDArray[np.float64], usual_s: float
+    log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
     """Return the motion that suits an identified load best, and the source of the delay.
 

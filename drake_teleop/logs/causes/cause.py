@@ -168,11 +168,7 @@ def _factor(state: State) -> Cause:
         if others := [other.model.factor for other in similar_factors(state)]:
             listed = " or ".join(f"{x:.6g}" for x in others)
             what += f" (or {listed} times, which the record does not exclude)"
-    return Cause(
-        "torque factor",
-        f"{what}: its unit or sign is wrong",
-        values={"factor": factor},
-    )
+    return Cause("torque factor", f"{what}: its unit or sign is wrong", values={"factor": factor})
 
 
 def _gain(state: State, c: int) -> Cause:
@@ -250,8 +246,7 @@ def _change(state: State, i: int) -> Cause:
     return Cause(
         "load change",
         f"{when} there is another load: {abs(mass):.4g} kg (+- {wide:.2g}) at"
-        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is stated for each"
-        " part of the record",
+        f" {_vector(1e3 * com, 'mm in S')} are {what}; the load is given for each part",
         start_s=step.time,
         values={"mass_change": mass, "com_of_change": np.asarray(com).tolist()},
     )
@@ -265,8 +260,7 @@ def _is_hand_contact(span: tuple[float, float], times: tuple[float, ...]) -> boo
 def _contact(start: float, stop: float) -> Cause:
     return Cause(
         "contact",
-        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part of the record"
-        " is not used",
+        f"from t = {start:.2f} to {stop:.2f} s the load is in contact; this part is not used",
         start_s=start,
         stop_s=stop,
     )

@@ -187,11 +187,7 @@ def _noise_share(x: Array) -> float:
 
 
 def _write_motion(
-    y: Array,
-    t: Array,
-    size: int,
-    motion: Motion | tuple[Array, ...],
-    gravity_W: Array | None,
+    y: Array, t: Array, size: int, motion: Motion | tuple[Array, ...], gravity_W: Array | None
 ) -> bool:
     rows = len(y)
     if not callable(motion):

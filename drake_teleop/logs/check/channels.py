@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.read.description import Description
@@ -43,8 +43,8 @@ def channel_findings(
     return found
 
 
-def _numbers(table: Table, columns: Any, where: str) -> dict[str, NDArray[np.float64]]:
-    numbers: dict[str, NDArray[np.float64]] = {}
+def _numbers(table: Table, columns: Any, where: str) -> dict[str, Array]:
+    numbers: dict[str, Array] = {}
     for column in columns:
         x = table.raw(column, where)
         for i, values in enumerate(x.T):
@@ -69,7 +69,7 @@ def _repeated_names(where: str, columns: Any, named: dict[str, str]) -> list[Fin
     return found
 
 
-def _dead_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _dead_channels(where: str, numbers: dict[str, Array]) -> list[Finding]:
     spread = {name: float(np.ptp(x)) for name, x in numbers.items()}
     noise = white_noise(np.stack(list(numbers.values()), axis=1))
     alive = noise > _MIN_NOISE_SHARE * (np.array(list(spread.values())) + 1e-300)
@@ -87,7 +87,7 @@ def _dead_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[
     ]
 
 
-def _equal_channels(where: str, numbers: dict[str, NDArray[np.float64]]) -> list[Finding]:
+def _equal_channels(where: str, numbers: dict[str, Array]) -> list[Finding]:
     return [
         Finding(
             "repeated channel",

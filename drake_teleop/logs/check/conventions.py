@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.one_thread import one_blas_thread
 from drake_teleop.load.identification import Identification
@@ -76,7 +76,7 @@ def check_file(path: Path) -> Conventions:
 def question_fit(
     log: Log,
     load: Identification,
-    predicted: NDArray[np.float64],
+    predicted: Array,
     delay: float | None,
     check: Callable[[], Conventions],
 ) -> tuple[Finding, ...]:

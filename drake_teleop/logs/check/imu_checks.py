@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,
@@ -28,7 +28,6 @@ from drake_teleop.logs.read.description import Description, Imu
 from drake_teleop.logs.read.mounting import Mounting, find_mounting
 from drake_teleop.logs.read.rotations import rotation_matrices
 
-Array = NDArray[np.float64]
 DEGREE_RATIOS = (40.0, 80.0)
 """Range of the ratio 180 / pi of two speeds with noise and gain errors."""
 MIN_GRAVITY_ERROR = 0.02

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtri
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured
 from drake_teleop.logs.read.canonical import Log
@@ -76,14 +76,14 @@ def load_fit(log: Log) -> LoadFit:
     return LoadFit(unexplained, float(theta[0]), noise, independent)
 
 
-def unexplained_share(wrench: NDArray[np.float64], residual: NDArray[np.float64]) -> float:
+def unexplained_share(wrench: Array, residual: Array) -> float:
     """Share of the variance of a wrench (N, 6) in a residual (N, 6)."""
     scale = _scale(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
 
 
-def white_noise(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def white_noise(x: Array) -> Array:
     """Standard deviations (k,) of white noise in (N, k), from third differences."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
@@ -95,7 +95,7 @@ def _cutoff(log: Log) -> float | None:
     return None if log.static else min(_CUTOFF_HZ, 0.2 / log.dt)
 
 
-def _scale(wrench: NDArray[np.float64]) -> NDArray[np.float64]:
+def _scale(wrench: Array) -> Array:
     force, torque = np.sqrt(wrench.var(axis=0).reshape(2, 3).sum(axis=1))
     least = 1e-9 * float(np.abs(wrench).max()) + 1e-15
     return np.repeat([force + least, max(torque, 0.03 * force) + least], 3)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread
@@ -81,7 +81,7 @@ class LogData:
         most = min(rate / _RATE_HZ, self.tables[stream.source].rows / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
-    def _stamps(self, stream: Any) -> NDArray[np.float64]:
+    def _stamps(self, stream: Any) -> Array:
         t = self.tables[stream.source].single(str(stream.time.column), "time")
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
@@ -107,6 +107,6 @@ def _streams(description: Description) -> list[Any]:
     return [stream for stream in streams if stream is not None]
 
 
-def _means(x: NDArray[np.float64], k: int) -> NDArray[np.float64]:
+def _means(x: Array, k: int) -> Array:
     rows = len(x) // k
     return x[: rows * k].reshape(rows, k, -1).mean(axis=1) if k > 1 else x

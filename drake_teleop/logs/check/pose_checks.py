@@ -6,8 +6,8 @@ from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.log_data import LogData
@@ -19,7 +19,6 @@ from drake_teleop.logs.read.description import UNITS, Description
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 
-Array = NDArray[np.float64]
 _CUTOFF_HZ = 3.0
 _WORST_CONDITION = 1e8
 _SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
@@ -31,7 +30,11 @@ SHORTEST_S = 4.0
 """Shorter records have too few frequencies for an estimate by poses alone [s]."""
 _UNIT_TOLERANCE, _NEAREST_COM, _FARTHEST_COM = 0.1, 2e-4, 1.5  # 1, m, m
 _TORQUE_UNITS = ("N m", "N mm", "lbf in")
-_TORQUE_RATIOS = tuple(UNITS[unit] / UNITS[other] for unit, other in permutations(_TORQUE_UNITS, 2))
+_UNIT_RATIOS = (
+    *(UNITS[unit] / UNITS[other] for unit, other in permutations(_TORQUE_UNITS, 2)),
+    *(UNITS["lbf"], 1.0 / UNITS["lbf"]),
+)
+"""Ratios of torque and force in wrong units, which resemble a displaced pose frame."""
 _SAME_COM = 0.03
 
 
@@ -101,7 +104,7 @@ def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
     return Finding(
         "units",
         f"{text} they are neither in mm nor in m; multiply pose.position.scale (1 by default) by"
-        f" {kappa:.3g}",
+        f" {kappa:.4g}",
     )
 
 
@@ -152,11 +155,7 @@ def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
     if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
         return None
     unit = abs(seen.kappa - 1.0) > max(_UNIT_TOLERANCE, 5.0 * seen.kappa_deviation)
-    if (
-        unit
-        or (seen.usable and seen.mirrored)
-        or _is_torque_unit(phi[1:4] / phi[0], frame.p_SoPo_S)
-    ):
+    if unit or (seen.usable and seen.mirrored) or _is_wrong_unit(phi[1:4] / phi[0], frame.p_SoPo_S):
         return None
     place = frame.p_SoPo_S + frame.R_SP @ posed.p_SoPo_S
     texts, lines = [], []
@@ -178,9 +177,9 @@ def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
     )
 
 
-def _is_torque_unit(com: Array, shift: Array) -> bool:
+def _is_wrong_unit(com: Array, shift: Array) -> bool:
     size = float(np.linalg.norm(com))
-    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _TORQUE_RATIOS]
+    off = [np.linalg.norm(com - ratio * (com - shift)) for ratio in _UNIT_RATIOS]
     return not _NEAREST_COM < size < _FARTHEST_COM or bool(min(off) < _SAME_COM * size)
 
 
