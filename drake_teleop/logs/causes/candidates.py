@@ -239,7 +239,7 @@ def _factor(state: State) -> Iterator[Candidate]:
     best = state.extended(
         best.model, best.x, **({"steps": _FACTOR_ITERATIONS} if by_residual else {})
     )
-    if not by_residual and 2.0 * (best.likelihood - state.likelihood) < 20.0:
+    if 2.0 * (best.likelihood - state.likelihood) < 20.0:
         return
     free = best.extended(best.model.extended("torque factor"))
     value, covariance = free.extension("torque factor")
