@@ -1,4 +1,4 @@
-"""The network: which packet is the newest, what the receiver reads, the statistics behind it."""
+"""Network: the newest packet, the packet that is read, and their statistics."""
 
 from __future__ import annotations
 
@@ -281,7 +281,7 @@ def test_delays_are_independent_of_each_other():
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
 def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
-    """A packet has sixteen of its own, and takes each for one thing."""
+    """A packet has sixteen numbers, each for one purpose."""
     config = NetworkConfig(
         delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
     )

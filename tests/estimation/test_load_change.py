@@ -59,7 +59,7 @@ def test_no_alarm_in_free_motion(tool):
 
 @pytest.mark.parametrize("keep", [1, 8])
 def test_a_grasp_at_8_and_at_1_khz(tool, keep):
-    """The stated noise is that before the filter, at either rate."""
+    """The given noise is that before the filter, at either rate."""
     for seed in range(3):
         monitor = LoadChangeMonitor(tool, SENSOR.wrench_std(), SENSOR.motion_std(), keep / RATE)
         states = monitor.watch(*parts(samples(seed, grasp=True)[::keep]))
