@@ -140,7 +140,7 @@ def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     asked, left, twist = 0.2 * rng.normal(size=6), 0.1 * rng.normal(size=6), rng.normal(size=6)
     moved_into(pose, asked, wanted)
     moved_into(pose, left, command)
-    pspm.command_left.py_func(wanted, command, pose, twist, p, memory)
+    pspm.command_sent.py_func(wanted, command, pose, twist, p, memory)
     np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))
