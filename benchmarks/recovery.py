@@ -81,7 +81,7 @@ class Row:
 
 
 def _resuming(silent: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The steps up to RESUME after a silence."""
+    """The steps up to RESUME_TIME after a silence."""
     steps = np.arange(len(silent))
     since = steps - np.maximum.accumulate(np.where(silent, steps, -len(silent)))
     return (since > 0) & (since < round(RESUME_TIME / PERIOD))

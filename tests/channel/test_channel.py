@@ -58,7 +58,7 @@ def run(scenario: Scenario, load_estimate: np.ndarray):
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 7, 40])
 def test_without_a_method_it_is_a_delay_in_both_directions(steps, load_estimate):
-    """At 2 kHz and logged at 2 kHz: what comes out went in so many samples ago, to rounding."""
+    """At 2 kHz, logged at 2 kHz: outputs are delayed inputs, to rounding."""
     result = run(moving(channel__delay=steps / 2000), load_estimate)
     np.testing.assert_allclose(
         result["pose_received"][steps:], result["pose_command"][:-steps], atol=1e-12
@@ -89,7 +89,7 @@ def test_the_ports_count_the_work_of_the_hand(load_estimate):
 
 
 def test_load_wrench_is_transformed_as_the_wrench():
-    """In the same axes and units, with a base that is turned and unequal scales."""
+    """With a rotated base and unequal scales."""
     scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])
     scenario = moving(kinematic_scaling=scaling, passivity=PassivityConfig(method="ledger"))
     side, wrench = MakeChannel(scenario), np.arange(1.0, 7.0)
@@ -108,7 +108,7 @@ def test_load_wrench_is_transformed_as_the_wrench():
 
 
 def test_packets_in_transit_belong_to_the_context():
-    """Two that go on from the same instant, side by side, each receive what each has sent."""
+    """Two contexts from the same instant each receive their own packets."""
     block = MakeChannel(moving(channel__delay=0.01)).GetSubsystemByName("channel")
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 
@@ -162,7 +162,7 @@ def test_invalid_channel_is_rejected(changes, message, load_estimate):
 def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
     monkeypatch, load_estimate
 ):
-    """From 0.2 to 0.4 s its wrench is not a number; the hand moves all the time."""
+    """From 0.2 to 0.4 s its wrench is NaN; the hand moves all the time."""
     scenario = moving(
         channel__delay=0.01,
         simulation__duration=1.2,
@@ -196,7 +196,7 @@ def test_a_wrist_sensor_that_fails_for_a_while_stops_the_station_smoothly(
 
 
 def test_the_timeout_follows_from_the_worse_of_both_directions():
-    """1.5 silences of a packet every 0.2 s, at least 0.1 s and at most 1 s, unless it is given."""
+    """1.5 silences of a packet every 0.2 s, from 0.1 s to 1 s, unless configured."""
     slow = NetworkConfig(rate_hz=5.0)
     for one in (Channel(rate_hz=5.0, backward=NetworkConfig()), Channel(backward=slow)):
         assert one.silent_after(1e-3) == pytest.approx(0.3)

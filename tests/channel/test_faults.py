@@ -1,4 +1,4 @@
-"""Data that are not finite, and a saturated sensor, at either end: smooth, bounded, and over."""
+"""Data that are not finite, and a saturated sensor, at either end: smooth, bounded, temporary."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_one_bad_sample_has_little_effect(method, fault):
 
 
 def test_the_hand_fades_in_50_ms_and_not_at_once():
-    """The pose of the hand is known: it is the slave that has lost its wrench."""
+    """The pose of the hand is valid; the slave's wrench is missing."""
     found = run("none", "slave_wrench")
     f = found.felt[:, 0]
     told = round((FAULT[0] + DELAY) / T) + 2
@@ -143,7 +143,7 @@ def test_the_hand_fades_in_50_ms_and_not_at_once():
 
 
 def test_last_valid_wrench_is_rendered_while_the_sensor_is_saturated():
-    """The hand draws back in the meantime: in the end there is none, and it goes over to that."""
+    """The hand withdraws meanwhile; the wrench then blends to zero."""
     span = (2.4, 2.9)
     found = run("none", "saturated", span)
     t, f = found.t, found.felt[:, 0]
@@ -156,7 +156,7 @@ def test_last_valid_wrench_is_rendered_while_the_sensor_is_saturated():
 
 @pytest.mark.parametrize("method", ["two_layer", "pspm"])
 def test_motor_ledger_uses_the_command_after_the_safe_state(method):
-    """In the safe state, and on the way out of it, that is not the one the method asked for."""
+    """In the safe state and while it ends, this differs from the method's command."""
     found = run(method, "hand_wrench")
     t = found.t
     changed = (t > FAULT[0] + DELAY + 0.01) & (t < FAULT[1] + RESUME_TIME)

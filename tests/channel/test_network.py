@@ -1,4 +1,4 @@
-"""The network: which packet is the newest, what the receiver reads, the statistics behind it."""
+"""Network: the newest packet, the packet that is read, and their statistics."""
 
 from __future__ import annotations
 
@@ -281,7 +281,7 @@ def test_delays_are_independent_of_each_other():
 
 @pytest.mark.parametrize("distribution", ["uniform", "normal", "gamma"])
 def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
-    """A packet has sixteen of its own, and takes each for one thing."""
+    """A packet has sixteen numbers, each for one purpose."""
     config = NetworkConfig(
         delay=0.1, jitter=0.5, distribution=distribution, loss=0.2, burst_loss=0.5, duplicate=0.7
     )
@@ -292,7 +292,7 @@ def test_no_two_packets_share_a_random_number(monkeypatch, distribution):
         return 0.6  # nothing is lost, all comes twice
 
     monkeypatch.setattr(network, "_uniform", uniform)
-    monkeypatch.setattr(network, "_travel", network._delay_steps.py_func)
+    monkeypatch.setattr(network, "_delay_steps", network._delay_steps.py_func)
     for k in range(100, 120):
         network._advance_chain.py_func(p, k, 0.0)
     packets, draws = np.array(taken).T

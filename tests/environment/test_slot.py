@@ -92,7 +92,7 @@ def test_materials_of_both_sides_combine_to_those_of_the_slot():
 
 
 def test_contact_does_not_pull_a_fast_ball():
-    """Hunt and Crossley: k x (1 + d times the speed inwards), and no pull where that is less."""
+    """Hunt and Crossley: k x (1 + d times the speed inwards), never negative."""
     pair = slave_at(Slot(stiffness=3e3, dissipation=0.7, friction=0.0)).contact_pairs[0]
     up, force = np.array([0.0, 0.6, 0.8]), np.zeros(3)
     for outwards, share in ((-1.0, 1.7), (0.0, 1.0), (1.0, 0.3), (2.0, 0.0)):
@@ -126,7 +126,7 @@ def distance_to(corners: np.ndarray, point: np.ndarray) -> float:
     z=st.floats(-1.0, 1.0),
 )
 def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
-    """How deep a ball is in its deepest box is how near its centre is to the section's outline."""
+    """The depth of a ball in its deepest box is the distance of its centre to the section."""
     slot = Slot(yaw=yaw, chamfer=chamfer, clearance=clearance, depth=depth)
     corners = profile(slot)
     # Anywhere above the outline: what is in the material is for no ball to reach.
@@ -146,7 +146,7 @@ def test_the_boxes_are_the_section(yaw, chamfer, clearance, depth, x, y, z):
 
 
 def test_walls_tops_and_floor_end_flush():
-    """Where a block ends there is nothing more to touch."""
+    """There is no contact beyond the end of a block."""
     pairs = pairs_of_a_ball(Slot(position=[0.0, 0.0, 0.0]))
     level = np.all(pairs[:, 4:13].round(12) == np.eye(3).ravel(), axis=1)  # all but the chamfers
     assert np.count_nonzero(level) == 5
@@ -190,7 +190,7 @@ def test_an_upright_peg_has_its_play_and_then_both_balls_touch():
 
 
 def test_peg_tilted_beyond_its_clearance_jams():
-    """The walls push its balls apart: a couple against the tilt, and no force."""
+    """The walls act on the balls as a couple against the tilt, without a force."""
     slave, apart = slave_at(DEEP), TIP_BALL - UPPER_BALL
     play = np.arcsin(DEEP.clearance / apart)
     assert not wrench_at(slave, 0.99 * play, 0.0).any()
@@ -228,7 +228,7 @@ def test_the_peg_finds_in_is_slid_down_and_stands_quietly_on_the_floor(inserted)
 
 @pytest.mark.slow
 def test_contact_only_takes_energy_from_the_tool(inserted):
-    """Springs of the contact give back at most what was put in; friction takes."""
+    """Contact springs return at most their energy; friction dissipates."""
     scenario, result = inserted
     arm, n = slave_at(scenario.slot).arm, 6
     J, R, p, power = np.empty((6, n)), np.empty((3, 3)), np.empty(3), []

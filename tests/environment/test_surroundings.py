@@ -1,4 +1,4 @@
-"""Several things to touch, still and moving: against Drake's contact, reactions and statics."""
+"""Several objects, fixed and moving, against Drake's contact, reactions and statics."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ SOFT_PAD = """
 
 
 def test_walls_and_boxes_follow_drakes_contact_law():
-    """In a corner of a soft rough floor, a stiff smooth wall and a tilted box: no two alike."""
+    """In a corner of a soft rough floor, a stiff smooth wall and a tilted box."""
     corner = Several(
         [
             Wall(position=[0.55, 0.0, 0.2], stiffness=3e3, dissipation=4.0, friction=0.7),
@@ -107,7 +107,7 @@ CABINET = """
 
 
 def test_moving_bodies_follow_drakes_contact_law(tmp_path):
-    """A block that was pushed and tipped over, and a drawer that slides in a door that turns."""
+    """A block that tips over, and a drawer that slides in a rotating door."""
     (tmp_path / "cabinet.sdf").write_text(CABINET)
     cabinet = Scene(file=str(tmp_path / "cabinet.sdf"), position=[0.4, 0.0, 0.1])
     both = Several([Block(position=[0.5, 0.0, 0.0], friction=0.6), cabinet])
@@ -140,7 +140,7 @@ def test_moving_bodies_follow_drakes_contact_law(tmp_path):
 
 
 def test_between_two_states_bodies_move_on_smoothly():
-    """A body that turns about two axes at once on its way, halfway and at a third of a step."""
+    """A body that rotates about two axes, at a half and a third of a step."""
     plant = AddSlavePlant(DiagramBuilder(), Slave(), Several([Block(), Scene()])).plant
     bodies = [plant.GetBodyByName(name).index() for name in ("block", "door")]
     (joints, order), h = JointTable(plant, bodies), 0.002
@@ -177,7 +177,7 @@ def pad(tmp_path_factory) -> str:
 
 @pytest.mark.parametrize("case", ["block", "pad", "leaf"])
 def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
-    """A block that is pushed, an area of pressure, a leaf beside a wall; at the sensor's 8 kHz."""
+    """A pushed block, a pressure field, a leaf beside a wall; at the sensor's 8 kHz."""
     things = {
         "block": [Block(position=[0.561, 0.0, 0.2])],  # which the ball begins 1 mm deep in
         "pad": [Scene(file=pad, position=[0.5, 0.0, 0.241], contact="hydroelastic")],
@@ -219,7 +219,7 @@ def test_wrist_wrench_is_the_reaction_for_every_environment(case, pad):
 
 
 def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
-    """With a box inside the ball, which nothing reaches: the same samples, told by Drake."""
+    """A box inside the ball, out of reach, makes Drake compute the same samples."""
     asked, wrench_W = [], ContactTwin.wrench_W
 
     def remember(twin, x, state):
@@ -255,7 +255,7 @@ def test_drake_computes_unmodelled_contacts_between_the_steps(monkeypatch):
 
 
 def test_separation_of_tool_and_unmodelled_shapes():
-    """A box that only Drake knows counts from 2 cm on; the ball in front of it as it touches."""
+    """A box that only Drake supports counts from 2 cm on; the ball counts from contact on."""
     shapes = [Ball(0.012, [0.0, 0.0, 0.188]), ToolBox([0.004] * 3, [0.0, 0.0, 0.1])]
     slave = Slave(position=[0.5, 0.0, 0.45], tool=Tool(mass=1.0, shapes=shapes))
     wall = Wall(position=[0.5, 0.0, 0.0])
@@ -272,7 +272,7 @@ def test_separation_of_tool_and_unmodelled_shapes():
 
 @pytest.mark.slow
 def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
-    """mu m g, in steady sliding, and the summary says how far."""
+    """mu m g in steady sliding; the summary has the distance."""
     scenario = replace(LoadScenario("push_block"), wrist_sensor__ideal=True)
     estimate = true_load(scenario)
     result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
@@ -294,7 +294,7 @@ def test_a_block_that_is_pushed_over_its_table_resists_by_friction():
 
 
 def test_replay_shows_moving_bodies_at_their_poses(tmp_path, meshcat):
-    """A block that is turned, and a door that is open, from their poses alone."""
+    """A rotated block and an open door, from their poses alone."""
     hinge = '<joint name="hinge" type="revolute">'
     text = (models_dir() / "door.sdf").read_text()
     aside = f"{hinge}<pose>0.01 0.02 0.03 0 0 0.4</pose>"  # its frames are not those of its bodies

@@ -1,4 +1,4 @@
-"""The detector in the station: the log's detector sample by sample, and when the hand knows."""
+"""Detector in the station: equal to that of logs, and delay until the hand."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_no_alarm_in_free_motion(tool):
 
 @pytest.mark.parametrize("keep", [1, 8])
 def test_a_grasp_at_8_and_at_1_khz(tool, keep):
-    """The stated noise is that before the filter, at either rate."""
+    """The given noise is that before the filter, at either rate."""
     for seed in range(3):
         states, load = watch(tool, samples(seed, grasp=True)[::keep], keep / RATE)
         assert states[: int(EVENT * RATE / keep)].max() == KNOWN

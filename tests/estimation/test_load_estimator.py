@@ -1,4 +1,4 @@
-"""The load estimator in the loop: what it learns, when it is settled, by either method."""
+"""Load estimator in the loop: estimates and settling, for both methods."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_given_load_stays_until_the_first_update():
 
 
 def test_total_least_squares_removes_the_bias_of_acceleration_noise():
-    """The sensor's own noise and filter: the inertias by rls are off by several sigma, not rtls."""
+    """Inertias of rls deviate by several sigma, those of rtls do not."""
 
     def errors(estimator: RecursiveEstimator, rows):
         estimator.learn(rows[:, :6], rows[:, 6:9], rows[:, 9:12], rows[:, 12:15])

@@ -1,4 +1,4 @@
-"""A load that is watched in the Diagram: settled, grasped and found again; contacts; offsets."""
+"""Monitored load in the Diagram: settling, grasp, contacts, offsets."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_it_settles_and_freezes(grasped, tool):
 
 @pytest.mark.slow
 def test_grasp_is_detected_and_the_object_identified(grasped):
-    """It is known half a second later that it is another load, and soon which one."""
+    """The change is detected within half a second, the new load soon after."""
     assert first(grasped, DISTURBED) - GRASP < 0.05
     changed = first(grasped, OTHER_LOAD)
     assert changed - GRASP < 0.5
@@ -136,7 +136,7 @@ def test_grasp_is_detected_and_the_object_identified(grasped):
 
 @pytest.mark.slow
 def test_estimate_changes_without_a_step(grasped):
-    """Between two known loads nothing is eliminated; each sample goes a hundredth of the way."""
+    """Between two loads nothing is eliminated; each sample moves the estimate by 1 %."""
     phi = grasped["load_estimate"][:, 6:]
     faded = phi[grasped.t < first(grasped, SETTLED, first(grasped, OTHER_LOAD))][-1]
     assert np.abs(faded[0]) < 0.01 * phi[2900, 0]
@@ -147,7 +147,7 @@ def test_estimate_changes_without_a_step(grasped):
 
 @pytest.mark.slow
 def test_contacts_are_not_a_change_of_load(known):
-    """Fig. 8, and pressing down on the leaf for good, still and sliding: nothing fades."""
+    """Fig. 8, and lasting contact with the leaf, at rest and sliding: no change."""
     touch = replace(LoadScenario("contact_transition"), load_estimator__watch=True)
     press = MinimumJerk(t_start=0.2, duration=0.5, translation=[0.0, 0.0, -0.075])
     hold = replace(
@@ -198,7 +198,7 @@ def watch(known, rows, fallback=None):
 
 
 def test_offsets_are_kept_at_rest(known):
-    """They drift by more than a newton, within 3 s by less than what is a contact."""
+    """They drift by more than 1 N, within 3 s by less than the contact threshold."""
     t = np.arange(0.0, 30.0, 1e-3)[:, None]
     drift = t / 30.0 * np.array([1.5, -1.0, 1.5, 0.05, -0.05, 0.05])
     handed, states = watch(known, at_rest(known[0], drift, 0))

@@ -1,4 +1,4 @@
-"""Stiffness and damping from stretches of the way into a contact."""
+"""Stiffness and damping of a contact from stretches of its displacement."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_stiffness_and_damping_are_not_negative():
 
 
 def test_slip_is_excluded_from_stiffness_and_a_hit_stop_is_not():
-    """Of what a way of 0.2 mm changes: up to 0.12 N are a spring's, 0.4 N at most friction's."""
+    """Over 0.2 mm up to 0.12 N belong to the spring, and at most 0.4 N to friction."""
     for sign in (1.0, -1.0):
         assert sign * slip_change(sign * 0.1, sign * 0.12, 0.4) == 0.0
         assert sign * slip_change(sign * 0.4, sign * 0.12, 0.4) == pytest.approx(0.28)

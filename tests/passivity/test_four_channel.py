@@ -1,4 +1,4 @@
-"""The four channels against the equations of their docstring."""
+"""Four channels against the equations of docs/theory.md (T39)."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ def test_no_energy_is_created_at_the_actual_motion(seed):
 
 @pytest.mark.parametrize("delay", [5e-4, 0.15])
 def test_a_light_hand_that_has_bounced_off_a_hard_wall_comes_to_rest(delay):
-    """It swings into the wall before it presses: what was learned then must not keep it going."""
+    """The fit of the bounces must not keep the motion alive."""
     axis = model(LIGHT, 50e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
     assert run.wall[run.t < 4.0].min() < -50.0, "it should have hit the wall"
@@ -123,7 +123,7 @@ def test_no_energy_is_created_with_a_wrong_servo_or_slow_motor(servo, damping):
 
 
 def test_ledger_is_input_minus_output_and_keeps_its_deficit():
-    """At every step, of hand and slave: with a hand that is pushed and pays for nothing, too."""
+    """At every step of both ends, also with a hand that is only pushed."""
     p, method = parameters(CHARGED_BY_DRAG), steps_of("ledger")
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     ends = [initial_memory("ledger", p, start) for _ in range(2)]
@@ -155,7 +155,7 @@ def test_ledger_is_input_minus_output_and_keeps_its_deficit():
 
 
 def test_motors_cannot_use_the_kinetic_energy_of_the_slave():
-    """A = L_s - m v^2 / 2 of each group, the mass taken for 5 % more than was told."""
+    """A = L_s - m v^2 / 2 by group, with 1.05 times the configured mass."""
     p = parameters(PassivityConfig(method="ledger", slave_mass=[4.0, 0.02]))
     start = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     memory, zero = initial_memory("ledger", p, start), np.zeros(6)
@@ -197,7 +197,7 @@ def test_command_of_the_safe_state_is_limited_to_the_balance(seed):
     ],
 )
 def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
-    """With nothing in store at the start, told nothing of the hand."""
+    """Without initial energy and without information about the hand."""
     task = Task(press=3.5, pressed=4.5, release=9.0, released=10.0, end=12.5, judged=1.0)
     network = NetworkConfig(delay=delay, jitter=0.5 if loss else 0.0, loss=loss, burst=0.08)
     pressing = operators_intent(task)
@@ -215,7 +215,7 @@ def test_rendered_force_equals_contact_force_at_rest(grip, wall, delay, loss):
 
 @pytest.mark.parametrize(("grip", "delay"), [(LIGHT, 0.05), (MEDIUM, 0.05)])
 def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay):
-    """Damping that is taken for stiffness is felt without being pressed."""
+    """Damping that counted as stiffness would be rendered without contact force."""
     axis = model(grip, 2.5e3, wall_damping=300.0, slave_friction=30.0)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT)
     found = figures(run, axis)
@@ -225,7 +225,7 @@ def test_rendered_force_is_right_with_damped_wall_and_joint_friction(grip, delay
 
 @pytest.mark.parametrize("grip", [MEDIUM, FIRM])
 def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
-    """At 300 ms: 20 kN/m are 1.1 kN/m at the hand, of which the first second shows 300 N/m."""
+    """At 300 ms: 20 kN/m are 1.1 kN/m at the hand; the first second displays 300 N/m."""
     axis = model(grip, 20e3)
     run = run_one_dof(axis, CHARGED_BEFORE, NetworkConfig(delay=0.15), timeout=PATIENT)
     found, hard = figures(run, axis), axis.force_scale * 20e3 / (1.0 + 20e3 / axis.servo_stiffness)
@@ -234,7 +234,7 @@ def test_displayed_stiffness_rises_for_a_hand_that_stays(grip):
 
 
 def test_short_silence_keeps_the_depth_of_a_hand_that_stays():
-    """48 ms without a packet, at a round trip of 100 ms: the slave used to give way by 2.6 mm."""
+    """48 ms without a packet, at a round trip of 100 ms."""
     network = NetworkConfig(delay=0.05, loss=0.01, burst=0.02)
     run = run_one_dof(
         model(FIRM, 15e3), CHARGED_BEFORE, network, seed=4, timeout=PATIENT,
@@ -277,7 +277,7 @@ def test_released_hand_is_not_accelerated(delay):
 
 @pytest.mark.parametrize("wall", [5.1e3, 20e3])
 def test_removed_wall_is_rendered_briefly(wall):
-    """By taps of 1 Hz: once more, until the slave has been there; a round trip is 100 ms."""
+    """Taps at 1 Hz: once more, until the slave was there; the round trip is 100 ms."""
     t = times(10.0)
     x = -0.01 - 0.025 * np.cos(2.0 * np.pi * t)
     there = np.stack([np.zeros(len(t)), np.where(t < 5.05, wall, 0.0)], axis=1)
@@ -318,7 +318,7 @@ def test_removed_wall_is_rendered_to_a_pressing_hand_for_one_delay(grip, delay):
     ids=["a touch", "hardly in", "hard"],
 )
 def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
-    """But for the drag that earns back what it kept, 0.28 N."""
+    """Except the drag of 0.28 N that refills the ledger."""
     t = times(7.0)
     there = np.stack([np.zeros(len(t)), np.where(t < 6.0, wall, 0.0)], axis=1)
     run = run_one_dof(
@@ -333,7 +333,7 @@ def test_removed_wall_is_rendered_for_half_a_round_trip_of_10_ms(grip, wall):
 
 @pytest.mark.parametrize("rate", [0.7, 1.5])
 def test_taps_are_rendered_from_the_second_on(rate):
-    """News of each comes when the hand is out again: the remembered wall stands in for it."""
+    """Packets of each tap arrive after it: the remembered wall replaces them."""
     t = times(9.0)
     x = charging(t, 20.0, 0.0)[:, 0]
     x = np.where(t < 3.2, x, -0.015 + 0.025 * np.cos(2.0 * np.pi * rate * (t - 3.2) + np.pi))
@@ -351,7 +351,7 @@ def test_taps_are_rendered_from_the_second_on(rate):
     ids=["firm", "hard", "both"],
 )
 def test_fast_hand_receives_the_contact_force(grip, wall, delay, end, share):
-    """30 mm within a second: the slave has spent its reserve before the hand pays."""
+    """30 mm within a second: the slave uses its reserve before it receives energy."""
     axis = model(grip, wall)
     run = run_one_dof(
         axis, CHARGED_BEFORE, NetworkConfig(delay=delay), timeout=PATIENT,

@@ -43,7 +43,7 @@ RICH = PassivityConfig(
 
 
 class Hand:
-    """The master's end, and the packet that it has received last."""
+    """Master's end with its last received packet."""
 
     def __init__(self, wrench: np.ndarray, stiffness: float) -> None:
         self.p = parameters(RICH)
@@ -74,7 +74,7 @@ class Hand:
 
 
 def test_contact_far_from_the_reference_is_one_spring():
-    """As deep as the point itself goes, whether the hand moves or turns; the torque goes along."""
+    """The depth is that of the contact point for translation and rotation, with the torque."""
     arm, k = np.array([0.0, 0.1, 0.0]), 200.0
     normal = np.array([0.0, 0.0, 1.0, *np.cross(arm, [0.0, 0.0, 1.0])])
     component_along = 1.0 + (0.1 / 0.1) ** 2  # of `normal`, a torque being a force at 0.1 m
@@ -88,7 +88,7 @@ def test_contact_far_from_the_reference_is_one_spring():
 
 
 def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
-    """News of friction come late: shown as they come they would push a hand that has turned."""
+    """Delayed friction would push a hand that has reversed."""
     wrench = np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     hand = Hand(wrench, 200.0)
     hand.rest(1500)
@@ -107,7 +107,7 @@ def test_friction_follows_the_hand_and_equals_the_measurement_at_rest():
 
 
 def test_friction_stays_under_a_resting_hand():
-    """Over 600 ms what the slave measures now is less than what holds the hand."""
+    """Over 600 ms the measured friction is smaller than the one that holds the hand."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
@@ -121,7 +121,7 @@ def test_friction_stays_under_a_resting_hand():
 
 @pytest.mark.parametrize("way", [1e-3, -1e-3])
 def test_friction_stays_across_a_rotating_direction(way):
-    """An arm that rubs presses aslant at first. What was shown of friction then was 0.2 N along."""
+    """Joint friction tilts the first contact; 0.2 N of it would lie along n."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
@@ -135,7 +135,7 @@ def test_friction_stays_across_a_rotating_direction(way):
 
 
 def test_brake_of_an_accelerated_hand_fades_with_its_speed():
-    """0.5 N above 0.1 m/s, nothing below 0.05, and no edge that would be felt between."""
+    """0.5 N above 0.1 m/s, 0 below 0.05 m/s, with a ramp between."""
     hand = Hand(np.array([0.0, 0.0, 6.0, 0.0, 0.0, 0.0]), 200.0)
     hand.rest(1500)
     up = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
@@ -152,7 +152,7 @@ def test_brake_of_an_accelerated_hand_fades_with_its_speed():
 
 @pytest.mark.parametrize("turns", [0.6e-3, -0.6e-3])
 def test_friction_force_along_the_contact_is_removed(turns):
-    """A point 40 mm off is touched, then one on the other side; 2.6 and 3.4 N of 3 were felt."""
+    """Contact 40 mm off, then on the other side; without it 2.6 and 3.4 N of 3 were rendered."""
     hand = Hand(np.array([0.0, -1.2, 3.0, 0.12, 0.0, 0.0]), 200.0)
     hand.packet[ROUND_TRIP] = 0.6
     hand.rest(1500)
@@ -181,7 +181,7 @@ def test_stick_slip_does_not_drive_the_hand():
 
 @pytest.mark.parametrize("turning", [False, True])
 def test_sampled_friction_does_not_oscillate_with_a_light_hand(turning):
-    """Its spring gives out k T / 2; a hand that rubs over `lan` shook at 58 Hz by what it felt."""
+    """A sampled spring is active by k T / 2; over `lan` this oscillated at 58 Hz."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     axis, inertia, rubs = (4, 2e-4, 0.05) if turning else (1, 0.02, 0.5)
     hand.rest(1500)
@@ -199,7 +199,7 @@ def test_sampled_friction_does_not_oscillate_with_a_light_hand(turning):
 
 
 def test_friction_ignores_motion_along_the_contact():
-    """A point 40 mm off: the hand goes and turns along n, and feels the wall as without any."""
+    """Contact 40 mm off: motion and rotation along n render only the wall."""
     normal = np.array([0.0, 0.0, 1.0, 0.04, 0.0, 0.0])
     way = 2e-5 * np.array([0.0, 0.0, 1.0, 0.04 / 0.1**2, 0.0, 0.0])
     felt = []
@@ -217,7 +217,7 @@ def test_friction_ignores_motion_along_the_contact():
 
 
 def test_released_hand_receives_at_most_its_ledger():
-    """R_m + 0.7 R_s in contact, and what its drag has cost, though the wall follows with 3 N."""
+    """R_m + 0.7 R_s in contact plus the drag, although the wall follows with 3 N."""
     hand = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 200.0)
     hand.rest(1000)
     got = 0.0
@@ -230,7 +230,7 @@ def test_released_hand_receives_at_most_its_ledger():
 
 
 def test_an_empty_ledger_is_not_drained_by_the_steps_of_an_encoder():
-    """A hand that goes to and fro by one step pays for the way in only if it feels a force then."""
+    """A hand that oscillates by one encoder step needs a force on the way in as well."""
     hand, got, step = Hand(np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]), 0.0), 0.0, 3e-5
     hand.memory[LEDGER] = 0.0
     for k in range(600):
@@ -256,7 +256,7 @@ def test_wrench_cross_fades_after_missing_packets():
 
 
 def test_friction_that_changes_its_sign_does_not_soften_the_wall():
-    """The tool slides to and fro on a wall of 200 N/m while it is pressed."""
+    """The tool slides back and forth on a wall of 200 N/m in contact."""
     p, packet, command = parameters(RICH), np.zeros(PACKET_SIZE), np.zeros(13)
     memory, received = initial_memory("ledger", p, START), np.zeros(PACKET_SIZE)
     pose, before = START.copy(), START.copy()
@@ -308,7 +308,7 @@ def test_slip_is_rendered_gradually_and_a_yielding_wall_at_once():
 
 
 def test_contact_is_independent_of_scales_and_an_opposite_one_is_new():
-    """At the slave 18 N at a lever of 40 mm, in the master's power units at three scales."""
+    """18 N at a lever of 40 mm at the slave, in power units at three scales."""
     config = PassivityConfig(method="ledger")
     contact = np.array([0.0, 0.0, 18.0, 0.0, 0.7, 0.0])
     sizes = []

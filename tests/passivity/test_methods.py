@@ -1,4 +1,4 @@
-"""What every method owes: finite and limited outputs, packets that count, frame-independence."""
+"""Properties of every method: finite, limited, numbered outputs; independence of frames."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_outputs_are_finite_limited_and_numbered(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_world_axes_do_not_matter(method):
-    """Everything turned by a constant R gives turned results."""
+    """A constant rotation of all inputs rotates the outputs."""
     rng = np.random.default_rng(2)
     config = PassivityConfig(method=method)
     master, slave, f_e, newest = (
@@ -175,7 +175,7 @@ def test_input_not_finite_gives_zero_force_and_keeps_the_ledgers(method, bad):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_step_writes_only_into_its_arguments(method):
-    """Compiled code does not notice the end of an array: here each lies between other numbers."""
+    """Compiled code does not check bounds: each array lies between other numbers here."""
     rng, m = np.random.default_rng(4), steps_of(method)
     around = []
 
@@ -243,7 +243,7 @@ def test_charged_tdpa_holds_a_wall_over_a_long_delay_with_the_right_force(wall, 
 
 @pytest.mark.parametrize("sigma", [0.5, 1.0])
 def test_slave_follows_while_its_inertia_is_rendered(sigma):
-    """Accelerating costs energy there; what the master's end has too much of comes back."""
+    """Acceleration needs energy at the slave; surplus energy of the master returns."""
     model = OneDof(sigma=sigma)
     network = NetworkConfig(delay=0.3, jitter=0.25, loss=0.1)
     run = run_one_dof(model, PassivityConfig(method="charged_tdpa"), network)
@@ -255,7 +255,7 @@ def test_slave_follows_while_its_inertia_is_rendered(sigma):
     ("stored", "left"), [(2e-3, 3.0 - 0.45 / 2.0), (3e-4, 1.0), (9e-3, 3.0), (0.0, 0.0)]
 )
 def test_wrench_drops_abruptly_only_without_energy(stored, left):
-    """A hand that feels 3 N and gives way by 0.3 mm in a step, motion scaled by 2: 450 N/s."""
+    """3 N, the hand yields 0.3 mm in a step, motion scale 2: 450 N/s."""
     p = parameters(PassivityConfig(method="tdpa"), motion_scale=(2.0, 2.0))
     memory, packet, wrench = initial_memory("tdpa", p, START), np.zeros(PACKET_SIZE), np.zeros(6)
     received = packet.copy()
@@ -270,7 +270,7 @@ def test_wrench_drops_abruptly_only_without_energy(stored, left):
 
 
 def test_tank_with_fastest_sending_is_not_overdrawn():
-    """A thousand times its content in a second, every millisecond and every ten."""
+    """A thousand times its content in a second, each millisecond and each 10 ms."""
     p = parameters(PassivityConfig(method="two_layer", two_layer=TwoLayerConfig(send_rate=1000.0)))
     for step in (T, 10 * T):
         memory, packet = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
@@ -282,7 +282,7 @@ def test_tank_with_fastest_sending_is_not_overdrawn():
 
 
 def test_overdrawn_tank_keeps_its_deficit():
-    """What comes repays it first; where it was written off, energy came from nothing."""
+    """Received energy repays it first."""
     p = parameters(PassivityConfig(method="two_layer"))
     memory, received = initial_memory("two_layer", p, START), np.zeros(PACKET_SIZE)
     memory[LEDGER] = -1e-3

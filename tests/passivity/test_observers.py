@@ -1,4 +1,4 @@
-"""The observers of energy against closed forms and against the methods' own ledgers."""
+"""Energy observers against closed forms and the methods' own ledgers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drake_teleop.station.passivity.packet import OTHER_ENERGY, PACKET_SIZE, POS
 
 
 def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
-    """A constant force over a path, a constant torque over a turn about its axis."""
+    """A constant force on a path, a constant torque on a rotation about its axis."""
     angle = np.linspace(0.0, 2.5, 6)
     pose = np.zeros((6, 7))
     pose[:, 0], pose[:, 3] = np.cos(angle / 2), np.sin(angle / 2)
@@ -32,7 +32,7 @@ def test_work_of_a_held_wrench_is_exact_however_coarse_the_samples():
 
 
 def test_pairs_differ_by_the_work_of_a_step():
-    """A spring that is sampled: `mean` is its energy exactly, the others are off by k dx^2 / 2."""
+    """For a sampled spring `mean` is exact; the others differ by k dx^2 / 2."""
     x, k = np.array([0.0, 0.1, 0.15, 0.4]), 7.0
     pose, wrench = np.zeros((4, 7)), np.zeros((4, 6))
     pose[:, 0], pose[:, 4], wrench[:, 0] = 1.0, x, -k * x
@@ -58,7 +58,7 @@ def test_tdpa_ledger_is_the_work_at_the_hand():
 
 @pytest.mark.parametrize("short", [None, "master", "slave"])
 def test_drag_acts_only_below_the_reserve(short):
-    """All of it, against the motion, at a speed beyond the fading one."""
+    """Full drag against the motion, above the fading speed."""
     config = PassivityConfig(method="charged_tdpa")
     p, dx, wrench = parameters(config), np.zeros(6), np.zeros(6)
     dx[:3] = 1e-3 * np.array([2.0, -1.0, 2.0]) / 3

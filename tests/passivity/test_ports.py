@@ -61,7 +61,7 @@ def in_bursts(rng: np.random.Generator, steps: int) -> np.ndarray:
 
 @pytest.mark.parametrize("method", ["wave", "tdpa", "charged_tdpa"])
 def test_backward_pair_creates_no_energy_between_hand_and_command(method):
-    """Translation and rotation apart; the wrench is limited, and nothing fades it."""
+    """For each group; the wrench is limited and does not fade."""
     rng, steps = np.random.default_rng(7), 3000
     config = PassivityConfig(
         method=method,
@@ -86,7 +86,7 @@ def test_backward_pair_creates_no_energy_between_hand_and_command(method):
 @pytest.mark.parametrize(("seed", "timeout"), [(3, 0.1), (4, 1.0)])
 @pytest.mark.parametrize("method", ["tdpa", "charged_tdpa"])
 def test_tdpa_creates_at_most_the_kinetic_energy_at_the_slave(method, seed, timeout):
-    """A command that jumped, and one that the safe state moved, gave out 0.96 to 1.2 J."""
+    """A jump of the command, and one by the safe state, released 0.96 to 1.2 J."""
     found = pressed(method, seed, timeout)
     moving = 0.5 * MEDIUM.force_scale * MEDIUM.slave_mass * TdpaConfig().speed[0] ** 2
     assert found.least(ACTUAL) > -moving
@@ -151,7 +151,7 @@ def test_tdpa_repays_a_deficit_before_it_sends(method):
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_tanks_cover_a_jump_of_the_command(seed):
-    """0.18 and 0.33 J were created, by a servo that accelerates more than was assumed."""
+    """Without the servo's own acceleration 0.18 and 0.33 J were created."""
     found = pressed("two_layer", seed, 1.0)
     assert found.least(ACTUAL) >= 0.0 and found.least(MOTOR) >= 0.0
 
@@ -168,7 +168,7 @@ def test_waves_create_no_energy_at_the_command(seed, timeout):
 
 
 def test_force_limit_bounds_the_rendered_force():
-    """And reaches: the wall pushes back with twice as much; nothing is promised about energy."""
+    """The bound is reached: the wall's force is twice as large."""
     found = pressed("force_limit", 2, 1.0)
     limit = ForceLimitConfig().force
     assert MEDIUM.force_scale * np.abs(found.wall).max() > 2.0 * limit
@@ -177,7 +177,7 @@ def test_force_limit_bounds_the_rendered_force():
 
 
 def test_four_channels_are_transparent_without_delay():
-    """Felt is what is pressed, and the slave is where the hand is, though its servo gives way."""
+    """Rendered and contact force are equal, positions too, although the servo yields."""
     task = Task(press=0.5, pressed=1.5, release=4.0, released=5.0, end=6.0, judged=1.0)
     found = run_one_dof(
         MEDIUM, PassivityConfig(method="four_channel"), NetworkConfig(),

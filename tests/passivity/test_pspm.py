@@ -107,7 +107,7 @@ def test_stored_energy_is_what_was_put_in(end):
 
 
 def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
-    """So the damper is felt on top of the limit, and what is not shown costs no energy."""
+    """The damper acts beyond the limit; a withheld wrench costs no energy."""
     p, m, rng = (
         parameters(PassivityConfig(method="pspm")),
         steps_of("pspm"),
@@ -130,7 +130,7 @@ def test_a_wrench_beyond_the_limit_is_shortened_before_the_spring_is_wound():
 
 
 def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
-    """The servo's wrench, and what the spring has more of is paid for; groups unlike each other."""
+    """The ledger pays for additional energy of the spring, by group."""
     monkeypatch.setattr(pspm, "dot", pspm.dot.py_func)
     config = PassivityConfig(method="pspm", servo_stiffness=[300.0, 5.0], servo_damping=[2.0, 0.02])
     p, rng = parameters(config), np.random.default_rng(1)
@@ -140,7 +140,7 @@ def test_servo_wrench_follows_the_command_after_the_safe_state(monkeypatch):
     asked, left, twist = 0.2 * rng.normal(size=6), 0.1 * rng.normal(size=6), rng.normal(size=6)
     moved_into(pose, asked, wanted)
     moved_into(pose, left, command)
-    pspm.command_left.py_func(wanted, command, pose, twist, p, memory)
+    pspm.command_sent.py_func(wanted, command, pose, twist, p, memory)
     np.testing.assert_allclose(memory[HELD_WRENCH], K * left - D * twist, rtol=1e-9)
     np.testing.assert_array_equal(memory[COMMAND_POSE], command)
     more = groups(0.5 * K * (left**2 - asked**2))

@@ -1,4 +1,4 @@
-"""A hand that lets go while it presses: what all methods but `none` make of it."""
+"""Released hand in contact, for all methods except `none`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LET_GO = 9000
 @pytest.mark.parametrize("delay", [0.05, 0.3])
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "none"])
 def test_released_hand_stays_slow(method, delay):
-    """Before a wall of 5.1 kN/m, some 4 N undelayed; 1.3 and 4.4 m/s without the limit."""
+    """Wall of 5.1 kN/m, about 4 N without delay; 1.3 and 4.4 m/s without the limit."""
     intent = operators_intent()[:11000]
     intent[intent[:, 0] > 0.0] *= 1.375
     grip = np.tile([0.2, 5.0, 300.0], (len(intent), 1))
@@ -31,7 +31,7 @@ def test_released_hand_stays_slow(method, delay):
 
 
 def test_only_wrench_along_a_fast_hand_fades():
-    """Speed and wrench of each group apart, at the hand's scale; inertia that is felt stays."""
+    """Speed and wrench by group, at the hand's scale; the inertial part stays."""
     config = PassivityConfig(method="tdpa", slave_mass=[2.0, 0.5])
     p = parameters(config, motion_scale=[2.0, 1.0])
     given = np.array([3.0, 4.0, 0.0, 0.0, 0.0, 2.0])

@@ -1,4 +1,4 @@
-"""Silence, and its end: nothing steps, nothing is replayed, everything recovers."""
+"""Silence and its end: no steps, no replay, recovery."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def rough_networks(tmp_path_factory) -> list[tuple[NetworkConfig, NetworkConfig]
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_station_recovers_after_every_rough_network(rough_networks, method):
-    """Whatever the network did until 9 s, in contact: it comes to rest, and the slave is there."""
+    """With contact and any network until 9 s, the slave comes to rest at the hand."""
     model = OneDof(wall_stiffness=500.0)
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method, force_limit=5.0)
@@ -166,7 +166,7 @@ def test_station_recovers_after_every_rough_network(rough_networks, method):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
-    """Before the paper's wall, where several methods chatter: not in the 0.5 s after a silence."""
+    """In the 0.5 s after a silence, with the paper's wall, where several methods chatter."""
     resumptions = 0
     for forward, backward in rough_networks:
         config = PassivityConfig(method=method)
@@ -182,7 +182,7 @@ def test_wrench_rises_without_steps_while_resuming(rough_networks, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_packet_does_not_contain_old_memory(method):
-    """What is sent is finite whatever lay where the packet is written."""
+    """The sent packet is finite for any previous content of its memory."""
     p = parameters(PassivityConfig(method=method))
     pose = np.array([1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
     number, still = steps_of(method), np.zeros(6)

@@ -95,7 +95,7 @@ def test_steady_position_error_is_the_momentum_on_the_line(delay):
 
 @pytest.mark.parametrize("delay", [1, 40])
 def test_a_line_that_filled_in_contact_holds_it(delay):
-    """5 N stand before there is a line: then the command never moves, and the hand feels them."""
+    """5 N act before the line starts: the command stays, and 5 N are rendered."""
     f, x = line(WaveConfig(), np.zeros(400), lambda u, x: -5.0, delay, delay, fills=2 * delay + 100)
     assert np.abs(x).max() < 1e-12
     np.testing.assert_allclose(f[-200:], -5.0, rtol=1e-9)
@@ -124,7 +124,7 @@ def test_line_that_filled_in_contact_releases_only_its_energy(delay):
 
 
 def test_energy_that_fills_a_line_counts_once():
-    """f^2 / 4 b goes back, in store is what the filter lags, and what has come is spent."""
+    """f^2 / 4 b returns, the store holds the filter's lag, received energy is used."""
     config, force, n = WaveConfig(), 5.0, 100
     p = parameters(PassivityConfig(method="wave", wave=config))
     start, zero, f_e = (
@@ -147,7 +147,7 @@ def test_energy_that_fills_a_line_counts_once():
 
 @pytest.mark.parametrize("missing", [1, 40, 90])
 def test_wrench_rate_is_bounded_after_missing_packets(missing):
-    """In contact while the hand moves on: 450 N/s at most, where it would be 1 to 7 N in a step."""
+    """In contact with a moving hand: at most 450 N/s instead of 1 to 7 N in a step."""
     pressed, begin = 0.01 * (1.0 - np.cos(np.arange(600) * T / 0.15)), 150
     f, _ = line(
         WaveConfig(),
@@ -163,7 +163,7 @@ def test_wrench_rate_is_bounded_after_missing_packets(missing):
 
 @pytest.mark.parametrize(("touch", "rest"), [(0.0, (1 - 3 * T) ** 200), (1e-9, 1.0)])
 def test_drift_fades_unless_that_increases_contact_force(touch, rest):
-    """The wave line brings velocities; what the command lacks of the position is added slowly."""
+    """The wave transmits velocities; the position error is corrected slowly."""
     p = parameters(PassivityConfig(method="wave", wave=WaveConfig(drift_rate=3.0)))
     start, zero = np.array([1.0, 0, 0, 0, 0, 0, 0]), np.zeros(6)
     memory = [initial_memory("wave", p, start) for _ in range(2)]

@@ -172,7 +172,7 @@ def test_clutch_holds_the_command_and_re_indexes_without_a_jump():
 
 
 def test_the_clutch_waits_for_a_pose():
-    """It would keep one that is none as its reference."""
+    """An invalid pose would stay the reference."""
     system = KinematicScaling(KinematicScalingConfig(), 1e-3, np.arange(1.0, 8.0))
     context = system.CreateDefaultContext()
     for pose, closed in ((np.full(7, np.nan), 0.0), (np.array(IDENTITY), 1.0)):

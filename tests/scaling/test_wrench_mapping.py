@@ -1,4 +1,4 @@
-"""The slave's wrench as the hand feels it."""
+"""Wrench to render at the hand from the slave's wrench."""
 
 from __future__ import annotations
 

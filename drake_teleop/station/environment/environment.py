@@ -17,12 +17,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
-from pydrake.multibody.tree import (
-    BodyIndex,
-    ModelInstanceIndex,
-    QuaternionFloatingJoint,
-    RigidBody,
-)
+from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloatingJoint, RigidBody
 
 
 class Stand(NamedTuple):

@@ -15,13 +15,7 @@ Section across the slot, M is the middle of its mouth, z up::
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import (
-    Box,
-    ProximityProperties,
-    RoleAssign,
-    SceneGraph,
-    Sphere,
-)
+from pydrake.geometry import Box, ProximityProperties, RoleAssign, SceneGraph, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia

@@ -53,8 +53,7 @@ class LoadEstimatorConfig:
         "predicted uncertainty of a settled load, relative to a natural value",
     )
     watch: bool = plain(
-        False,
-        "freeze a settled load, or one that is given with its covariance; detect its change",
+        False, "freeze a settled load, or one that is given with its covariance; detect its change"
     )
     model_error: float = quantity(
         0.0,

@@ -126,7 +126,7 @@ def _change(device, numbers, period, drive):
     displayed, last, limits, full = drive[_LAST], device[_LAST], np.empty(2), _full(numbers)
     fault = drive[_FAULT] != _NONE
     drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
-    # All of the way within STOP, so that it does not turn at once either.
+    # All of the way within STOP_TIME, so that it does not turn at once either.
     share = 0.0 if fault else period / max(STOP_TIME + period - drive[_SOUND], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
