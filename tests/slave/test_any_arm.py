@@ -1,4 +1,4 @@
-"""Foreign arms in the station: seven joints, one of which slides, and what may be wrong."""
+"""User-supplied arms in the station: seven joints, one of them prismatic, and invalid scenarios."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ slave:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scenario and beside it an arm that has a gripper, and strong motors."""
+    """Folder with a scenario and an arm with a gripper and strong motors."""
     folder = tmp_path_factory.mktemp("station")
     text = other_arm_urdf(slides=4).replace('effort="40"', 'effort="400"')
     text = text.replace('ixy="0.001" ixz="-0.002" iyz="0.0015"', 'ixy="0" ixz="0" iyz="0"')
@@ -278,7 +278,7 @@ def test_without_an_arm_the_scenario_is_the_papers():
 
 
 def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
-    """Between two fingers, each of which is a turned box, and not at the centre of mass."""
+    """The tip is between two rotated boxes, not at the centre of mass."""
     text = (folder / "arm.urdf").read_text()
     box = '<collision><geometry><box size="0.06 0.01 0.02"/></geometry></collision></link>'
     for side in (-1, 1):
@@ -303,7 +303,7 @@ def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_joint_may_swing_a_little_beyond_its_limit(scenario, beyond, stops, side):
-    """One that follows a command that stays at its limit does, before the arm is at its stop."""
+    """An arm that is commanded to its limit overshoots before its mechanical stop."""
     arm = NominalSlave(scenario.slave).arm
     monitor = SlaveMonitor(arm, 1e-3)
     context, q = monitor.CreateDefaultContext(), np.array(HOME)
@@ -320,7 +320,7 @@ def test_a_joint_may_swing_a_little_beyond_its_limit(scenario, beyond, stops, si
 
 
 def slowest(scenario):
-    """Of the motions of the linearised station, the multipliers of those that die last."""
+    """Return the multipliers of the slowest modes of the linearized station."""
     system = linearize_station(scenario, load_estimate=true_load(scenario))
     return np.abs(system.multipliers[:20])
 
@@ -339,7 +339,7 @@ def test_a_redundant_arm_nears_its_posture_by_what_the_kinematics_pull(scenario,
 
 @pytest.mark.slow
 def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
-    """Commands are displaced by more than what the kinematics are solved to, as without them."""
+    """The command displacement exceeds the tolerance of the kinematics in both cases."""
     beside = replace(scenario, environment=[Wall(position=[0.0, 0.0, -2.0])])
     beside = replace(beside, slave__tool=Tool(mass=1.0, shapes=[Ball(0.01, [0.0, 0.0, 0.1])]))
     alone = slowest(replace(beside, environment=[]))
@@ -353,7 +353,7 @@ def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
 
 @pytest.mark.slow
 def test_a_slow_joint_changes_no_multiplier(folder, scenario, free):
-    """What a joint may go in a period is no part of small motions."""
+    """Speed limits do not affect small motions."""
     text = (folder / "arm.urdf").read_text()
     j4 = text.index('<joint name="j4"')
     slow = text[:j4] + text[j4:].replace('velocity="3"', 'velocity="0.02"', 1)

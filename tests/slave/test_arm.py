@@ -1,4 +1,4 @@
-"""The compiled arm kernels against the Drake plant that they were read from."""
+"""Compiled arm kernels against the Drake plant from which they are read."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def random_states(arm, count=50):
 
 
 def full(plant, arm, values):
-    """The plant's vector (other joints at zero) that holds the arm's values."""
+    """Return the plant's vector with the arm's values and zeros for other joints."""
     vector = np.zeros(plant.num_velocities())
     vector[arm.velocity_index] = values
     return vector
@@ -111,7 +111,7 @@ def test_inverse_dynamics_equals_the_plant(case):
 
 
 def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(case):
-    """With a wrench on the load: J^T F on top of the torques."""
+    """A wrench on the load adds J^T F to the torques."""
     _, _, arm = case
     n, random = arm.num_joints, np.random.default_rng(5)
     tau, found, J = np.zeros(n), np.zeros(n), np.zeros((6, n))

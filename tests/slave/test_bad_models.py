@@ -1,4 +1,4 @@
-"""Models that something is wrong with: one error that says what, or an assumption that is named."""
+"""Faulty models cause one error that names the fault, or an assumption."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def joint(k, kind="revolute", inside="", parent=None, child=None, name=None, tag
 
 
 def arm(joints=6, beyond="", j3=None, l3=None, l0=None):
-    """A URDF whose third joint and link are as given."""
+    """Return a URDF with the given third joint and link."""
     parts = [l0 or link("l0")]
     for k in range(1, joints + 1):
         parts += [j3 if j3 and k == 3 else joint(k), l3 if l3 and k == 3 else link(f"l{k}")]
@@ -82,7 +82,7 @@ def sdf_joint(kind, axis="<axis><xyz>0 0 1</xyz></axis>"):
 
 
 def read(slave):
-    """What `run` and `new` do first, and `excite` but for tool and start; the assumptions."""
+    """Read the slave as `run` and `new` do; return the assumptions."""
     slave.check("slave")
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
@@ -286,7 +286,7 @@ def test_what_is_missing_is_assumed_and_named(tmp_path, case):
 
 
 def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
-    """Of the same arm with other limits each time, in places that it can reach."""
+    """One arm with different limits, at reachable positions."""
     path = tmp_path / "arm.urdf"
     path.write_text(arm())
     slave = Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0))
@@ -304,7 +304,7 @@ def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
 
 
 def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
-    """In its place Drake takes a ball's: 0.005, and not 0.02 and 0.04 kg m^2."""
+    """Drake would replace it by that of a ball: 0.005 instead of 0.02 and 0.04 kg m^2."""
     path, plant = tmp_path / "arm.urdf", MultibodyPlant(0.0)
     path.write_text(ASSUMED["an inertia of rounded numbers"][0])
     ParseSlave(plant, Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0)))

@@ -1,4 +1,4 @@
-"""The closed-form inverse kinematics of the RX90 against the plant and against its own forward."""
+"""Closed-form inverse kinematics of the RX90 against the plant and the forward kinematics."""
 
 from __future__ import annotations
 

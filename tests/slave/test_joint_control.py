@@ -55,7 +55,7 @@ def test_without_encoders_the_motors_carry_the_arm_and_without_a_command_they_ho
 
 
 def test_the_joints_do_not_disturb_each_other(arm):
-    """Computed torque: an error of one joint accelerates that joint alone."""
+    """Computed torque: the error of one joint accelerates this joint only."""
     q, error = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), np.zeros(6)
     error[1] = 0.001
     wanted = np.zeros(6)
@@ -74,7 +74,7 @@ def test_torque_stays_within_the_motors_limits(arm):
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize("share", [0.999, 1.0, 1.001])
 def test_at_its_speed_limit_a_joint_is_not_accelerated_any_more(arm, way, share):
-    """However far away the setpoint is; beyond the limit it is braked, by the block as by hand."""
+    """Beyond the limit it brakes, however far the setpoint; the block equals the formula."""
     q, config = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), JointControlConfig()
     limit = way * arm.velocity_limit
     braking = 2 * np.pi * config.velocity_bandwidth_hz * (1.0 - share) * limit

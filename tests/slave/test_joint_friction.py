@@ -1,4 +1,4 @@
-"""Dry friction in the arm's joints: the plant has it, the compiled dynamics too, no controller."""
+"""Dry joint friction: in the plant and the compiled dynamics, but in no controller."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
 
 
 class Arm:
-    """The plant by itself, with motors that hold a torque."""
+    """The plant alone, with constant motor torques."""
 
     def __init__(self, friction):
         builder = DiagramBuilder()
@@ -50,7 +50,7 @@ def arm():
 
 @pytest.mark.parametrize("speed", [0.3 * FRICTION_SPEED, 0.4])
 def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, speed):
-    """What computed torque means to be a motion lacks the friction, of which it is not told."""
+    """Computed torque does not compensate the friction."""
     random, table = np.random.default_rng(3), arm.slave.arm.table
     torque, compiled = np.empty(6), np.empty(6)
     for _ in range(10):
@@ -89,7 +89,7 @@ def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
 
 
 def test_it_takes_energy_and_never_gives_any(arm):
-    """The arm swings on with no torque but its friction: what is lost is friction's work."""
+    """An arm swings without torque; the lost energy equals the friction's work."""
     v = np.array([1.0, -0.8, 0.9, -2.0, 1.5, 3.0])
     arm.put(arm.slave.start, v, np.zeros(6))
     arm.simulator.get_mutable_context().SetTime(0.0)

@@ -1,4 +1,4 @@
-"""One period of an excitation trajectory, begun late, at rest before and after."""
+"""One delayed period of an excitation trajectory, at rest before and after."""
 
 from __future__ import annotations
 

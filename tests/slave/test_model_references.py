@@ -1,4 +1,5 @@
-"""Files that a model names are read inside its folder and packages; nothing ends the process."""
+"""Referenced files are read only inside the model's folder and packages; no file ends the process.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +75,7 @@ def gltf(**more: object) -> dict:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Of a model, beside a file that is somebody else's."""
+    """Folder of a model, beside a secret file."""
     (tmp_path / "secret.png").write_bytes(b"secret")
     (tmp_path / "other.sdf").write_text(sdf('<link name="l"/>'))
     (tmp_path / "solid.obj").write_text(SOLID)
@@ -83,7 +84,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write(folder: Path, **files: str | dict) -> Path:
-    """The first of some files, whose names have _ for the point."""
+    """Write files, with _ for the point in their names; return the first."""
     paths = [folder / name.replace("_", ".", 1) for name in files]
     for path, content in zip(paths, files.values(), strict=True):
         path.write_text(content if isinstance(content, str) else json.dumps(content))
@@ -163,7 +164,7 @@ def test_a_mesh_outside_is_left_out_and_the_remedy_named(tmp_path: Path, where: 
 
 
 def circle(text: Callable[[str], str], *names: str) -> dict[str, str]:
-    """Files that name each other."""
+    """Return files that include each other."""
     others = (*names[1:], names[0])
     return {name.replace(".", "_"): text(other) for name, other in zip(names, others, strict=True)}
 
@@ -268,7 +269,7 @@ def test_an_include_that_may_not_be_is_one_line(folder: Path, name: str) -> None
 
 
 def test_a_name_of_any_length_is_one_line(folder: Path) -> None:
-    """Drake's pattern for addresses ends the process on a long one."""
+    """Drake's regular expression for addresses aborts on a long one."""
     long = "file://" + "a" * 30_000
     path = folder / "a.yaml"
     path.write_text(f"directives: [add_directives: {{file: '{long}'}}]")
@@ -293,7 +294,7 @@ def test_joints_in_a_circle_are_one_line(folder: Path) -> None:
 def test_a_file_where_the_process_is_is_none_of_the_model(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Drake looks there for what included files include."""
+    """Drake resolves nested includes from the working directory."""
     monkeypatch.chdir(folder.parent)
     path = write(folder, a_sdf=including("b.sdf"), b_sdf=including("other.sdf"))
     with pytest.raises(DrakeTeleopError, match=OUTSIDE):

@@ -1,4 +1,4 @@
-"""The numeric inverse kinematics against the plants and the closed form, and where it cannot go."""
+"""Numeric inverse kinematics against plants and the closed form, also out of reach."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ BENT = np.array([0.2, -0.5, -1.6, 0.7, 0.8, 0.4])
 
 
 class Case(NamedTuple):
-    """An arm with the plant that says where it is."""
+    """An arm and its plant, which gives the true pose."""
 
     plant: object
     context: object
@@ -59,7 +59,7 @@ class Case(NamedTuple):
         return pose_of(self.X_WS(q))
 
     def errors(self, pose, q):
-        """[m], [rad]."""
+        """Return the errors of position [m] and orientation [rad]."""
         X = self.X_WS(q)
         R = RotationMatrix(X.rotation().inverse().matrix() @ quaternion(pose).matrix())
         return np.linalg.norm(pose[4:] - X.translation()), R.ToAngleAxis().angle()
@@ -133,7 +133,7 @@ def test_on_the_rx90_it_is_the_closed_form(rx90):
 
 
 def test_of_all_turns_the_one_nearest_to_the_reference(rx90):
-    """Joints 4 and 6 turn by more than 360 degrees."""
+    """Joints 4 and 6 have ranges above 360 degrees."""
     q = np.array([0.2, -0.5, -1.6, 0.7, 0.6, 4.0])
     assert q[5] < rx90.arm.upper[5]
     found, status = find_posture(rx90.arm, rx90.pose(q), np.append(q[:5], 3.9))
@@ -151,10 +151,10 @@ def lost_axis(case, q):
 
 
 def sweep(case, q, solve):
-    """S turns to and fro about the axis about which it can hardly turn at q.
+    """Rotate S back and forth about the axis with the smallest singular value at q.
 
     Returns:
-        Largest step as part of what speeds allow; errors at the end; statuses.
+        Largest step as a share of the speed limits; errors at the end; statuses.
     """
     axis = lost_axis(case, q)
     X, largest, statuses = case.X_WS(q), 0.0, set()
@@ -190,7 +190,7 @@ def test_through_a_singular_wrist_no_joint_is_faster_than_it_can_be(rx90, aside)
 
 
 def test_next_to_nothing_at_a_singularity_sets_nothing_in_motion(rx90):
-    """Joints 4 and 6 would turn far for 1e-7 rad."""
+    """Joints 4 and 6 would rotate far for 1e-7 rad."""
     X, q = rx90.X_WS(STRETCHED), STRETCHED
     turn = np.array([1.0, *(0.5e-7 * lost_axis(rx90, STRETCHED))])
     pose = pose_of(RigidTransform(quaternion(turn) @ X.rotation(), X.translation()))
@@ -201,7 +201,7 @@ def test_next_to_nothing_at_a_singularity_sets_nothing_in_motion(rx90):
 
 @pytest.mark.parametrize(("max_step", "pull"), [(0.01, 0.02), (1e-3, 1.0)])
 def test_what_is_left_over_goes_to_the_posture(seven, max_step, pull):
-    """Away along what the pose leaves open, and back, while the pose is met."""
+    """The arm moves in its null space and returns; the pose is met."""
     home, J = np.full(7, 0.4), np.empty((6, 7))
     jacobian(seven.arm.table, home, J)
     pose, q, away = seven.pose(home), home, []
@@ -331,7 +331,7 @@ def test_in_no_time_nothing_moves_not_even_a_joint_without_a_limit(rx90):
 
 @pytest.mark.parametrize(("period", "left"), [(0.01, np.exp(-1.0)), (0.1, 0.9**10), (3.0, 0.0)])
 def test_the_posture_is_neared_by_time_and_not_by_command(seven, period, left):
-    """In a second by all but 1/e of the way, in steps as they come, and never beyond it."""
+    """1/e of the distance remains after 1 s, for any period, without overshoot."""
     home, J = np.full(7, 0.4), np.empty((6, 7))
     jacobian(seven.arm.table, home, J)
     pose, posture = seven.pose(home), home + 0.2 * np.linalg.svd(J)[2][6]

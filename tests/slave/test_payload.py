@@ -1,4 +1,4 @@
-"""A payload: the plant carries it, the sensor feels it, the identification finds it."""
+"""Payload: carried by the plant, measured by the sensor, identified as load."""
 
 from __future__ import annotations
 

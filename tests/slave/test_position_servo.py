@@ -1,4 +1,4 @@
-"""Arms that take joint positions: lag, dead time, limits, and torques that follow."""
+"""Arms with a position interface: lag, dead time, limits and torques."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def arm():
 
 
 def follow(arm, interface, command, steps):
-    """(steps, 12) [q; v] of the arm under the block's torque, and the torque (steps, 6).
+    """Return [q; v] (steps, 12) of the arm under the block's torque, and the torque (steps, 6).
 
-    The arm takes semi-implicit steps: the drives' loop, not the integrator, is what is looked at.
+    Integrates with semi-implicit steps.
     """
     config = dataclasses.replace(Scenario().joint_control, servo="position", interface=interface)
     block = MakeJointControl(arm, config, PERIOD, HOME)
@@ -58,7 +58,7 @@ def test_a_steady_motion_is_followed_by_lookahead_dead_time_and_half_a_hold_late
 
 
 def test_a_step_begins_after_the_dead_time_and_is_the_closed_form(arm):
-    """Of d2r/dt2 = gain (1 - r - lookahead dr/dt), damped by 0.87."""
+    """Solution of d2r/dt2 = gain (1 - r - lookahead dr/dt), damping ratio 0.87."""
     states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)
     response = (states[:, 0] - HOME[0]) / 0.02
     assert np.abs(response[: round(UR.dead_time / PERIOD)]).max() < 1e-9
@@ -80,7 +80,7 @@ def test_speed_and_acceleration_stay_within_the_limits(arm):
 
 
 def test_it_brakes_in_time_however_far_the_target_is(arm):
-    """A fast interface of weak motors, such as Franka's: a linear law would shoot far beyond."""
+    """With a fast interface of weak motors, a linear law would overshoot."""
     franka = INTERFACES["franka_position"]
     states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
     moved = states[:, :6] - HOME
@@ -89,7 +89,7 @@ def test_it_brakes_in_time_however_far_the_target_is(arm):
 
 
 def test_what_it_generates_is_torque_that_the_arm_follows(arm):
-    """Along what is generated, the torque is the inverse dynamics of that motion."""
+    """The torque is the inverse dynamics of the generated motion."""
     states, torques = follow(arm, UR, lambda t: HOME + 0.1, 60)
     q, v = np.split(states[40], 2)
     vdot, expected = (states[41, 6:] - v) / PERIOD, np.empty(6)

@@ -1,4 +1,4 @@
-"""Joint control sampled inside the step, against an event for each of its samples."""
+"""Joint control sampled inside the step, against one event per sample."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ CONFIG = JointControlConfig()
 
 
 def moved(samples, hz, wall=None):
-    """Where the joints are after 20 ms of a step of the command; an event for each `samples`."""
+    """Return the joint positions 20 ms after a command step, with one event per `samples`."""
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(), wall)
     if samples > 1:
@@ -61,7 +61,7 @@ def test_samples_inside_a_step_move_the_arm_as_events_do(wall, share):
 
 
 class Elsewhere(LeafSystem):
-    """A master that wants the tool 2 mm to the side."""
+    """A master that commands the tool 2 mm to the side."""
 
     def __init__(self, start):
         super().__init__()

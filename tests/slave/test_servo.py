@@ -1,4 +1,4 @@
-"""The arm as one servo at the tool: energy, and who is told of it."""
+"""The arm as one servo at the tool: kinetic energy, and the methods that use it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def home(arm):
 
 
 def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
-    """Against the joints' mass matrix, column by column from the inverse dynamics."""
+    """Against the mass matrix from the inverse dynamics, column by column."""
     still, weight, J = np.zeros(6), np.empty(6), np.empty((6, 6))
     inverse_dynamics(arm.table, home, still, still, weight)
     mass = np.empty((6, 6))
@@ -40,7 +40,7 @@ def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
 
 
 def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
-    """And some motion has all of it."""
+    """One motion reaches the bound."""
     config = SCENARIO.joint_control
     told = servo_at_tool(arm, home, config)
     mass = np.diag(np.repeat(told.mass, 3))

@@ -1,4 +1,4 @@
-"""The compiled contact law is Drake's, wherever ball and leaf meet."""
+"""The compiled contact law equals Drake's for ball and leaf."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.station.slave.tool_contact import environment_wrench
 
 
 def drakes(plant, context, tool) -> np.ndarray:
-    """[f; tau] on the tool about the world's origin, from the plant's own contact results."""
+    """Return [f; tau] on the tool about the world's origin, from the plant's contact results."""
     results, wrench = plant.get_contact_results_output_port().Eval(context), np.zeros(6)
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
@@ -64,7 +64,7 @@ def test_it_is_drakes_law(leaf, most):
 
 
 def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
-    """Near the floor, tilted: both balls on floor, walls and chamfers."""
+    """Tilted near the floor: both balls touch floor, walls and chamfers."""
     builder = DiagramBuilder()
     slot = Slot(position=[0.55, 0.0, 0.2], yaw=0.4, clearance=5e-4, friction=0.3)
     slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.362]), slot)
@@ -99,7 +99,6 @@ def test_a_push_is_moved_to_the_worlds_origin():
 
 
 def test_other_shapes_are_watched_from_around_them():
-    """A brick turned about z, and a box around a ball; without an end there is none."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     table = plant.AddModelInstance("table")
@@ -118,7 +117,7 @@ def test_other_shapes_are_watched_from_around_them():
 
 
 def test_boxes_that_are_apart_do_not_touch():
-    """Never farther than Drake says, and as far where a face is the nearest."""
+    """The distance never exceeds Drake's, and equals it if a face is nearest."""
     random, half = np.random.default_rng(3), np.array([[0.02, 0.05, 0.1], [0.08, 0.03, 0.04]])
     plant, _ = AddMultibodyPlantSceneGraph(builder := DiagramBuilder(), 0.0)
     bodies = [

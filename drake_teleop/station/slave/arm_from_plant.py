@@ -1,4 +1,4 @@
-"""A serial arm of revolute and prismatic joints, read out of a finalized MultibodyPlant."""
+"""Conversion of a finalized MultibodyPlant to an `ArmModel`."""
 
 from __future__ import annotations
 
@@ -38,19 +38,13 @@ def ArmModelFromPlant(
     model_instance: ModelInstanceIndex,
     sensor_frame_name: str = "sensor",
 ) -> ArmModel:
-    """Reads the chain from the world to a sensor frame out of a finalized plant.
+    """Return the chain from the world to a sensor frame of a finalized plant.
 
-    Joints beyond the sensor frame (a gripper's fingers) count as held at their default positions.
-
-    Args:
-        plant: a finalized plant; other models in it do not matter, whatever is attached to the arm
-            counts, whichever model instance it belongs to.
-        model_instance: the arm's.
-        sensor_frame_name: a frame of that model instance, on the last link or welded to it.
+    Joints beyond the sensor frame are held at their default positions.
 
     Raises:
-        DrakeTeleopError: there is no such frame, or what leads to it from the world is not a chain
-            of welds, revolute and prismatic joints, or a link carries a further moving joint.
+        DrakeTeleopError: if the frame is missing, the path to it is not a chain of welds, revolute
+            and prismatic joints, or a link carries another moving joint.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -73,7 +67,7 @@ def ArmModelFromPlant(
     table[n, GRAVITY:SLIDES] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
 
     context = plant.CreateDefaultContext()
-    # C turns the joint's axis into z.
+    # C rotates the joint's axis to z.
     C = [RigidTransform(RotationMatrix.MakeFromOneVector(_axis(j), 2)) for j in joints]
     X_WS = frame_S.CalcPoseInWorld(context)
     X_WJ = [
@@ -118,7 +112,6 @@ def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
 
 
 def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoint | PrismaticJoint]:
-    """The moving joints from the world to S, from the base outwards."""
     body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
     while body.index() in inboard:
         joint = inboard[body.index()]
@@ -146,7 +139,6 @@ def _row_of(
     rows: dict[BodyIndex, int],
     sensor_body: RigidBody,
 ) -> int | None:
-    """The row of the table that carries the body's inertia; None if the arm does not carry it."""
     moving = None
     outermost = body
     while True:
@@ -170,7 +162,7 @@ def _row_of(
 
 
 def _phi(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """(10,) phi of a body about the origin of L, in L."""
+    """Return phi (10,) of a body about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()

@@ -1,4 +1,4 @@
-"""Limits that a model of an arm leaves out, and what is assumed in their place."""
+"""Default joint limits for models that specify none."""
 
 from __future__ import annotations
 
@@ -12,30 +12,27 @@ from drake_teleop.station.slave.arm import SLIDES, ArmModel
 
 Array = NDArray[np.float64]
 
-# Range [rad], speed [rad/s] of a joint that turns; of one that slides [m], [m/s].
+# Default half range and speed: revolute [rad, rad/s], prismatic [m, m/s].
 _TURNS, _SLIDES = (np.pi, np.pi), (1.0, 1.0)
-# A joint turns about itself at most so far [rad]; limits farther apart may be in degrees.
+# Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _TURNS_AT_MOST = 8 * np.pi
-# To full speed [s].
+# Default time to full speed [s].
 _TIME_TO_SPEED = 0.4
 
 
 def with_all_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
-    """The arm with a limit for everything, and what was assumed for it.
+    """Return the arm with every limit set, and one text per assumption.
 
-    Args:
-        arm: as its model has it.
-        where: for messages.
-        acceleration: limits [rad/s^2], one for all joints or one for each, instead of its own.
-        hint: added to what is assumed of accelerations: how to give them.
+    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
+    assumption about accelerations.
 
     Raises:
-        DrakeTeleopError: for a joint that cannot move, or a wrong number of accelerations.
+        DrakeTeleopError: for a fixed joint or a wrong number of accelerations.
     """
     n, assumptions = arm.num_joints, []
-    # From 0 to 0 is what exporters write when they do not know.
+    # Exporters write 0 to 0 for unknown limits.
     endless = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper)) | (
         (arm.lower == 0) & (arm.upper == 0)
     )
@@ -91,5 +88,5 @@ def with_all_limits(
 
 
 def _given(limits: Array) -> NDArray[np.bool_]:
-    """Which limits are limits; a zero is what exporters write when they do not know."""
+    """Return True for specified limits; exporters write 0 for unknown ones."""
     return np.isfinite(limits) & (limits > 0)

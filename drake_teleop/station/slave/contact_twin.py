@@ -1,4 +1,4 @@
-"""Drake's contact in any state: the slave's plant and what there is to touch, once more."""
+"""Drake's contact wrench in any state, from a second plant."""
 
 from __future__ import annotations
 
@@ -15,15 +15,7 @@ Array = NDArray[np.float64]
 
 
 class ContactTwin:
-    """A plant of its own, which nothing moves.
-
-    The simulated plant is in one state; the wrist sensor wants contact at instants between.
-
-    Args:
-        config: which slave.
-        environment: what there is to touch.
-        q_start: (n,) joint positions [rad].
-    """
+    """Second copy of the plant, for contact between the states of the simulated one."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()
@@ -33,11 +25,10 @@ class ContactTwin:
         self._context = self._slave.plant.GetMyMutableContextFromRoot(self._root)
 
     def wrench_W(self, x: Array, state: Array) -> Array:
-        """(6,) what contacts exert on the tool, about the world's origin, in W.
+        """Return the contact wrench (6,) on the tool, about the world's origin, in W.
 
-        Args:
-            x: [q, a leaf's deflection, v, its rate] of arm and leaf.
-            state: [q; v] of the plant, for everything else that moves; empty if nothing does.
+        x is [q, leaf deflection, v, its rate]; `state` is the plant's [q; v], empty without other
+        moving bodies.
         """
         plant, context, contact = self._slave.plant, self._context, self._slave.contact
         half = len(x) // 2

@@ -1,8 +1,6 @@
-"""The slave's pose, from the joint angles that its control goes by.
+"""Pose of the slave from the joint angles that its control uses.
 
-Not from those in the wrist sensor's sample, which are as old as the latest part of it, such as the
-acceleration through a filter or a slow line: what a passivity method counts as work of the servo
-would be larger by the pull of so much lag.
+Those in the sensor's sample are older and would distort the energy of passivity methods.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
 @njit(cache=True)
 def pose_into(arm, q, pose):
-    """X_WS (7,) [qw qx qy qz px py pz] of the arm at q (n,) [rad]."""
+    """Write X_WS (7,) [qw qx qy qz px py pz] of the arm table at q (n,) [rad]."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm, q, R, p)
     orientation = quaternion_of(R)
@@ -29,7 +27,7 @@ def pose_into(arm, q, pose):
 
 
 class ForwardKinematics(LeafSystem):
-    """Where the slave is.
+    """Pose of the slave's sensor frame.
 
     .. pydrake_system::
 
@@ -38,9 +36,6 @@ class ForwardKinematics(LeafSystem):
         - slave_state: [q; v] of the arm [rad, rad/s]
         output_ports:
         - pose_slave: (7,) X_WS
-
-    Args:
-        arm: the slave's kinematics.
     """
 
     __slots__ = ONE_DICT

@@ -1,4 +1,4 @@
-"""Where an arm starts: a posture with its tool down, which its motors can hold."""
+"""Start posture of the arm, with the tool down."""
 
 from __future__ import annotations
 
@@ -15,25 +15,22 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.servo import mass_matrix
 from drake_teleop.station.slave.slave_config import Slave
 
-# Of any motion of the joints [kg m^2]: 1e-9 is that of a grain of sand at an arm's length.
+# Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
 _LEAST_INERTIA = 1e-9
-#: S at home: the tool points down, x_S along x_W.
+#: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-# Of the joints' ranges, about their middles: where an arm starts if it can, and else.
+# Shares of the joint ranges, about their middles, that are searched in this order.
 _OF_RANGES = (0.7, 0.9, 1.0)
-#: Elbow up, reaching forward (negative q2 and q3 lean to +x); home is the branch nearest to it.
+#: Elbow up, reaching forward [rad]; home is the branch nearest to it.
 _Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 def tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
-    """Joint positions (n,) [rad] of a posture with S at a place (3,) p_WS [m], and their status.
+    """Return joint positions (n,) [rad] with S at `position` [m, in W], and their status.
 
-    Args:
-        arm: one without closed form stays away from its joints' limits, if it can.
-        position: p_WS (3,) [m].
-        R_WS: how S is turned, z_S down by default.
+    Without a closed form, it avoids joint limits where possible.
     """
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_NEAR_HOME, arm.lower, arm.upper)
@@ -48,11 +45,7 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Joint positions [rad] with S at `position` [m, in W], z_S down; an RX90's elbow bent upwards.
-
-    Raises:
-        DrakeTeleopError: if the arm cannot reach it.
-    """
+    """Return joint positions (n,) [rad] with S at `position` [m, in W], z_S down."""
     q, status = tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
@@ -68,11 +61,7 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
 
 
 def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
-    """(n,) where the arm starts [rad].
-
-    Raises:
-        DrakeTeleopError: if it cannot be there.
-    """
+    """Return the start posture (n,) [rad], or raise DrakeTeleopError."""
     if not slave.home:
         return home_position(arm, slave.position)
     if len(slave.home) != arm.num_joints:
@@ -93,11 +82,7 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 
 def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Refuses a posture that the motors cannot hold, and an arm without inertia.
-
-    Raises:
-        DrakeTeleopError: naming the joint that cannot; or if a torque could move joints at once.
-    """
+    """Raise DrakeTeleopError for a joint without inertia or with too weak a motor."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _LEAST_INERTIA:
         raise DrakeTeleopError(
             "nothing resists a torque: its links have too little inertia for its joints",

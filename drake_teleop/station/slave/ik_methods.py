@@ -1,4 +1,4 @@
-"""The ways from a commanded pose to joint positions that a station may take."""
+"""Inverse kinematics methods by name."""
 
 from __future__ import annotations
 
@@ -14,26 +14,18 @@ from drake_teleop.station.slave.inverse_kinematics import InverseKinematics, has
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 
 AUTOMATIC = "automatic"
-"""The closed form for an arm that has it, numeric for others."""
+"""Name that selects the closed form where it exists, otherwise the numeric method."""
 
 METHODS: dict[str, Callable[[ArmModel, NDArray[np.float64], float], LeafSystem]] = {
     "closed_form": lambda arm, q_start, period: InverseKinematics(arm.lower, arm.upper),
     "numeric": NumericInverseKinematics,
 }
-"""Systems with the ports of `InverseKinematics`, made of the arm, (n,) where it starts [rad] and
-the period of commands [s], by name: a line here enters one."""
+"""Constructors by name, called with the arm, its start (n,) [rad] and the period [s]; the systems
+have the ports of `InverseKinematics`."""
 
 
 def method_of(name: str, arm: ArmModel) -> str:
-    """Which of `METHODS` a scenario means.
-
-    Args:
-        name: one of them, or `AUTOMATIC`.
-        arm: whose joints are to be moved.
-
-    Raises:
-        DrakeTeleopError: for the closed form of an arm that has none.
-    """
+    """Return the key in `METHODS` for `name`; raise DrakeTeleopError without a closed form."""
     if name == AUTOMATIC:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):

@@ -1,7 +1,6 @@
-"""Joint position control of the slave: position loop around a velocity loop, as in the paper.
+"""Joint position control of the slave: a position loop around a velocity loop (VI-A).
 
-VI-A: the joint controllers turn joint angle setpoints into joint velocities for the inverters.
-Here the velocity loop acts through the arm's computed torque, so that the joints are decoupled.
+Computed torque decouples the joints.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -30,7 +29,7 @@ COMPUTED_TORQUE = "computed_torque"
 @settings
 @dataclass
 class JointControlConfig:
-    """How the joints follow; of computed torque the loop is about as fast as the position loop."""
+    """Joint control of the slave: computed torque or a position interface."""
 
     position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
     velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
@@ -44,14 +43,14 @@ class JointControlConfig:
 
     @property
     def position_interface(self) -> PositionInterface | None:
-        """That of the servo; None of computed torque."""
+        """Position interface of the servo; None for computed torque."""
         if self.servo == COMPUTED_TORQUE:
             return None
         return self.interface or INTERFACES.get(self.servo, PositionInterface())
 
     @property
     def lag(self) -> float:
-        """By how much it is behind a steady motion, about [s]."""
+        """Approximate delay of a steady motion [s]."""
         interface = self.position_interface
         if interface is not None:
             return interface.lookahead + interface.dead_time + 1 / interface.command_hz
@@ -59,16 +58,12 @@ class JointControlConfig:
 
     @property
     def speed_gain(self) -> float:
-        """The speed that is asked of a joint, over its error [1/s]."""
+        """Commanded joint speed divided by the position error [1/s]."""
         interface = self.position_interface
         return 2 * np.pi * self.position_bandwidth_hz if interface is None else 1 / self.lag
 
     def check(self, where: str, rate: float) -> None:
-        """Checks what ranges cannot, against the rate of the joint control [Hz].
-
-        Raises:
-            DrakeTeleopError: naming `where` and the field.
-        """
+        """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE and self.interface is not None:
             raise DrakeTeleopError(
                 "computed torque takes the bandwidths, not an interface",
@@ -80,11 +75,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_is_torque(self, what: str) -> None:
-        """For what knows computed torque alone.
-
-        Raises:
-            DrakeTeleopError: for another servo, saying what does not know it.
-        """
+        """Raise DrakeTeleopError, with subject `what`, if the servo is not computed torque."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not know the servo {self.servo}",
@@ -98,11 +89,10 @@ class JointControlConfig:
 def joint_control_torque(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
-    """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
+    """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,), within the torque limits.
 
-    `state` is [q; v], `scratch` (3 n,), all other arrays (n,), rad, rad/s, N m; gains in 1/s.
-    `torque` is written: while the encoders give no numbers, what carries the arm at rest at the
-    command. If that gives none it stays as it is.
+    `state` is [q; v], `scratch` (3 n,); gains in 1/s. Invalid encoders: torque for rest at the
+    command. Invalid command: the last torque.
     """
     if not sound(command):
         return
@@ -124,7 +114,7 @@ def joint_control_torque(
 def servo_numbers(
     arm: ArmModel, config: JointControlConfig
 ) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
-    """Gains and limits for `joint_control_torque`."""
+    """Return gains and limits for `joint_control_torque`."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
@@ -136,8 +126,7 @@ def servo_numbers(
 class JointControl(LeafSystem):
     """Sampled joint position controller.
 
-    While the encoders give no numbers the motors carry the arm's weight, and it drifts on, for it
-    has no brakes.
+    With invalid encoders the motors compensate gravity and the arm drifts without brakes.
 
     .. pydrake_system::
 
@@ -148,11 +137,7 @@ class JointControl(LeafSystem):
         output_ports:
         - joint_torque: (n,) [N m], held between samples
 
-    Args:
-        arm: the arm with its tool (the controller knows its own nominal load).
-        config: the bandwidths.
-        period: sampling period [s].
-        q_start: (n,) where it holds the arm before the first sample [rad].
+    `q_start` is the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT
@@ -188,7 +173,7 @@ class JointControl(LeafSystem):
 def MakeJointControl(
     arm: ArmModel, config: JointControlConfig, period: float, q_start: NDArray[np.float64]
 ) -> LeafSystem:
-    """The block that a scenario asks for; arguments as of `JointControl`."""
+    """Return the block for the servo of `config`; arguments as for `JointControl`."""
     interface = config.position_interface
     if interface is None:
         return JointControl(arm, config, period, q_start)
@@ -196,5 +181,5 @@ def MakeJointControl(
 
 
 def interface_of(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """The defaults for a scenario's `joint_control.interface`: those of the servo that it names."""
+    """Return the default `interface` of the servo that a `joint_control` block names."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))

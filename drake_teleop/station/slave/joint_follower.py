@@ -1,4 +1,4 @@
-"""The joints of a slave that is led joint by joint: in the place of an inverse kinematics."""
+"""Joint commands for a slave that follows a leader arm joint by joint."""
 
 from __future__ import annotations
 
@@ -15,21 +15,16 @@ Array = NDArray[np.float64]
 
 
 class JointFollower(LeafSystem):
-    """Keeps the limits of position and speed; without numbers the command is held.
+    """Limits of position and speed for the leader's joints; invalid input holds the command.
 
     .. pydrake_system::
 
         name: JointFollower
         input_ports:
-        - leader_joints: (n,) where they shall be [rad]
+        - leader_joints: (n,) requested positions [rad]
         output_ports:
         - joint_command: (n,) [rad]
         - ik_status: an `IkStatus`: OK, JOINT_LIMIT or BAD_POSE
-
-    Args:
-        arm: with its limits.
-        q_start: (n,) the command before the first one [rad].
-        period: in which commands are taken [s].
     """
 
     __slots__ = ONE_DICT

@@ -1,4 +1,4 @@
-"""Pose of the wrist sensor from the joint positions of an arm that a model file describes."""
+"""Pose of the wrist sensor from joint positions and a model file."""
 
 from __future__ import annotations
 
@@ -18,18 +18,13 @@ from drake_teleop.station.slave.plant import finalize
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """The kinematics of an arm.
-
-    Args:
-        joint_names: from the base outwards.
-        table: `ArmModel.table`.
-    """
+    """Joint names from the base outwards, and `ArmModel.table`."""
 
     joint_names: tuple[str, ...]
     table: Array
 
     def pose(self, q: Array) -> Array:
-        """(7,) quaternion w x y z, and position [m], of S in the world at q (n,) [rad, m]."""
+        """Return X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self.table, q, R_WS, p_WS)
         return np.concatenate([quaternions(R_WS[None])[0], p_WS])
@@ -37,11 +32,6 @@ class Arm:
 
 def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
     """Return the kinematics of the arm in a model file.
-
-    Args:
-        model: URDF, SDF, MJCF or .dmd.yaml.
-        sensor_frame: name of the frame or link at which the sensor measures.
-        package_paths: folders in which `package://` addresses are looked up.
 
     Raises:
         DrakeTeleopError: if the model cannot be read or is no serial arm.

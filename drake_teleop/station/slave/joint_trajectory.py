@@ -1,4 +1,4 @@
-"""The source of joint commands during identification: Eqs. (9)-(10), played once."""
+"""Joint commands during identification, Eqs. (9)-(10)."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 
 class JointTrajectory(LeafSystem):
-    """Plays one period of an excitation trajectory, at rest before and after.
+    """One period of an excitation trajectory from `start` [s], at rest before and after.
 
     .. pydrake_system::
 
         name: JointTrajectory
         output_ports:
         - joint_command: (n,) [rad]
-
-    Args:
-        trajectory: starts and ends at rest.
-        start: when it begins [s].
     """
 
     __slots__ = ONE_DICT

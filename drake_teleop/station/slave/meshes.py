@@ -1,4 +1,4 @@
-"""The meshes of a robot model, and what to do without them."""
+"""Meshes of a robot model, and the removal of unusable ones."""
 
 from __future__ import annotations
 
@@ -11,22 +11,20 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model_references import ModelFiles
 
-# Of meshes that Drake can use as collision shapes.
+# Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE = (".obj", ".gltf", ".vtk")
-# Of a triangle in a binary STL file: normal, three corners, attributes.
+# Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
 def without_lost_meshes(
     root: ElementTree.Element, files: ModelFiles, folder: Path
 ) -> dict[str, list[str]]:
-    """Removes shapes whose mesh is missing or not readable, and makes the others' paths absolute.
+    """Remove shapes without a usable mesh; return the affected links by fault.
 
-    Instead of STL files, which Drake does not read, there stand their convex hulls.
-
-    Returns:
-        By what is wrong with a mesh, the links whose shape lacks it. What a link is seen with may
-        stand for what it collides with.
+    STL files become convex hulls, because Drake does not read STL; other paths become absolute.
+    A lost visual is reported only for links without shapes, a lost collision shape only for links
+    without a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
@@ -48,7 +46,7 @@ def without_lost_meshes(
 
 
 def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
-    """What is wrong with the mesh of a shape; if nothing is, its path becomes absolute."""
+    """Return the fault of a shape's mesh; if none, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
@@ -66,14 +64,14 @@ def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str |
         suffix = Path(address.strip()).suffix
         return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
     if mesh.get("filename"):
-        mesh.set("filename", f"file://{file.resolve()}")  # Drake takes %20 as it is
+        mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
     else:
         mesh.find("uri").text = f"file://{file.resolve()}"  # type: ignore[union-attr]
     return None
 
 
 def _hull_of_stl(path: Path, folder: Path) -> Path | None:
-    """An OBJ file with the convex hull of an STL file's corners; None if they have none."""
+    """Write the convex hull of an STL file as OBJ; return None if it is degenerate."""
     from scipy.spatial import ConvexHull, QhullError
 
     data = path.read_bytes()

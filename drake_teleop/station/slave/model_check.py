@@ -1,10 +1,8 @@
-"""What cannot be true of a robot model, said before Drake reads it.
+"""Checks of a robot model before Drake parses it.
 
-Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
-an inertia that no body has by another one without telling, even if only the last digit is wrong.
-Here each is one error with the name of joint or link; what is merely missing is an assumption, and
-what the file's rounding made wrong is made right. So is an inertia of what no joint of the arm
-moves, such as its base, on which nothing depends.
+Drake aborts on, or never finishes, joint loops and links with two parents, and silently replaces
+invalid inertias. Here each is one error that names the joint or link. Missing values become
+assumptions. Inertias with rounding errors, or of links that no joint moves, are corrected.
 """
 
 from __future__ import annotations
@@ -20,35 +18,30 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import PHI, TRANSLATION, ArmModel
 
 _INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# What places, shapes and masses are said with, in URDF and SDF.
+# Elements with lengths, masses or inertias in URDF and SDF.
 _MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
 _MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
 _MEASURES |= {"drake:rotor_inertia", "drake:gear_ratio"}
-WORLD = "world"  # as URDF and SDF call it
+WORLD = "world"  # name in URDF and SDF
 _JOINTS = ("joint", "drake:joint")
-_SMALLEST, _LONGEST = 0.01, 50.0  # of an arm [m]
-_LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
-# How far principal moments may be from those of a body, for rounding in the file.
+_SMALLEST, _LONGEST = 0.01, 50.0  # lengths of an arm [m]
+_LARGEST = 1e6  # of `_MEASURES` in SI units; limits may be larger
+# Accepted violation of the triangle inequality, as a share of the largest moment.
 _ROUNDING = 1e-3
-_NONE = 1e-15  # kg m^2: a grain of dust has more
+_NONE = 1e-15  # kg m^2, accepted violation: less than a grain of dust
 
 
 def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
-    """Checks tree, limits and masses of a URDF or SDF.
+    """Check tree, limits and masses of a URDF or SDF; correct inertias in place.
 
-    Args:
-        root: of the file, in which inertias may be made right.
-        where: for messages.
-        sensor: the arm's last link, or a link fixed to it, if that is what the file is read for.
+    `sensor` is the arm's last link, or a link fixed to it, if the file is the arm's.
 
     Returns:
-        Assumptions: which links have no mass or no inertia, and what Drake leaves out.
+        Assumptions: links without mass or inertia, corrections, and elements that Drake ignores.
 
     Raises:
-        DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
-            circle, names that stand twice, limits that are no numbers or the wrong way round, a
-            negative mass, an inertia that no body has where something moves it, a length or a mass
-            that no arm has.
+        DrakeTeleopError: for an invalid tree, duplicate names, invalid limits, or an implausible
+            mass, inertia or length.
     """
     for scope in root.iter():
         _check_scope(scope, where)
@@ -93,17 +86,10 @@ def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
 
 
 def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
-    """Checks that joints make a tree, or several.
-
-    Args:
-        joints: name, parent and child of each.
-        where: for the message.
-
-    Returns:
-        Of each link that hangs on a joint, its parent and the joint's name.
+    """Check joints (name, parent, child); return parent and joint of each child.
 
     Raises:
-        DrakeTeleopError: for a link with two parents, a world that hangs on something, a circle.
+        DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
     """
     parents: dict[str, tuple[str, str]] = {}
     for name, parent, child in joints:
@@ -130,12 +116,12 @@ def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, 
 
 
 def _check_scope(scope: Element, where: str) -> None:
-    """Checks the tree of a robot or a model; models inside it have names of their own."""
+    """Check the tree of a robot or a model; nested models have separate names."""
     joints = [
         (joint.get("name", ""), parent, child)
         for joint in (each for tag in _JOINTS for each in scope.findall(tag))
         for parent, child in [(_end(joint, "parent"), _end(joint, "child"))]
-        if parent and child  # or Drake says what lacks
+        if parent and child  # otherwise Drake reports the missing element
     ]
     links = [link.get("name", "") for link in scope.findall("link")]
     for kind, names in (("links", links), ("joints", [name for name, _, _ in joints])):
@@ -162,7 +148,7 @@ def _check_measure(element: Element, where: str) -> None:
         for word in text.split():
             try:
                 value = float(word)
-            except ValueError:  # a name; or Drake says that it wants a number
+            except ValueError:  # a name; Drake reports an invalid number
                 continue
             if not abs(value) <= _LARGEST:
                 raise DrakeTeleopError(
@@ -182,10 +168,10 @@ def _check_limit(limit: Element, where: str) -> None:
         raise DrakeTeleopError(f"lower limit {lower:g} is above upper limit {upper:g}", where=where)
     for name in ("velocity", "effort"):
         value = number(name)
-        # Of SDF, -1 says that there is no limit.
+        # In SDF, -1 means no limit.
         if value is not None and value < 0 and not (value == -1 and limit.get(name) is None):
             raise DrakeTeleopError(f"{name} limit {value:g} is negative", where=where)
-    for name, text in limit.attrib.items():  # of a URDF
+    for name, text in limit.attrib.items():  # URDF only
         if math.isinf(_number(text, name, where)):
             raise DrakeTeleopError(
                 f"{name} {text} is not finite",
@@ -195,13 +181,7 @@ def _check_limit(limit: Element, where: str) -> None:
 
 
 def _is_massless(link: Element, where: str, moves: bool) -> bool:
-    """Whether a link that has shapes, or that a joint moves, has no inertia.
-
-    Without either it is a frame, such as tool0.
-
-    Raises:
-        DrakeTeleopError: for a mass or an inertia that cannot be.
-    """
+    """Return True if a link with shapes, or moved by a joint, has no inertia."""
     place = f"{where}: link {link.get('name', '')}"
     inertial = link.find("inertial")
     mass_element = None if inertial is None else inertial.find("mass")
@@ -213,7 +193,7 @@ def _is_massless(link: Element, where: str, moves: bool) -> bool:
         raise DrakeTeleopError(f"mass {mass:g} kg is negative", where=place)
     element = inertial.find("inertia")
     if element is None:
-        turns = mass_element.get("value") is None  # of SDF it is 1 kg m^2 then
+        turns = mass_element.get("value") is None  # the default of SDF is 1 kg m^2
     else:
         turns = bool(_moments(element, place)[2] > 0.0)
     if mass == 0.0 and turns:
@@ -222,7 +202,7 @@ def _is_massless(link: Element, where: str, moves: bool) -> bool:
 
 
 def _unmoved(root: Element, sensor: str) -> set[str]:
-    """The links of a URDF or of an SDF's only model that no joint up to the sensor moves."""
+    """Return the links that no joint up to the sensor moves."""
     joints = {
         _end(joint, "child"): (_end(joint, "parent"), joint.get("type") != "fixed")
         for joint in (each for tag in _JOINTS for each in root.iter(tag))
@@ -233,7 +213,7 @@ def _unmoved(root: Element, sensor: str) -> set[str]:
 
     def way(link: str) -> list[str]:
         passed = [link]
-        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # a loop has no end
+        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # stop in a loop
             passed.append(joints[passed[-1]][0])
         return passed
 
@@ -242,15 +222,9 @@ def _unmoved(root: Element, sensor: str) -> set[str]:
 
 
 def _made_right(link: Element, where: str, *, refused: bool) -> bool:
-    """Makes a body's inertia of one that no body has, by the same addition to each of its moments.
+    """Correct an invalid inertia by equal additions to its diagonal; return True if changed.
 
-    Args:
-        link: of which it is.
-        where: for the message.
-        refused: whether more than rounding is an error: `_ROUNDING` of the largest moment, `_NONE`.
-
-    Raises:
-        DrakeTeleopError: if it is one.
+    If `refused`, a correction beyond rounding raises a DrakeTeleopError.
     """
     element = link.find("inertial/inertia")
     if element is None:
@@ -281,7 +255,7 @@ def _entry(inertia: Element, name: str) -> str:
 
 
 def _moments(inertia: Element, where: str) -> NDArray[np.float64]:
-    """(3,) principal moments, the smallest first."""
+    """Return the principal moments (3,), ascending."""
     xx, xy, xz, yy, yz, zz = (_number(_entry(inertia, name), name, where) for name in _INERTIAS)
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
@@ -298,18 +272,14 @@ def _number(text: str, name: str, where: str) -> float:
 
 
 def check_size(arm: ArmModel, where: str) -> None:
-    """Refuses an arm that is too large or too small for its lengths to be metres.
-
-    Raises:
-        DrakeTeleopError: for its length, or a link whose mass is far from its joint.
-    """
+    """Raise DrakeTeleopError for an implausible length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _SMALLEST or length > _LONGEST:
         what = f"from its first joint to the sensor it is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
-        # The root mean square of the distance of its mass from the joint's origin.
+        # Root mean square distance of the mass from the joint's origin.
         away = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if away > _LONGEST:
             what = f"what {name} moves is {away:.3g} m away from it"

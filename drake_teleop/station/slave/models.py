@@ -1,4 +1,4 @@
-"""Reading robot models as they are found: meshes missing, base hanging free, packages elsewhere."""
+"""Reading of robot models: missing meshes, free bases, packages in other folders."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from drake_teleop.station.slave.model_files import (
 )
 from drake_teleop.station.slave.model_references import ModelFiles
 
-# What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
+# Elements that close kinematic loops: Drake's tags in URDF and SDF, and MJCF's.
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
-# How what is said of lost meshes begins.
+# Prefix of assumptions about removed shapes.
 _MISSING = "shapes are missing of"
-# What a file should be, and where its packages are looked for.
+# Expected kind of file, and the remedy for missing packages.
 _Said: TypeAlias = tuple[str, str]
 _Found = TypeVar("_Found")
 _ROBOT = ("robot", "with --package-path for package://")
@@ -57,14 +57,7 @@ _SCENE = ("scene", "its package:// addresses in folders around it")
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """What `ParseModel` found.
-
-    Attributes:
-        instance: the arm's, of the joints from the world to S.
-        sensor_frame: S.
-        assumptions: on what is missing, and what is held.
-        folder: of converted meshes; Drake reads them when it needs them.
-    """
+    """Result of `ParseModel`; `folder` has converted meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -74,7 +67,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """What `ParseTool` found: as of `ParsedModel`, and the body on the sensor frame."""
+    """Result of `ParseTool`; `body` is the body on the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -88,21 +81,21 @@ def ParseModel(
     package_paths: tuple[Path, ...] = (),
     X_WBase: RigidTransform | None = None,
 ) -> ParsedModel:
-    """Parses the model of an arm, so that nothing of it moves but the joints that lead to S.
+    """Parse an arm, in which only the joints up to S move, each with one actuator.
 
-    A base that hangs on nothing is welded to the world, and joints beside the way from there to S,
-    such as a gripper's, where they are by default. Each joint on the way has one actuator.
+    A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
+    at their default positions.
 
     Args:
         plant: not finalized.
-        path: a URDF or SDF, or anything else that Drake reads by its suffix.
-        sensor_frame: name of the frame or link at which the sensor measures.
-        package_paths: folders in which `package://` addresses are looked up.
-        X_WBase: where the base is welded to the world.
+        path: URDF, SDF or another format that Drake reads.
+        sensor_frame: frame or link at which the sensor measures.
+        package_paths: folders of `package://` addresses.
+        X_WBase: pose of a free base.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
-            an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
+        DrakeTeleopError: if the file cannot be read, has no such frame, fails `check_model`, or
+            fixes the base although `X_WBase` is not the identity.
     """
     before = set(plant.GetJointIndices())
     read = _read(plant, path, package_paths, sensor=sensor_frame)
@@ -113,7 +106,7 @@ def ParseModel(
             for instance in read.instances
             for index in plant.GetFrameIndices(instance)
         ]
-        # Drake's own, of joints.
+        # Names that Drake creates for joints.
         frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
         known = ", ".join(sorted(set(frames)))
         raise DrakeTeleopError(
@@ -145,19 +138,10 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parses what hangs on the sensor: its root is welded to S by the joint "sensor_weld".
-
-    Joints inside it are held where they are by default.
-
-    Args:
-        plant: not finalized, with the arm.
-        path: as for `ParseModel`.
-        sensor_frame: S.
-        package_paths: as for `ParseModel`.
+    """Parse a tool and weld its root to S by the joint "sensor_weld"; hold its joints.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, or holds several things that do not hang on
-            each other.
+        DrakeTeleopError: if the file cannot be read or does not have exactly one root.
     """
     before = set(plant.GetJointIndices())
     read = _read(plant, path, package_paths)
@@ -179,17 +163,10 @@ def ParseTool(
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
-    """Parses what stands around an arm: nothing of it is held, and nothing assumed.
-
-    Args:
-        plant: not finalized.
-        path: as for `ParseModel`.
-
-    Returns:
-        The folder of converted meshes, to be kept as long as shapes are looked at.
+    """Parse the surroundings of an arm; return the folder of their converted meshes.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, or has what Drake would leave out.
+        DrakeTeleopError: if the file cannot be read, or contains elements that Drake ignores.
     """
     read = _read(plant, path, (), _SCENE)
     missing = [text for text in read.assumptions if text.startswith(_MISSING)]
@@ -202,7 +179,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
 
 
 class _Read(NamedTuple):
-    """What stands in a file; the roots of the XML that it is made of."""
+    """Content of a model file, and the roots of its XML files."""
 
     instances: list[ModelInstanceIndex]
     roots: list[ElementTree.Element]
@@ -210,7 +187,6 @@ class _Read(NamedTuple):
     folder: TemporaryDirectory[str]
 
     def of_all(self, find: Callable[[ElementTree.Element], dict[str, _Found]]) -> dict[str, _Found]:
-        """What `find` finds in any of the roots."""
         return {name: what for root in self.roots for name, what in find(root).items()}
 
 
@@ -227,7 +203,7 @@ def _read(
         raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
     kind = path.suffix.lower().removeprefix(".")
     if kind == "xml":
-        read_text(path)  # or names cannot be said
+        read_text(path)  # raises an error for invalid encoding
     files = ModelFiles(path, package_paths)
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
@@ -246,7 +222,7 @@ def _read(
             assumptions += without_idle(root)
             lost = without_lost_meshes(root, files, Path(converted.name))
             assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
-            for uri in root.iterfind(".//include/uri"):  # relative to the file, not to the process
+            for uri in root.iterfind(".//include/uri"):  # or Drake uses the working folder
                 if (included := files.file((uri.text or "").strip())) is not None:
                     uri.text = f"file://{included.resolve()}"
             text = ElementTree.tostring(root, encoding="unicode")
@@ -265,7 +241,7 @@ def _read(
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
-    """Refuses what moves otherwise than about or along one axis."""
+    """Raise an error for joints that are neither revolute nor prismatic."""
     for joint in (plant.get_joint(index) for index in chain if _moves(plant, index)):
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             raise DrakeTeleopError(
@@ -287,10 +263,7 @@ def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], whe
 
 
 def _check_no_loop(path: Path, kind: str) -> None:
-    """Refuses what closes loops in a tree of links: Drake would drop it, or the chain be another.
-
-    Of joints that move together, `peculiar_joints` tells.
-    """
+    """Raise an error for loop constraints (`peculiar_joints` finds dependent joints)."""
     found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
     if found:
         raise DrakeTeleopError(
@@ -307,8 +280,8 @@ def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
 def _hold_others(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Welds what moves and is not on the chain, where it is by default; says so."""
-    for constraint in plant.GetConstraintIds():  # such as of fingers that move together
+    """Weld moving joints outside the chain at their default positions; return a note."""
+    for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     names = []
     for index in set(plant.GetJointIndices()) - before - set(chain):
@@ -327,7 +300,7 @@ def _hold_others(
 
 
 def _default_pose(joint: Joint) -> RigidTransform:
-    """X_FM where the joint is by default; Drake has it for few kinds."""
+    """Return the default X_FM of a joint; Drake provides it for few kinds."""
     q = joint.default_positions()
     if isinstance(joint, RevoluteJoint):
         return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
@@ -337,7 +310,7 @@ def _default_pose(joint: Joint) -> RigidTransform:
 
 
 def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, float]) -> None:
-    """One actuator for each moving joint of the chain, in its order, as a state has them."""
+    """Give each moving joint of the chain one actuator, in the order of the chain."""
     moving = [index for index in chain if _moves(plant, index)]
     actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
     own = [each for each in actuators if each.joint().index() in chain]
@@ -364,12 +337,12 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
 
 @contextmanager
 def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
-    """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with its file."""
     try:
         yield
     except DrakeTeleopError:
         raise
-    # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
+    # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = str(error).replace("<literal-string>", "").replace(f"{path.parent}/", "")
         raise DrakeTeleopError(
@@ -381,11 +354,7 @@ def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
 
 @contextmanager
 def _drakes_errors_raised() -> Iterator[None]:
-    """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
-
-    And for an inertia in whose place it takes another one. Its other warnings are of elements that
-    it does not know; they are not said.
-    """
+    """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
     errors: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:
@@ -397,7 +366,7 @@ def _drakes_errors_raised() -> Iterator[None]:
     log = logging.getLogger("drake")
     log.addFilter(keep)
     try:
-        with silent_stderr():  # where the parsers below it write some more
+        with silent_stderr():  # the underlying parsers write to it
             yield
     finally:
         log.removeFilter(keep)
@@ -412,14 +381,14 @@ def _weld_base(
     X_WBase: RigidTransform | None,
     where: str,
 ) -> list[JointIndex]:
-    """Welds the base to the world if it hangs on nothing; returns the joints to S, outwards."""
+    """Weld a free base to the world; return the joints to S, from the base outwards."""
 
     def name_of(body: RigidBody) -> str:
         is_world = body.index() == plant.world_body().index()
         return WORLD if is_world else body.scoped_name().get_full()
 
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    # Once more, because `check_model` looks neither into other files nor beyond URDF and SDF.
+    # `check_model` covers neither included files nor other formats than URDF and SDF.
     check_tree(
         ((each.name(), name_of(each.parent_body()), name_of(each.child_body())) for each in joints),
         where,

@@ -1,4 +1,4 @@
-"""The monitor of the slave: joint limits, which continuous plants do not enforce, and the IK."""
+"""Monitor of joint limits and inverse kinematics."""
 
 from __future__ import annotations
 
@@ -8,26 +8,22 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
 
-# Of its range: a joint that is commanded to its limit swings a little beyond it, where arms as they
-# are sold have not come to their stops yet.
+# Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
+# mechanical stops of commercial arms are farther out.
 _BEYOND = 0.01
 
 
 class SlaveMonitor(LeafSystem):
-    """Ends the simulation with a clear message when a joint leaves its range by 1 % of it.
+    """Periodic check that joints stay within their range plus 1 % of it.
 
     .. pydrake_system::
 
         name: SlaveMonitor
         input_ports:
         - slave_state: [q; v] of the arm [rad, rad/s]
-        - ik_status: of the inverse kinematics (may be left unconnected)
+        - ik_status: of the inverse kinematics (optional)
         output_ports:
-        - ik_status: the last one seen, for the log
-
-    Args:
-        arm: the limits.
-        period: how often it looks [s].
+        - ik_status: last value, for the log
 
     Raises:
         DrakeTeleopError: from the simulation, when a joint is outside or not finite.
@@ -49,13 +45,13 @@ class SlaveMonitor(LeafSystem):
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
-        # A comparison with NaN is false, so a lost joint is outside too.
+        # A comparison with NaN is false, so NaN counts as outside.
         inside = (q >= self._lower) & (q <= self._upper)
         if inside.all():
             return
         joint = int(inside.argmin())
         unit = "m" if self._arm.table[joint, SLIDES] else "rad"
-        # Raised, not returned as EventStatus.Failed: that crashes for systems written in Python.
+        # Returning EventStatus.Failed crashes for systems written in Python.
         raise DrakeTeleopError(
             f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "
             f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "

@@ -1,4 +1,4 @@
-"""Where a body of the surroundings is that moves, for the log and the film."""
+"""Pose of a moving body, for the log and the 3D replay."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, Joint
 
 
 def can_be_told(joint: Joint) -> bool:
-    """Whether the positions of a joint follow from a pose, see `positions_of`."""
+    """Return True if the joint's positions follow from a pose, see `positions_of`."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
 def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
-    """The positions at which a joint has its child there: turning, sliding or free."""
+    """Return the joint positions for the pose X_FM of its child frame."""
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
@@ -38,7 +38,7 @@ def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
 
 
 class MovingPose(LeafSystem):
-    """The pose of a body as seven numbers.
+    """Pose of a body.
 
     .. pydrake_system::
 
@@ -47,10 +47,6 @@ class MovingPose(LeafSystem):
         - plant_state: [q; v] of the whole plant
         output_ports:
         - pose: (7,) [qw, qx, qy, qz, px, py, pz] in W [1, m]
-
-    Args:
-        plant: finalized.
-        body: whose pose.
     """
 
     __slots__ = ONE_DICT
@@ -64,4 +60,4 @@ class MovingPose(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         bodies_into(self._joints, self._state.Eval(context), self._bodies)
-        output.SetFromVector(self._bodies[-1, :7])  # which hangs on those before it
+        output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain

@@ -1,8 +1,7 @@
-"""The plant's motion in compiled code, for who looks into one of its steps: sensor and servo.
+"""Compiled plant dynamics inside one step, for sensor and servo.
 
-Of arm, tool, balls on boxes and one leaf; `Contact.beyond` says if there is more to touch. A state
-is x = [q, the leaf's deflection, v, its rate]; behind it, if anything else moves, stands the state
-[q; v] of the whole plant.
+Covers arm, tool, balls on boxes and one leaf (otherwise see `Contact.beyond`). The state is x = [q,
+leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from drake_teleop.station.slave.tool_contact import environment_wrench
 
 @njit(cache=True)
 def joined(state, around, x):
-    """x, see the module, of [q; v] and [deflection, rate, the plant's state]."""
+    """Write x from [q; v] and [deflection, rate, the plant's state]."""
     n = state.shape[0] // 2
     put(x, 0, state, 0, n)
     put(x, n + 1, state, n, n)
@@ -27,14 +26,10 @@ def joined(state, around, x):
 
 @njit(cache=True)
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
-    """Time derivative of the first 2 n + 2 of x, and the environment's wrench.
+    """Write the time derivative xdot (2 n + 2,) and the environment's wrench.
 
-    Args:
-        physics: `SlavePlant.physics`.
-        x: see the module.
-        tau: (n,) of the motors [N m].
-        applied_W, wrench_W: as for `environment_wrench`.
-        xdot: (2 n + 2,) filled.
+    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
+    `wrench_W` are those of `environment_wrench`.
     """
     arm, _, pairs, _, joints, told = physics
     half = tau.shape[0] + 1
@@ -55,11 +50,10 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
 
 @njit(cache=True)
 def _is_told(told, x, wrench_W):
-    """Whether the wrench of contact has been told, into `wrench_W`; if not, it is asked for.
+    """Copy the next given contact wrench to `wrench_W` and return True; if missing, request it.
 
-    Args:
-        told: (k, ...) [how many are told, how many were needed, the first x that was not], then a
-            wrench (6) each; or nothing, if nobody is asked.
+    `told` has rows of wrenches (6) after row 0 [number given, number used, x of the request]; it is
+    empty if no wrenches are given.
     """
     if told.shape[0] == 0:
         return False
@@ -75,14 +69,14 @@ def _is_told(told, x, wrench_W):
 
 @njit(cache=True)
 def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
-    """Time derivative of x, see `plant_rates`, under the environment's wrench."""
+    """Write the time derivative of x under a given environment wrench."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]
     forward_dynamics(arm, q, v, tau, wrench_W, xdot[half:-1])
     put(xdot, 0, x, half, half)
     push = 0.0
-    if pairs.shape[0] > 0:  # which all are of one body, the leaf, or of none
+    if pairs.shape[0] > 0:  # all belong to the leaf, or none does
         for i in range(3):
             push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
     xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[2 * half - 1]) / leaf[0] + leaf[3]

@@ -1,19 +1,12 @@
-"""Joint control that samples faster than the simulation stops for it.
+"""Joint control that samples faster than the simulation's events.
 
-The paper's runs at 10 kHz, while everything else that drives the arm changes at 2 kHz. An event for
-each sample cuts the plant's steps five times shorter, and costs four times as much. Here the
-samples lie inside the step, as the wrist sensor's do: at each event the motion until the next one
-is foreseen with the plant's own dynamics (`plant_rates`), one midpoint step for each sample, and
-the controller is called for each:
+Events at 10 kHz would slow the simulation. Instead, each event predicts the motion with
+`plant_rates`, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant gets the line a + b (t - h/2) over h = m T with the area and the first moment of these
-steps, so that arms of constant inertia arrive where they would have; b = 0 if m = 1. The next event
-begins from where the plant really is. The hand's command is that of the event for all m samples.
-
-Of what pushes the tool besides contacts nothing is foreseen. The steps of the torque themselves,
-at 10 kHz, are not in the wrench; the wrench is that of the line, to rounding.
+The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
+steps; b = 0 if m = 1. The prediction includes contacts, but no other force on the tool.
 """
 
 from __future__ import annotations
@@ -36,14 +29,14 @@ from drake_teleop.station.slave.plant_rates import joined, plant_rates
 
 Array = NDArray[np.float64]
 
-#: Events need come no oftener [Hz]: over a longer time a line is too far from the servo's samples.
+#: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
 _EVENTS = 2000.0
 
 
 def samples_within(control_hz: float, hand_hz: float) -> int:
-    """How many samples of the servo one event takes: the most with events at 2 kHz or more.
+    """Return the largest number of servo samples per event with events at 2 kHz or more.
 
-    Each sample of the hand stays an event.
+    Each operator-side sample remains an event.
     """
     for_each_hand = control_hz / hand_hz
     whole = round(for_each_hand)
@@ -55,20 +48,19 @@ def samples_within(control_hz: float, hand_hz: float) -> int:
 
 @njit(cache=True)
 def torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """The torque of the coming samples as a line in time.
+    """Write the torque of the next samples as a line in time.
 
     Args:
         arm: `ArmModel.table` of the controller.
         command: (n,) [rad].
-        state: (2 n,) [q; v] now.
+        state: (2 n,) [q; v].
         sheet: (2,) of the leaf.
         servo: `servo_numbers`.
-        physics: `SlavePlant.physics`, what the plant really is.
+        physics: `SlavePlant.physics`.
         samples: m.
         period: T [s].
         scratch: (3 n,).
-        line: (3 n,) torque now [N m], its rate [N m/s], the last sample [N m], which stays where
-            a command is none; changed.
+        line: (3 n,) torque [N m], its rate [N m/s], last sample [N m]; updated.
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
@@ -95,7 +87,7 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):
-        # Half of the way that the line takes, and no motor beyond what it can at either end.
+        # Half the rise of the line; clip both ends to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
         start = min(max(mean - away, -servo[3][i]), servo[3][i])
         end = min(max(mean + away, -servo[3][i]), servo[3][i])
@@ -104,14 +96,14 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
 
 @njit(cache=True)
 def _on_line(state, time, torque):
-    """The torque (n,) on the line in `state`: `line` of `torque_line`, and its beginning [s]."""
+    """Write the torque (n,) at `time`; `state` is `line` and its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
         torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
-    """`JointControl` with several samples for each event, see the module.
+    """`JointControl` with several samples per event, see the module.
 
     .. pydrake_system::
 
@@ -122,14 +114,9 @@ class SampledServo(LeafSystem):
         - sheet_state: [z; v_z] of the leaf (only if there is one)
         output_ports:
         - joint_torque: (n,) now, on the line [N m]
-        - torque_rate: (n,) the line's, held between events [N m/s]
+        - torque_rate: (n,) slope of the line, held between events [N m/s]
 
-    Args:
-        slave: the plant.
-        config: the bandwidths.
-        period: of the servo [s].
-        samples: for each event.
-        q_start: (n,) where it holds the arm before the first sample [rad].
+    `period` is that of the servo [s], `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT

@@ -1,7 +1,6 @@
-"""Something to touch out of a file: SDF, URDF or Drake's model directives, as Drake reads them.
+"""Environment from a file: SDF, URDF or Drake model directives.
 
-Its bodies may hang on joints, with springs and damping of the file, and have any shape. What an SDF
-or URDF hangs on nothing is welded to the world, or left to fall and to be pushed.
+Bodies may hang on joints with springs and damping. Free roots are welded to the world, or float.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -29,16 +28,16 @@ from drake_teleop.station.environment.environment import Environment, LetFloat, 
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.moving_pose import can_be_told
 
-#: Meshes that were converted, for as long as this process looks at them.
+#: Folders of converted meshes, kept while the process runs.
 _CONVERTED: list[TemporaryDirectory[str]] = []
 _OWN = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_RESOLUTION = 0.005  # m, of the mesh that the tool's ball becomes
+_RESOLUTION = 0.005  # m, of the mesh of the tool's ball
 
 
 @settings
 @dataclass
 class Scene(Environment):
-    """Of which file, where it stands, and whether contacts have points or areas."""
+    """File of the surroundings, its pose, and point or hydroelastic contact."""
 
     file: str = plain(
         "door.sdf",
@@ -61,26 +60,22 @@ class Scene(Environment):
 
     @property
     def path(self) -> Path:
-        """The file, or the model of that name that comes with the package."""
+        """The given file, or the model of that name in the package."""
         given, shipped = Path(self.file), models_dir() / self.file
         return shipped if not given.is_file() and shipped.is_file() else given
 
     @property
     def hydroelastic(self) -> bool:
-        """Whether the file's and the tool's shapes may have a pressure over an area."""
+        """True if contacts may have a pressure over an area."""
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
-        """The same with its file found from a folder, if it is there."""
+        """Return a copy with the file resolved from a folder, if it exists there."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Parses the file and puts what hangs on nothing where it shall be.
-
-        Raises:
-            DrakeTeleopError: if there is no such file, or Drake cannot read it.
-        """
+        """Parse the file and place its free roots; raises DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
@@ -114,11 +109,7 @@ class Scene(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Gives the tool's shapes a pressure, if that is wanted.
-
-        Raises:
-            DrakeTeleopError: if no shape of the file could have one.
-        """
+        """Make the tool's shapes hydroelastic, if configured; raises DrakeTeleopError."""
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
@@ -141,5 +132,5 @@ class Scene(Environment):
 
 
 def is_hydroelastic(properties: ProximityProperties) -> bool:
-    """Whether a shape may have a pressure over an area of contact."""
+    """Return True if a shape has hydroelastic properties."""
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

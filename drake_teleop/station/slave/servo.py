@@ -1,4 +1,4 @@
-"""Arm and joint control as one servo at the tool, as the passivity methods take them."""
+"""Arm and joint control as one servo at the tool, for the passivity methods."""
 
 from __future__ import annotations
 
@@ -14,12 +14,7 @@ Array = NDArray[np.float64]
 
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
-    """(n, n) M(q), with rotors and tool: inverse dynamics of unit accelerations.
-
-    Args:
-        arm: the arm with its tool.
-        q: (n,) where it is [rad].
-    """
+    """Return M(q) (n, n) with rotors and tool, by inverse dynamics of unit accelerations."""
     still, weight = np.zeros(len(q)), np.empty(len(q))
     inverse_dynamics(arm.table, q, still, still, weight)
     columns = np.empty((len(q), len(q)))
@@ -30,13 +25,9 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 
 
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
-    """(6, 6) (J M^-1 J^T)^-1 at So, translation first, in W: the arm that a wrench there moves.
+    """Return Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W; q is not singular.
 
     Khatib, A unified approach for motion and force control of robot manipulators (1987).
-
-    Args:
-        arm: the arm with its tool.
-        q: (n,) where it is, not singular [rad].
     """
     n = arm.num_joints
     still, J = np.zeros(n), np.empty((6, n))
@@ -51,7 +42,7 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
 
 
 class ServoAtTool(NamedTuple):
-    """It pulls with K (x_command - x) - D v; for translation and rotation, lists of 2.
+    """Servo with the wrench K (x_command - x) - D v; two values each, translation and rotation.
 
     Attributes:
         stiffness: K [N/m, N m/rad].
@@ -65,16 +56,11 @@ class ServoAtTool(NamedTuple):
 
 
 def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
-    """Stiffness, damping and mass of the slave as a method is told of them.
+    """Return stiffness, damping and mass of the slave for the passivity methods.
 
-    One mass for translation and one inertia for rotation, with which nothing moves with more energy
-    than they say, whatever moves at the same time in whichever direction: the least multiple of the
-    largest eigenvalues of either's block for which diag(m, m, m, J, J, J) - Lambda has none below
-    zero. The joints' loops accelerate with kv (kp (x_command - x) - v), hence K and D.
-
-    Args:
-        arm, q: as for `operational_inertia`.
-        config: of the joint control.
+    Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
+    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy of any
+    motion. The joint loops accelerate with kv (kp (x_command - x) - v), hence K and D.
 
     Raises:
         DrakeTeleopError: for a servo other than computed torque.

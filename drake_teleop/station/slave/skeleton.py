@@ -1,4 +1,4 @@
-"""An arm of sticks, for films of models whose meshes are missing or cannot be read."""
+"""Stick figure of an arm, for 3D replays of models without readable meshes."""
 
 from __future__ import annotations
 
@@ -13,14 +13,7 @@ _COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
-    """Adds to links of which nothing is seen a stick from their joint to the next, or to S.
-
-    To the base one from its origin.
-
-    Args:
-        plant: with the arm and a scene graph, not finalized.
-        sensor_frame: S.
-    """
+    """Add sticks to links without visuals, each from its joint to the next, or to S."""
     joints = map(plant.get_joint, plant.GetJointIndices())
     inboard = {joint.child_body().index(): joint for joint in joints}
     end, body = sensor_frame, sensor_frame.body()
@@ -37,7 +30,7 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
 
 
 def _in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
-    """X_BodyFrame of a frame on it, or on what is welded to it."""
+    """Return X_BodyFrame of a frame on the body, or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

@@ -1,4 +1,4 @@
-"""What a scenario says of the slave: which arm, where it stands and starts, what it carries."""
+"""Settings of the slave in a scenario: arm, base pose, start and tool."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -65,30 +65,25 @@ class Slave:
 
     @property
     def path(self) -> Path:
-        """The file of the arm."""
+        """File of the arm."""
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
     def packages(self) -> tuple[Path, ...]:
-        """Where package:// addresses are looked up."""
+        """Folders of package:// addresses."""
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
     def X_WBase(self) -> RigidTransform:
-        """Where the arm stands."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
-        """What its models are read from, as far as it is there."""
+        """Return the existing model files."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         return [path for path in paths if path.is_file()]
 
     def check(self, where: str) -> None:
-        """Checks what ranges cannot.
-
-        Raises:
-            DrakeTeleopError: for numbers that are none, or a tool that cannot be.
-        """
+        """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
                 "has to be a list of finite numbers from 0 on", where=f"{where}.friction"
@@ -104,7 +99,7 @@ class Slave:
             self.tool.check(f"{where}.tool")
 
     def found_from(self, folder: Path) -> "Slave":
-        """The same with its files found from a folder, wherever the program runs."""
+        """Return a copy with its files resolved from a folder."""
 
         def found(name: str) -> str:
             return str((folder / name).resolve()) if name else ""

@@ -1,4 +1,4 @@
-"""What there is to touch in the slave's plant: what of it moves, which law tells its contact."""
+"""Environment in the slave's plant: moving bodies, and the law that computes contact."""
 
 from __future__ import annotations
 
@@ -19,33 +19,31 @@ from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import JOINT_WIDTH, JointTable
 from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
 
-_SAME = 1e-12  # of frames: rounding
-_NO_INERTIA = 1e-12  # kg or kg m^2: nothing that is moved has less
+_SAME = 1e-12  # rounding of frames
+_NO_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
 class Touched(NamedTuple):
-    """What there is to touch in a plant: model instances, and that of the leaf, if there is one."""
+    """Model instances of the environment, and the leaf's if there is one."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
 
 
 class Contact(NamedTuple):
-    """What may touch the tool, and how it is told.
+    """Contact of the tool with the environment.
 
     Attributes:
-        pairs: (k, 28) `Pairs.known`; none if `beyond` says something.
-        watched: (l, 40) `Pairs.watched`: what is left to Drake where it comes near.
-        joints: (m, 21) of `JointTable`, by which the boxes of `pairs` move.
-        plant_size: of the plant's state, if there are joints, or 0.
-        beyond: what the compiled contact law does not know, so that Drake's contact results are
-            used; empty if it knows enough.
-        bodies: the tool's, and what is welded to it, as numbers.
-        shapes: identifiers of their shapes, as numbers.
-        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
-            gravity [m/s^2]; without one, a mass that nothing moves.
-        sheet: model instance of the leaf, or another `moving_part`, if there is one.
-        moving: everything else that moves, by name.
+        pairs: (k, 28) `Pairs.known`; empty if `beyond` is set.
+        watched: (l, 40) `Pairs.watched`, left to Drake at close range.
+        joints: (m, 21) of `JointTable`, which move the boxes of `pairs`.
+        plant_size: size of the plant's state, 0 without joints.
+        beyond: reason for using Drake's contact results instead of the compiled law, or empty.
+        bodies: indices of the tool's bodies.
+        shapes: identifiers of their shapes.
+        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
+        sheet: model instance of the leaf, or of another `moving_part`, if any.
+        moving: other moving bodies, by name.
     """
 
     pairs: NDArray[np.float64]
@@ -61,12 +59,12 @@ class Contact(NamedTuple):
 
     @property
     def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pairs and joints, as `environment_wrench` takes them."""
+        """Pairs and joints for `environment_wrench`."""
         return self.pairs, self.joints
 
 
 def no_contact() -> Contact:
-    """With nothing to touch."""
+    """Return the `Contact` without environment."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
     watched = np.zeros((0, WATCHED_WIDTH))
@@ -74,11 +72,7 @@ def no_contact() -> Contact:
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
-    """Adds what there is to touch to a plant that has the tool and is not finalized.
-
-    Raises:
-        DrakeTeleopError: if a file of it cannot be read.
-    """
+    """Add the environment to a plant with the tool, before finalizing."""
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
@@ -96,23 +90,18 @@ def ContactWith(
     environment: Environment,
     touched: Touched,
 ) -> Contact:
-    """Prepares the contact of the tool with what was added, once the plant is finalized.
+    """Return the contact of the tool with the environment, after finalizing the plant.
 
-    Args:
-        plant: finalized.
-        scene_graph: with the shapes of tool and environment, and of nothing else.
-        sensor_frame: S.
-        tool: the body on it.
-        environment: what there is to touch.
-        touched: the same, as `AddEnvironment` returned it.
+    `scene_graph` contains the shapes of tool and environment only.
 
     Raises:
-        DrakeTeleopError: if a scene's contact is not what was asked for, or what moves has no mass.
+        DrakeTeleopError: if the requested contact model is impossible, or a moving body has no
+            mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
     contact = no_contact()._replace(
-        # Numbers: the identifiers themselves would hold the plant.
+        # Identifiers themselves would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
         sheet=touched.sheet,
@@ -177,10 +166,7 @@ def _beyond(environment: Environment, contact: Contact) -> str:
 
 
 def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
-    """What moves of it, besides the leaf, in a finalized plant, by the names of the bodies.
-
-    Of several of one name each has that of its model instance before its own.
-    """
+    """Return moving bodies except the leaf by unique name, in a finalized plant."""
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
@@ -198,5 +184,4 @@ def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex
 
 
 def _plain(name: str) -> str:
-    """For the name of a signal: a full stop would end it."""
     return re.sub(r"\W+", "_", name)

@@ -1,4 +1,4 @@
-"""What the environment exerts on the tool: contacts of balls with boxes, and what is applied."""
+"""Wrench of the environment on the tool: contacts of balls with boxes, and applied wrenches."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from drake_teleop.station.environment.point_contact import (
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import Contact
 
-#: Of the tool: nothing touches it, what the compiled law knows may, what it does not know may.
+#: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 FAR, TOUCHING, WATCHED = range(3)
-_WATCHED_FROM = 0.02  # m, farther than anything moves between two looks
+_WATCHED_FROM = 0.02  # m, larger than any motion between two checks
 _ROUNDING = 1e-9  # m
 
 
 @njit(cache=True)
 def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
-    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
+    """Write the environment's wrench on the tool, about the world's origin, in W.
 
     Args:
         arm: `ArmModel.table`.
         pairs: (k, 28) `Pairs.known`.
         joints: (m, 21) of `JointTable`.
-        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
-        q, v: (n,) of the arm.
-        sheet: (2,) deflection and its rate [m, m/s], of a leaf.
-        state: [q; v] of the whole plant, for `joints`; not read if there are none.
-        wrench_W: (6,) filled [N, N m].
+        applied_W: (6,) additional [f; tau] about So, in W [N, N m].
+        q, v: (n,).
+        sheet: (2,) deflection of the leaf and its rate [m, m/s].
+        state: the plant's [q; v], unused without joints.
+        wrench_W: (6,) output [N, N m].
     """
     acts = pairs.shape[0] > 0
     for i in range(6):
@@ -78,7 +78,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place(pair, bodies, placed):
-    """The pair with its box where its body has it, in `placed` (28,)."""
+    """Return `placed` (28,): the pair with its box at its body's pose."""
     body = bodies[int(pair[BODY])]
     put(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])
@@ -91,12 +91,7 @@ def _place(pair, bodies, placed):
 
 @njit(cache=True)
 def nearness(arm, pairs, watched, joints, q, sheet, state):
-    """How near the tool is to anything: `FAR`, `TOUCHING` or `WATCHED`.
-
-    Args:
-        arm, pairs, joints, q, sheet, state: as above.
-        watched: (l, 40) `Pairs.watched`.
-    """
+    """Return `FAR`, `TOUCHING` or `WATCHED`, for (l, 40) `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
     bodies_into(joints, state, bodies)
@@ -117,13 +112,13 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
 
 @njit(cache=True)
 def add_force(wrench_W, p_WC, force_W):
-    """Adds a force (3,) at C [N] to a wrench (6,) about the world's origin, all in W."""
+    """Add a force (3,) at C [N] to a wrench (6,) about the world's origin, in W."""
     add_into(wrench_W, 0, force_W)
     add_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):
-    """The true contact wrench for the log; no controller sees it.
+    """True contact wrench for the log, see `environment_wrench`.
 
     .. pydrake_system::
 
@@ -134,10 +129,6 @@ class ToolContact(LeafSystem):
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         output_ports:
         - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
-
-    Args:
-        arm: kinematics up to the tool.
-        contact: what it may touch.
     """
 
     __slots__ = ONE_DICT
