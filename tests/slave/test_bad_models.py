@@ -258,7 +258,7 @@ ASSUMED = {
 
 
 @pytest.mark.parametrize("case", ERRORS)
-def test_what_cannot_be_is_one_error(tmp_path, case):
+def test_faulty_model_raises_one_error(tmp_path, case):
     suffix, text, expected = ERRORS[case]
     path, other = tmp_path / f"arm.{suffix}", tmp_path / "other.urdf"
     tool = Tool(mass=1.0)
@@ -276,7 +276,7 @@ def test_what_cannot_be_is_one_error(tmp_path, case):
 
 
 @pytest.mark.parametrize("case", ASSUMED)
-def test_what_is_missing_is_assumed_and_named(tmp_path, case):
+def test_missing_data_become_named_assumptions(tmp_path, case):
     path = tmp_path / "arm.urdf"
     path.write_text(ASSUMED[case][0])
     joints = {"four joints": 4, "nine joints": 9}.get(case, 6)
@@ -285,7 +285,7 @@ def test_what_is_missing_is_assumed_and_named(tmp_path, case):
     assert re.search(ASSUMED[case][1], "; ".join(assumed))
 
 
-def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
+def test_start_posture_avoids_joint_limits(tmp_path):
     """One arm with different limits, at reachable positions."""
     path = tmp_path / "arm.urdf"
     path.write_text(arm())
@@ -303,7 +303,7 @@ def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
     assert of_home[of_first].all() and of_home.sum() > 1.3 * of_first.sum()
 
 
-def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
+def test_rounded_inertia_is_preserved(tmp_path):
     """Drake would replace it by that of a ball: 0.005 instead of 0.02 and 0.04 kg m^2."""
     path, plant = tmp_path / "arm.urdf", MultibodyPlant(0.0)
     path.write_text(ASSUMED["an inertia of rounded numbers"][0])
@@ -327,7 +327,7 @@ def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
         ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: nothing with a mass hangs on tcp"),
     ],
 )  # fmt: skip
-def test_what_a_scenario_says_of_a_good_model(tmp_path, change, expected):
+def test_invalid_settings_of_valid_model_raise_error(tmp_path, change, expected):
     path = tmp_path / "arm.urdf"
     tcp = '<joint name="t" type="fixed"><parent link="l6"/><child link="tcp"/></joint>'
     path.write_text(arm(beyond=link("tcp", "") + tcp))
@@ -346,7 +346,7 @@ def test_what_a_scenario_says_of_a_good_model(tmp_path, change, expected):
         ("", "tool.sdf: is not XML"),
     ],
 )  # fmt: skip
-def test_tools_that_are_none(tmp_path, text, expected):
+def test_invalid_tool_raises_error(tmp_path, text, expected):
     path, tool = tmp_path / "arm.urdf", tmp_path / "tool.sdf"
     path.write_text(arm())
     tool.write_text(text)

@@ -49,7 +49,7 @@ def arm():
 
 
 @pytest.mark.parametrize("speed", [0.3 * FRICTION_SPEED, 0.4])
-def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, speed):
+def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
     """Computed torque does not compensate the friction."""
     random, table = np.random.default_rng(3), arm.slave.arm.table
     torque, compiled = np.empty(6), np.empty(6)
@@ -67,14 +67,14 @@ def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, s
         np.testing.assert_allclose(missing - torque, slip, atol=1e-10)
 
 
-def test_a_steady_joint_takes_all_of_it_from_the_motor(arm):
+def test_motor_balances_friction_at_constant_speed(arm):
     q, v, torque = arm.slave.start, np.array([0.1, -0.1, 0.1, -0.1, 0.1, -0.1]), np.empty(6)
     inverse_dynamics(arm.slave.arm.table, q, v, np.zeros(6), torque)
     arm.put(q, v, torque + np.sign(v) * FRICTION)
     np.testing.assert_allclose(arm.acceleration(), 0.0, atol=1e-9)
 
 
-def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
+def test_joint_creeps_below_friction_torque(arm):
     weight, share = np.empty(6), np.array([0.5, -0.5, 0.9, 0.2, 0.0, -0.7])
     still = np.zeros(6)
     inverse_dynamics(arm.slave.arm.table, arm.slave.start, still, still, weight)
@@ -88,7 +88,7 @@ def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
     assert (np.abs(q - arm.slave.start) <= 0.1 * 2e-3 * np.arctanh(np.abs(share)) + 1e-5).all()
 
 
-def test_it_takes_energy_and_never_gives_any(arm):
+def test_friction_only_dissipates(arm):
     """An arm swings without torque; the lost energy equals the friction's work."""
     v = np.array([1.0, -0.8, 0.9, -2.0, 1.5, 3.0])
     arm.put(arm.slave.start, v, np.zeros(6))
@@ -106,7 +106,7 @@ def test_it_takes_energy_and_never_gives_any(arm):
     assert energies[-1] - energies[0] == pytest.approx(lost, rel=1e-3)
 
 
-def test_one_number_is_for_all_and_none_adds_nothing():
+def test_one_friction_value_applies_to_all_joints():
     for friction, expected in (([2.0], 6 * [2.0]), ([], 6 * [0.0])):
         builder = DiagramBuilder()
         slave = AddSlavePlant(builder, Slave(friction=friction), None)
@@ -123,7 +123,7 @@ def test_one_number_is_for_all_and_none_adds_nothing():
         ([4.0], "slave.friction: the friction stops a joint within 0.0.. ms, too fast for steps"),
     ],
 )
-def test_what_cannot_be_is_one_line(friction, expected):
+def test_invalid_friction_raises_one_line(friction, expected):
     scenario = replace(
         LoadScenario("free_motion_force"), slave__friction=friction, force_scaling__sigma=1.0
     )

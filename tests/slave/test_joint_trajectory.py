@@ -8,7 +8,7 @@ from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.joint_trajectory import JointTrajectory
 
 
-def test_it_rests_then_plays_once_then_rests_again():
+def test_trajectory_rests_before_and_after_one_period():
     rng = np.random.default_rng(0)
     trajectory = FourierTrajectory(rng.normal(size=6), *rng.normal(size=(2, 6, 2)), 0.5)
     start, period = 1.25, trajectory.period

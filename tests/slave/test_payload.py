@@ -23,7 +23,7 @@ from drake_teleop.station.station import GetBlock, MakeTeleopStation
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
 
 
-def test_it_adds_to_the_tools_parameters():
+def test_payload_adds_to_tool_parameters():
     bare = AddSlavePlant(DiagramBuilder(), Slave(), None).arm.phi_load
     phi = slave_arm(replace(Scenario(), slave__payload=HELD)).phi_load
     # A steel ball of 2 kg has a radius of 39.3 mm.
@@ -33,7 +33,7 @@ def test_it_adds_to_the_tools_parameters():
     np.testing.assert_array_equal(nothing.phi_load, bare)
 
 
-def test_the_sensor_feels_it_as_its_joint_does():
+def test_sensor_wrench_includes_payload():
     swing = Sine(duration=10.0, ramp=0.1, frequency=3.0, translation=[0.01, 0.01, 0.03])
     scenario = replace(
         Scenario(), operator=OperatorConfig("firm", [swing]), wrist_sensor__ideal=True,
@@ -60,7 +60,7 @@ def test_the_sensor_feels_it_as_its_joint_does():
 
 
 @pytest.mark.slow
-def test_the_identification_finds_it():
+def test_identification_includes_payload():
     scenario = identification_scenario(replace(Scenario(), slave__payload=HELD), 1)
     mass, com, _ = mass_com_inertia(identify_load(scenario).estimate[6:])
     true_mass, true_com, _ = mass_com_inertia(slave_arm(scenario).phi_load)

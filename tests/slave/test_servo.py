@@ -27,7 +27,7 @@ def home(arm):
     return home_position(arm, SCENARIO.slave.position)
 
 
-def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
+def test_operational_inertia_gives_kinetic_energy(arm, home):
     """Against the mass matrix from the inverse dynamics, column by column."""
     still, weight, J = np.zeros(6), np.empty(6), np.empty((6, 6))
     inverse_dynamics(arm.table, home, still, still, weight)
@@ -39,7 +39,7 @@ def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
     np.testing.assert_allclose(found, mass - weight, rtol=1e-9, atol=1e-9)
 
 
-def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
+def test_mass_bounds_kinetic_energy(arm, home):
     """One motion reaches the bound."""
     config = SCENARIO.joint_control
     told = servo_at_tool(arm, home, config)
@@ -51,9 +51,7 @@ def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
     np.testing.assert_allclose(np.divide(told.damping, told.mass), kv)
 
 
-def test_the_ledger_of_a_station_is_told_of_its_arm_unless_somebody_says_another(
-    arm, home, monkeypatch
-):
+def test_ledger_uses_arm_mass_by_default(arm, home, monkeypatch):
     told, parameters = [], channel.methods.parameters
     monkeypatch.setattr(
         channel.methods,

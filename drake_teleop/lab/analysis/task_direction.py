@@ -108,7 +108,7 @@ def task_direction(
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
     servo, sheet = scenario.joint_control, scenario.leaf
-    servo.check_is_torque("the model of one axis")
+    servo.check_computed_torque("the model of one axis")
     scenario.master.check_leads_the_pose("the model of one axis")
     forward, backward = scenario.channel.lines()
     axis = OneAxis(

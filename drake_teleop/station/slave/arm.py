@@ -118,7 +118,7 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 
 @njit(cache=True, inline="always")
-def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
+def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
     """Move the state x from the previous link to this one."""
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
@@ -149,7 +149,7 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 
 
 @njit(cache=True, inline="always")
-def _start(table: Array, x: Array) -> None:
+def _set_world_at_rest(table: Array, x: Array) -> None:
     """Set x to the world frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
@@ -209,10 +209,10 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
     and R_WS by rows.
     """
     n = table.shape[0] - 1
-    _start(table, out)
+    _set_world_at_rest(table, out)
     for row in range(n):
-        _advance(table, row, q[row], v[row], vdot[row], out)
-    _advance(table, n, 0.0, 0.0, 0.0, out)
+        _advance_state(table, row, q[row], v[row], vdot[row], out)
+    _advance_state(table, n, 0.0, 0.0, 0.0, out)
     R_SW = transposed(nine(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply(R_SW, three(out, i))
@@ -222,13 +222,13 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the state x of each link, and of S, to the rows of out (n+1, 21)."""
     n = table.shape[0] - 1
-    _start(table, out[0])
+    _set_world_at_rest(table, out[0])
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
-        _advance(table, row, q[row], v[row], vdot[row], out[row])
+        _advance_state(table, row, q[row], v[row], vdot[row], out[row])
     out[n] = out[n - 1]
-    _advance(table, n, 0.0, 0.0, 0.0, out[n])
+    _advance_state(table, n, 0.0, 0.0, 0.0, out[n])
 
 
 @njit(cache=True, inline="always")
@@ -250,7 +250,7 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
 
 @njit(cache=True)
-def _to_the_joints(table: Array, link: Array, tau: Array) -> None:
+def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
     """Sum the wrenches of `_link_wrench` inboard and project them to torques tau (n,)."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
@@ -276,14 +276,14 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _start(table, x)
+    _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance(table, row, q[row], v[row], vdot[row], x)
+            _advance_state(table, row, q[row], v[row], vdot[row], x)
         else:
-            _advance(table, row, 0.0, 0.0, 0.0, x)
+            _advance_state(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
-    _to_the_joints(table, link, tau_out)
+    _project_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
 
@@ -296,15 +296,15 @@ def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None
     inertia[0] += m
     add_into(inertia, 1, plus(h, times(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
-    across = 2.0 * dot(p, h) + m * dot(p, p)
+    diagonal = 2.0 * dot(p, h) + m * dot(p, p)
     k = 4
     for i in range(3):
-        turned = apply(about_Lo, three(x, 12 + 3 * i))
+        rotated = apply(about_Lo, three(x, 12 + 3 * i))
         for j in range(i, 3):
-            value = dot(turned, three(x, 12 + 3 * j))
+            value = dot(rotated, three(x, 12 + 3 * j))
             value -= p[i] * h[j] + h[i] * p[j] + m * p[i] * p[j]
             if i == j:
-                value += across
+                value += diagonal
             inertia[k] += value
             k += 1
 
@@ -374,17 +374,17 @@ def forward_dynamics(
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _start(table, x)
+    _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance(table, row, q[row], v[row], 0.0, x)
+            _advance_state(table, row, q[row], v[row], 0.0, x)
         else:
-            _advance(table, row, 0.0, 0.0, 0.0, x)
+            _advance_state(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
         _composite_inertia(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
-    _to_the_joints(table, link, vdot_out)
+    _project_on_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
         if table[row, FRICTION] != 0.0:

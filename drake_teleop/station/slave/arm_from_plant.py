@@ -53,10 +53,10 @@ def ArmModelFromPlant(
             remedy="name the frame or link at which the sensor measures",
         )
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    inboard = {
+    inboard_joints = {
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
-    joints = _chain(inboard, frame_S)
+    joints = _joint_chain(inboard_joints, frame_S)
     n = len(joints)
     table = np.zeros((n + 1, WIDTH))
     for row, joint in enumerate(joints):
@@ -81,13 +81,13 @@ def ArmModelFromPlant(
         table[row, ROTATION:TRANSLATION] = X_PJ.rotation().matrix().ravel()
         table[row, TRANSLATION:PHI] = X_PJ.translation()
     rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
-    for index in inboard:
+    for index in inboard_joints:
         body = plant.get_body(index)
-        found = _row_of(body, inboard, rows, frame_S.body())
-        if found is not None:
-            X_LB = X_WL[found].InvertAndCompose(body.EvalPoseInWorld(context))
+        body_row = _table_row(body, inboard_joints, rows, frame_S.body())
+        if body_row is not None:
+            X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[found, PHI:ROTOR] += _phi(M_B, X_LB)
+            table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -111,10 +111,12 @@ def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     return axis
 
 
-def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoint | PrismaticJoint]:
+def _joint_chain(
+    inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
+) -> list[RevoluteJoint | PrismaticJoint]:
     body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
-    while body.index() in inboard:
-        joint = inboard[body.index()]
+    while body.index() in inboard_joints:
+        joint = inboard_joints[body.index()]
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
@@ -133,9 +135,9 @@ def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoin
     return joints[::-1]
 
 
-def _row_of(
+def _table_row(
     body: RigidBody,
-    inboard: dict[BodyIndex, Joint],
+    inboard_joints: dict[BodyIndex, Joint],
     rows: dict[BodyIndex, int],
     sensor_body: RigidBody,
 ) -> int | None:
@@ -146,9 +148,9 @@ def _row_of(
             return len(rows)
         if body.index() in rows:
             break
-        if body.index() not in inboard:
+        if body.index() not in inboard_joints:
             return None
-        joint = inboard[body.index()]
+        joint = inboard_joints[body.index()]
         if not isinstance(joint, WeldJoint):
             moving = joint
         body = joint.parent_body()
@@ -161,7 +163,7 @@ def _row_of(
     return rows[body.index()]
 
 
-def _phi(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
+def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
     """Return phi (10,) of a body about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))

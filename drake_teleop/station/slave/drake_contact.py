@@ -59,10 +59,10 @@ class DrakeContact(LeafSystem):
 
     def __init__(self, bodies: Container[int], shapes: Container[int]) -> None:
         super().__init__()
-        self._of = bodies, shapes
+        self._tool_ids = bodies, shapes
         results = Value[ContactResults]()
         self._contacts = self.DeclareAbstractInputPort("contact_results", results)
         self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._of))
+        output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._tool_ids))

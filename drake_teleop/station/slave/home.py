@@ -16,13 +16,13 @@ from drake_teleop.station.slave.servo import mass_matrix
 from drake_teleop.station.slave.slave_config import Slave
 
 # Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
-_LEAST_INERTIA = 1e-9
+_MIN_INERTIA = 1e-9
 #: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
 # Shares of the joint ranges, about their middles, that are searched in this order.
-_OF_RANGES = (0.7, 0.9, 1.0)
+_RANGE_SHARES = (0.7, 0.9, 1.0)
 #: Elbow up, reaching forward [rad]; home is the branch nearest to it.
-_Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
+_Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 def tool_down(
@@ -33,10 +33,10 @@ def tool_down(
     Without a closed form, it avoids joint limits where possible.
     """
     if has_closed_form(arm):
-        return nearest_branch(R_WS.matrix(), position, _Q_NEAR_HOME, arm.lower, arm.upper)
+        return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
-    for share in _OF_RANGES:
+    for share in _RANGE_SHARES:
         inside = replace(arm, lower=middle - share * half, upper=middle + share * half)
         q, status = find_posture(inside, pose, middle)
         if status == IkStatus.OK:
@@ -83,14 +83,14 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
     """Raise DrakeTeleopError for a joint without inertia or with too weak a motor."""
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _LEAST_INERTIA:
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA:
         raise DrakeTeleopError(
             "nothing resists a torque: its links have too little inertia for its joints",
             where="slave.model",
             remedy="give the links their masses and inertias, or the joints rotor inertias",
         )
-    still, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
-    inverse_dynamics(arm.table, q, still, still, torque)
+    zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
+    inverse_dynamics(arm.table, q, zeros, zeros, torque)
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())
     if share[k] > 1.0:

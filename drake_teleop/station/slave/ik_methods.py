@@ -24,7 +24,7 @@ METHODS: dict[str, Callable[[ArmModel, NDArray[np.float64], float], LeafSystem]]
 have the ports of `InverseKinematics`."""
 
 
-def method_of(name: str, arm: ArmModel) -> str:
+def ik_method_name(name: str, arm: ArmModel) -> str:
     """Return the key in `METHODS` for `name`; raise DrakeTeleopError without a closed form."""
     if name == AUTOMATIC:
         return "closed_form" if has_closed_form(arm) else "numeric"

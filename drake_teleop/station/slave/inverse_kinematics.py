@@ -34,9 +34,9 @@ FLANGE = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
-_SINGULAR = 1e-9
+_SINGULAR_THRESHOLD = 1e-9
 # Tolerance of a limit [rad]; the angle is clipped to it.
-_ROUNDING = 1e-9
+_LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
@@ -77,25 +77,25 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
     y = p[1] - FLANGE * R[1, 2]
     z = p[2] - FLANGE * R[2, 2] - SHOULDER_HEIGHT
     reach = UPPER_ARM + FOREARM
-    hole = abs(UPPER_ARM - FOREARM)
+    inner_reach = abs(UPPER_ARM - FOREARM)
     distance = np.sqrt(x * x + y * y + z * z)
-    if distance > reach or distance < hole:
+    if distance > reach or distance < inner_reach:
         if not clamp:
             q[:] = np.nan
             return _OUT_OF_REACH
-        scale = (reach if distance > reach else hole) / distance
+        scale = (reach if distance > reach else inner_reach) / distance
         x, y, z = scale * x, scale * y, scale * z
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _SINGULAR:
+    if rho < _SINGULAR_THRESHOLD:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
         q1_front = np.arctan2(y, x)
     # The half-angle form is accurate where the arm is nearly stretched.
     stretched = max((reach - distance) * (reach + distance), 0.0)
-    folded = max((distance - hole) * (distance + hole), 0.0)
+    folded = max((distance - inner_reach) * (distance + inner_reach), 0.0)
     q3_up = 2.0 * np.arctan2(np.sqrt(stretched), np.sqrt(folded))
     for a in range(2):
         q1 = q1_front + a * np.pi
@@ -115,7 +115,7 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _SINGULAR else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _SINGULAR_THRESHOLD else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
             # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
@@ -130,15 +130,15 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
 
 
 @njit(cache=True)
-def _turned(angle: float, near: float, lower: float, upper: float) -> float:
+def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
     """Return angle + 2 pi k within the limits, nearest to ``near``; nan if none exists."""
-    turn = 2.0 * np.pi
-    angle += turn * np.round((near - angle) / turn)
-    if angle > upper + _ROUNDING:
-        angle -= turn * np.ceil((angle - upper - _ROUNDING) / turn)
-    if angle < lower - _ROUNDING:
-        angle += turn * np.ceil((lower - _ROUNDING - angle) / turn)
-    if angle > upper + _ROUNDING:
+    full_turn = 2.0 * np.pi
+    angle += full_turn * np.round((near - angle) / full_turn)
+    if angle > upper + _LIMIT_TOLERANCE_RAD:
+        angle -= full_turn * np.ceil((angle - upper - _LIMIT_TOLERANCE_RAD) / full_turn)
+    if angle < lower - _LIMIT_TOLERANCE_RAD:
+        angle += full_turn * np.ceil((lower - _LIMIT_TOLERANCE_RAD - angle) / full_turn)
+    if angle > upper + _LIMIT_TOLERANCE_RAD:
         return np.nan
     return min(max(angle, lower), upper)
 
@@ -162,7 +162,7 @@ def _nearest_branch(
     for row in range(8):
         distance = 0.0
         for i in range(6):
-            angle = _turned(branches[row, i], reference[i], lower[i], upper[i])
+            angle = _wrap_to_limits(branches[row, i], reference[i], lower[i], upper[i])
             step = abs(angle - reference[i])
             # A nan (outside the limits) also gives inf.
             distance += step * step if step <= max_step else np.inf
@@ -172,7 +172,7 @@ def _nearest_branch(
     if best < 0:
         return _JOINT_LIMIT
     put(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _SINGULAR:
+    if abs(np.sin(q[4])) < _SINGULAR_THRESHOLD:
         status = max(status, _WRIST_SINGULAR)
     return status
 

@@ -74,7 +74,7 @@ class JointControlConfig:
         if interface is not None:
             interface.check(f"{where}.interface", rate)
 
-    def check_is_torque(self, what: str) -> None:
+    def check_computed_torque(self, what: str) -> None:
         """Raise DrakeTeleopError, with subject `what`, if the servo is not computed torque."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
@@ -97,7 +97,7 @@ def joint_control_torque(
     if not sound(command):
         return
     n = torque.shape[0]
-    q, v, wanted = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
+    q, v, acceleration = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
     put(scratch, 0, state, 0, 2 * n)
     if not sound(state):
         put(q, 0, command, 0, n)
@@ -105,8 +105,8 @@ def joint_control_torque(
     for i in range(n):
         setpoint = position_gain * (command[i] - q[i])
         setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
-        wanted[i] = velocity_gain * (setpoint - v[i])
-    inverse_dynamics(arm, q, v, wanted, torque)
+        acceleration[i] = velocity_gain * (setpoint - v[i])
+    inverse_dynamics(arm, q, v, acceleration, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
@@ -155,8 +155,8 @@ class JointControl(LeafSystem):
         self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
+        zeros, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
         self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -180,6 +180,6 @@ def MakeJointControl(
     return PositionServo(arm, interface, period, q_start)
 
 
-def interface_of(block: Mapping[str, Any] | None) -> PositionInterface | None:
+def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the default `interface` of the servo that a `joint_control` block names."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))

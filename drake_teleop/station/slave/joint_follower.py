@@ -34,18 +34,18 @@ class JointFollower(LeafSystem):
         self._lower, self._upper = arm.lower, arm.upper
         self._step = arm.velocity_limit * period
         n = arm.num_joints
-        self._wanted = self.DeclareVectorInputPort("leader_joints", n)
+        self._leader = self.DeclareVectorInputPort("leader_joints", n)
         self.DeclareDiscreteState(np.array(q_start, dtype=np.float64))
         self.DeclareVectorOutputPort("joint_command", n, weak_callback(self._calc_command))
         self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _next(self, context: Context) -> tuple[Array, IkStatus]:
-        last, wanted = context.get_discrete_state(0).value(), self._wanted.Eval(context)
-        if not sound(wanted):
+        last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
+        if not sound(leader):
             return last, IkStatus.BAD_POSE
-        within = np.clip(wanted, self._lower, self._upper)
-        status = IkStatus.OK if (within == wanted).all() else IkStatus.JOINT_LIMIT
+        within = np.clip(leader, self._lower, self._upper)
+        status = IkStatus.OK if (within == leader).all() else IkStatus.JOINT_LIMIT
         return np.clip(within, last - self._step, last + self._step), status
 
     def _calc_command(self, context: Context, output: BasicVector) -> None:

@@ -67,14 +67,14 @@ class JointFriction(LeafSystem):
 
     def __init__(self, coulomb: Array, index: NDArray[np.intp], velocities: int) -> None:
         super().__init__()
-        self._numbers = coulomb, index
+        self._constants = coulomb, index
         self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
         self.DeclareVectorOutputPort(
             "generalized_force", velocities, weak_callback(self._calc), {self._state.ticket()}
         )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        _friction_into(*self._numbers, self._state.Eval(context), output.get_mutable_value())
+        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
 
 
 def AddJointFriction(

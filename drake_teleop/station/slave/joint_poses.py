@@ -12,7 +12,7 @@ from drake_teleop.common.arrays import Array
 from drake_teleop.logs.read.rotations import quaternions
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.plant import finalize
 
 
@@ -37,7 +37,7 @@ def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ())
         DrakeTeleopError: if the model cannot be read or is no serial arm.
     """
     plant = MultibodyPlant(0.0)
-    with drakes_errors_said(model):
+    with translate_drake_errors(model):
         parsed = ParseModel(plant, model, sensor_frame, package_paths)
         finalize(plant)
         found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())

@@ -12,12 +12,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
-_READABLE = (".obj", ".gltf", ".vtk")
+_READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 
 
-def without_lost_meshes(
+def remove_unusable_meshes(
     root: ElementTree.Element, files: ModelFiles, folder: Path
 ) -> dict[str, list[str]]:
     """Remove shapes without a usable mesh; return the affected links by fault.
@@ -29,23 +29,23 @@ def without_lost_meshes(
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
         faults = {"collision": set[str](), "visual": set[str]()}
-        for kind, of_kind in faults.items():
+        for kind, removed in faults.items():
             for shape in link.findall(kind):
-                if fault := _fault(shape, files, folder):
+                if fault := _mesh_fault(shape, files, folder):
                     link.remove(shape)
-                    of_kind.add(fault)
+                    removed.add(fault)
         if link.find("collision") is not None:
-            counting = faults["collision"]
+            reported = faults["collision"]
         elif link.find("visual") is not None:
-            counting = set()
+            reported = set()
         else:
-            counting = faults["collision"] | faults["visual"]
-        for fault in sorted(counting):
+            reported = faults["collision"] | faults["visual"]
+        for fault in sorted(reported):
             lost.setdefault(fault, []).append(link.get("name", ""))
     return lost
 
 
-def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
+def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
     """Return the fault of a shape's mesh; if none, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
@@ -59,8 +59,8 @@ def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str |
     except DrakeTeleopError as error:
         return str(error)
     if file.suffix.lower() == ".stl":
-        file = _hull_of_stl(file, folder)
-    if file is None or file.suffix.lower() not in _READABLE:
+        file = _convert_stl_to_hull(file, folder)
+    if file is None or file.suffix.lower() not in _READABLE_SUFFIXES:
         suffix = Path(address.strip()).suffix
         return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
     if mesh.get("filename"):
@@ -70,7 +70,7 @@ def _fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str |
     return None
 
 
-def _hull_of_stl(path: Path, folder: Path) -> Path | None:
+def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
     """Write the convex hull of an STL file as OBJ; return None if it is degenerate."""
     from scipy.spatial import ConvexHull, QhullError
 

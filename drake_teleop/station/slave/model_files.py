@@ -29,7 +29,7 @@ def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
     return roots
 
 
-def peculiar_joints(root: Element) -> dict[str, str]:
+def unsupported_joints(root: Element) -> dict[str, str]:
     """Return properties that Drake ignores: dependent joints and links that float on a link."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
@@ -62,7 +62,7 @@ def _is_free(joint: Element | None) -> bool:
     return joint is not None and joint.get("type") == "free"
 
 
-def efforts(root: Element) -> dict[str, float]:
+def effort_limits(root: Element) -> dict[str, float]:
     """Return torque limits of URDF joints; Drake drops them without a transmission."""
     limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
     return {
@@ -72,7 +72,7 @@ def efforts(root: Element) -> dict[str, float]:
     }
 
 
-def without_idle(root: Element) -> list[str]:
+def remove_idle_elements(root: Element) -> list[str]:
     """Remove `mimic` tags of fixed joints and transmissions of missing joints; return notes."""
     for joint in root.iter("joint"):
         for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():

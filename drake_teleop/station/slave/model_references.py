@@ -24,7 +24,7 @@ from drake_teleop.common.texts import read_yaml
 
 # Limits for all files together (repeated includes count again), and bytes of one text file.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
-_LONGEST_NAME = 4096
+_MAX_NAME_LENGTH = 4096
 _MAX_DEPTH = 20  # of nested includes
 _BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
 _PACKAGE = "package.xml"
@@ -82,7 +82,7 @@ class ModelFiles:
             path = None if base is None else base / match[2]
         else:
             path = (folder or self._folder) / address.removeprefix("file://")
-        return next(iter(_existing(path)), None)
+        return next(iter(_existing_paths(path)), None)
 
     def check(self, path: Path) -> None:
         """Check a file and all files that it references, except meshes of the model's own links.
@@ -116,14 +116,14 @@ class ModelFiles:
                 raise DrakeTeleopError(f"names {path}, which is no file", where=where)
             files, size = 1, real.stat().st_size
             _check_size(files, size, path)
-            for named in list(self._named(real)):
+            for named in list(self._referenced_files(real)):
                 more = self._size(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_size(files, size, path)
             self._sizes[real] = files, size
         return self._sizes[real]
 
-    def _named(self, path: Path) -> Iterator[Path]:
+    def _referenced_files(self, path: Path) -> Iterator[Path]:
         """Yield the existing files and folders that a file references."""
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
@@ -131,11 +131,11 @@ class ModelFiles:
         folders = {top / base for top in tops for base in self._bases}
         try:
             for address in self._addresses(path):
-                if len(address) > _LONGEST_NAME and path.suffix.lower() not in (".obj", ".mtl"):
+                if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
                     what = f"names a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.file(address, folder) for folder in folders}
-                found = {file for each in named for file in _existing(each)}
+                found = {file for each in named for file in _existing_paths(each)}
                 yield from (each for each in found if each != path.parent)
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
@@ -149,18 +149,20 @@ class ModelFiles:
         elif kind in (".urdf", ".sdf", ".xml", ".config"):
             root = read_xml(path)
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
-            yield from _of_xml(root, meshes=path != self._model.resolve() or kind == ".xml")
+            yield from _addresses_in_xml(
+                root, meshes=path != self._model.resolve() or kind == ".xml"
+            )
         elif kind in (".yaml", ".yml"):
             yield from added_models(read_yaml(path, tagged=True))
         elif kind in (".gltf", ".glb"):
-            yield from _of_gltf(path)
+            yield from _addresses_in_gltf(path)
         elif kind in (".obj", ".mtl"):
             for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
 
-def _existing(path: Path | None) -> list[Path]:
+def _existing_paths(path: Path | None) -> list[Path]:
     """Return the path if it exists, and as Drake normalizes it (a/../b is b)."""
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
@@ -197,7 +199,7 @@ def read_xml(path: Path) -> Element:
         raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
-def _of_xml(root: Element, *, meshes: bool) -> Iterator[str]:
+def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
     for element in root.iter():
         if element.tag in ("plugin", "script"):
             continue
@@ -217,7 +219,7 @@ def added_models(data: Any) -> Iterator[str]:
                 yield added["file"]
 
 
-def _of_gltf(path: Path) -> list[str]:
+def _addresses_in_gltf(path: Path) -> list[str]:
     found: list[str] = []
 
     def keep(fields: list[tuple[str, Any]]) -> None:

@@ -32,24 +32,24 @@ from pydrake.multibody.tree import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.silence import silent_stderr
 from drake_teleop.common.texts import read_text
-from drake_teleop.station.slave.meshes import without_lost_meshes
+from drake_teleop.station.slave.meshes import remove_unusable_meshes
 from drake_teleop.station.slave.model_check import WORLD, check_model, check_tree
 from drake_teleop.station.slave.model_files import (
     XACRO,
-    efforts,
+    effort_limits,
     floating_links,
-    peculiar_joints,
     read_roots,
-    without_idle,
+    remove_idle_elements,
+    unsupported_joints,
 )
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Elements that close kinematic loops: Drake's tags in URDF and SDF, and MJCF's.
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
 # Prefix of assumptions about removed shapes.
-_MISSING = "shapes are missing of"
+_REMOVED_SHAPES = "shapes are missing of"
 # Expected kind of file, and the remedy for missing packages.
-_Said: TypeAlias = tuple[str, str]
+_Description: TypeAlias = tuple[str, str]
 _Found = TypeVar("_Found")
 _ROBOT = ("robot", "with --package-path for package://")
 _SCENE = ("scene", "its package:// addresses in folders around it")
@@ -98,9 +98,9 @@ def ParseModel(
             fixes the base although `X_WBase` is not the identity.
     """
     before = set(plant.GetJointIndices())
-    read = _read(plant, path, package_paths, sensor=sensor_frame)
-    having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
-    if len(having) != 1:
+    read = _parse(plant, path, package_paths, sensor=sensor_frame)
+    with_frame = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
+    if len(with_frame) != 1:
         frames = [
             plant.get_frame(index).name()
             for instance in read.instances
@@ -110,17 +110,17 @@ def ParseModel(
         frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
         known = ", ".join(sorted(set(frames)))
         raise DrakeTeleopError(
-            f"{len(having) or 'no'} frames are named {sensor_frame!r}",
+            f"{len(with_frame) or 'no'} frames are named {sensor_frame!r}",
             where=str(path),
             remedy=f"name one of {known}" if known else "give a model that has links",
         )
-    frame = plant.GetFrameByName(sensor_frame, having[0])
-    chain = _weld_base(plant, frame, read.of_all(peculiar_joints), X_WBase, str(path))
-    _check_loose(plant, read.instances, str(path))
+    frame = plant.GetFrameByName(sensor_frame, with_frame[0])
+    chain = _weld_base(plant, frame, read.collect(unsupported_joints), X_WBase, str(path))
+    _check_free_bodies(plant, read.instances, str(path))
     _check_chain(plant, chain, str(path))
-    with drakes_errors_said(path):
-        held = _hold_others(plant, before, chain)
-        _actuate(plant, chain, read.of_all(efforts))
+    with translate_drake_errors(path):
+        held = _weld_other_joints(plant, before, chain)
+        _actuate(plant, chain, read.collect(effort_limits))
     instances = {plant.get_joint(k).model_instance() for k in chain if _moves(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
@@ -129,9 +129,9 @@ def ParseModel(
             where=str(path),
             remedy="write the chain up to the sensor as one model",
         )
-    instance = next(iter(instances), having[0])
-    afloat = [name for root in read.roots for name in floating_links(root)]
-    welded = [f"welded to the world, where it may float: {', '.join(afloat)}"] if afloat else []
+    instance = next(iter(instances), with_frame[0])
+    floating = [name for root in read.roots for name in floating_links(root)]
+    welded = [f"welded to the world, where it may float: {', '.join(floating)}"] if floating else []
     return ParsedModel(instance, frame, [*read.assumptions, *welded, *held], read.folder)
 
 
@@ -144,7 +144,7 @@ def ParseTool(
         DrakeTeleopError: if the file cannot be read or does not have exactly one root.
     """
     before = set(plant.GetJointIndices())
-    read = _read(plant, path, package_paths)
+    read = _parse(plant, path, package_paths)
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
@@ -155,8 +155,8 @@ def ParseTool(
             where=str(path),
             remedy="a tool is one tree of links, whose root is put on the sensor frame",
         )
-    with drakes_errors_said(path):
-        assumptions = [*read.assumptions, *_hold_others(plant, before, [])]
+    with translate_drake_errors(path):
+        assumptions = [*read.assumptions, *_weld_other_joints(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     return ParsedTool(roots[0], assumptions, read.folder)
@@ -168,9 +168,9 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     Raises:
         DrakeTeleopError: if the file cannot be read, or contains elements that Drake ignores.
     """
-    read = _read(plant, path, (), _SCENE)
-    missing = [text for text in read.assumptions if text.startswith(_MISSING)]
-    missing += [f"{name} {what}" for name, what in read.of_all(peculiar_joints).items()]
+    read = _parse(plant, path, (), _SCENE)
+    missing = [text for text in read.assumptions if text.startswith(_REMOVED_SHAPES)]
+    missing += [f"{name} {what}" for name, what in read.collect(unsupported_joints).items()]
     if missing:
         raise DrakeTeleopError(
             missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
@@ -178,7 +178,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     return read.folder
 
 
-class _Read(NamedTuple):
+class _ModelContent(NamedTuple):
     """Content of a model file, and the roots of its XML files."""
 
     instances: list[ModelInstanceIndex]
@@ -186,17 +186,19 @@ class _Read(NamedTuple):
     assumptions: list[str]
     folder: TemporaryDirectory[str]
 
-    def of_all(self, find: Callable[[ElementTree.Element], dict[str, _Found]]) -> dict[str, _Found]:
+    def collect(
+        self, find: Callable[[ElementTree.Element], dict[str, _Found]]
+    ) -> dict[str, _Found]:
         return {name: what for root in self.roots for name, what in find(root).items()}
 
 
-def _read(
+def _parse(
     plant: MultibodyPlant,
     path: Path,
     package_paths: tuple[Path, ...],
-    said: _Said = _ROBOT,
+    expected: _Description = _ROBOT,
     sensor: str = "",
-) -> _Read:
+) -> _ModelContent:
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
     if path.suffix.lower() == ".xacro":
@@ -214,30 +216,32 @@ def _read(
     forces = plant.num_force_elements()
     roots = read_roots(path, files)
     _check_no_loop(path, kind)
-    with drakes_errors_said(path, said):
+    with translate_drake_errors(path, expected):
         for file, root in roots.items():
             assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
-            assumptions += without_idle(root)
-            lost = without_lost_meshes(root, files, Path(converted.name))
-            assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
+            assumptions += remove_idle_elements(root)
+            lost = remove_unusable_meshes(root, files, Path(converted.name))
+            assumptions += [
+                f"{_REMOVED_SHAPES} {', '.join(ls)}: {what}" for what, ls in lost.items()
+            ]
             for uri in root.iterfind(".//include/uri"):  # or Drake uses the working folder
                 if (included := files.file((uri.text or "").strip())) is not None:
                     uri.text = f"file://{included.resolve()}"
             text = ElementTree.tostring(root, encoding="unicode")
-            with _drakes_errors_raised():
+            with _raise_logged_errors():
                 instances = parser.AddModelsFromString(text, kind)
         else:
-            with _drakes_errors_raised():
+            with _raise_logged_errors():
                 instances = parser.AddModels(str(path))
-    if said is _ROBOT and plant.num_force_elements() > forces:
+    if expected is _ROBOT and plant.num_force_elements() > forces:
         raise DrakeTeleopError(
             "has springs, or other forces of its own",
             where=str(path),
             remedy="take them out: what moves the arm are its motors, gravity and what it touches",
         )
-    return _Read(instances, list(roots.values()), assumptions, converted)
+    return _ModelContent(instances, list(roots.values()), assumptions, converted)
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
@@ -251,7 +255,9 @@ def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> 
             )
 
 
-def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str) -> None:
+def _check_free_bodies(
+    plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str
+) -> None:
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     for index in (k for instance in instances for k in plant.GetBodyIndices(instance)):
         if index not in held:
@@ -263,7 +269,7 @@ def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], whe
 
 
 def _check_no_loop(path: Path, kind: str) -> None:
-    """Raise an error for loop constraints (`peculiar_joints` finds dependent joints)."""
+    """Raise an error for loop constraints (`unsupported_joints` finds dependent joints)."""
     found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
     if found:
         raise DrakeTeleopError(
@@ -277,7 +283,7 @@ def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
     return plant.get_joint(index).num_velocities() > 0
 
 
-def _hold_others(
+def _weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
     """Weld moving joints outside the chain at their default positions; return a note."""
@@ -309,7 +315,9 @@ def _default_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, float]) -> None:
+def _actuate(
+    plant: MultibodyPlant, chain: list[JointIndex], effort_limits: dict[str, float]
+) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain."""
     moving = [index for index in chain if _moves(plant, index)]
     actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
@@ -328,7 +336,7 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
         plant.RemoveJointActuator(each)
     for index in moving:
         joint = plant.get_joint(index)
-        effort, rotor, gear = known.get(index, (efforts.get(joint.name(), 0.0), 0.0, 1.0))
+        effort, rotor, gear = known.get(index, (effort_limits.get(joint.name(), 0.0), 0.0, 1.0))
         effort = effort if effort > 0.0 else np.inf
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(rotor)
@@ -336,7 +344,7 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
 
 
 @contextmanager
-def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
+def translate_drake_errors(path: Path, expected: _Description = _ROBOT) -> Iterator[None]:
     """Convert Drake's exceptions about a model to a DrakeTeleopError with its file."""
     try:
         yield
@@ -346,14 +354,14 @@ def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = str(error).replace("<literal-string>", "").replace(f"{path.parent}/", "")
         raise DrakeTeleopError(
-            f"cannot be read as a {said[0]} ({reason.strip()})",
+            f"cannot be read as a {expected[0]} ({reason.strip()})",
             where=str(path),
-            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {said[1]}",
+            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}",
         ) from None
 
 
 @contextmanager
-def _drakes_errors_raised() -> Iterator[None]:
+def _raise_logged_errors() -> Iterator[None]:
     """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
     errors: list[str] = []
 

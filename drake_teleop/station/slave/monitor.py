@@ -10,7 +10,7 @@ from drake_teleop.station.slave.arm import SLIDES, ArmModel
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
-_BEYOND = 0.01
+_RANGE_TOLERANCE = 0.01
 
 
 class SlaveMonitor(LeafSystem):
@@ -34,14 +34,14 @@ class SlaveMonitor(LeafSystem):
     def __init__(self, arm: ArmModel, period: float) -> None:
         super().__init__()
         self._arm = arm
-        beyond = _BEYOND * (arm.upper - arm.lower)
-        self._lower, self._upper = arm.lower - beyond, arm.upper + beyond
+        tolerance = _RANGE_TOLERANCE * (arm.upper - arm.lower)
+        self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
         self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
         self._status = self.DeclareVectorInputPort("ik_status", 1)
         self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._watch)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
 
-    def _watch(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _check(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._status.HasValue(context):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]

@@ -20,7 +20,7 @@ from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, JointTable, bodies_into
 
 
-def can_be_told(joint: Joint) -> bool:
+def supports_pose(joint: Joint) -> bool:
     """Return True if the joint's positions follow from a pose, see `positions_of`."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)

@@ -40,25 +40,25 @@ MET = 1e-8
 """Tolerance of position [m] and orientation [rad] for a pose that is met."""
 
 # Error that is rounding only [m].
-_EXACT = 1e-14
+_ROUNDING_ERROR_M = 1e-14
 SINGULAR = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
 STEPS = 10
 """Maximum number of steps per command; two or three are typical."""
 # Minimum damping of a step [m^2], which keeps redundant joints at rest.
-_LEAST = 1e-14
+_MIN_DAMPING = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
-_CAUTION, _STEPS_FROM_AFAR, _STARTS = 1e-3, 100, 100
+_INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
 # Ratio |J^T e| / |e| below which the gradient counts as zero [m].
-_STUCK = 1e-3
+_ZERO_GRADIENT = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
-_NEAR = 5e-6
+_REACH_TOLERANCE_M = 5e-6
 # The same for `find_posture`, whose search ends early [m].
-_NEARLY = 1e-3
+_SEARCH_TOLERANCE_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
-_NUDGE, _NUDGE_FROM_AFAR = 0.05, 0.3
+_ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
 # Triple product of the last three axes below which the wrist is singular.
-_ALIGNED = 0.1
+_COPLANAR_AXES = 0.1
 
 _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = (
     map(int, IkStatus)
@@ -66,7 +66,7 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _look(table, L, pose, q, x, J, e):
+def _jacobian_and_error(table, L, pose, q, x, J, e):
     """Compute J (6, n) and error e (6,) at q, rotations times L; return e^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized((pose[0], pose[1], pose[2], pose[3]))
@@ -86,7 +86,7 @@ def _look(table, L, pose, q, x, J, e):
 
 
 @njit(cache=True)
-def _normal(J, H):
+def _normal_matrix(J, H):
     """Set H to J^T J, or to J J^T if H has another size."""
     n = H.shape[0]
     rows = n == J.shape[1]
@@ -103,7 +103,7 @@ def _normal(J, H):
 
 
 @njit(cache=True)
-def _weakest(H, u):
+def _smallest_eigenvalue(H, u):
     """Return the smallest eigenvalue of H (m, m), its vector in u (inverse iteration)."""
     m = H.shape[0]
     M = np.empty((m, m))
@@ -114,7 +114,7 @@ def _weakest(H, u):
         for i in range(m):
             for k in range(m):
                 M[i, k] = H[i, k]
-            M[i, i] += _LEAST
+            M[i, i] += _MIN_DAMPING
         solve_spd(M, u)
         growth = 0.0
         for i in range(m):
@@ -122,7 +122,7 @@ def _weakest(H, u):
         growth = np.sqrt(growth)
         for i in range(m):
             u[i] /= growth
-    return max(1.0 / growth - _LEAST, 0.0)
+    return max(1.0 / growth - _MIN_DAMPING, 0.0)
 
 
 @njit(cache=True)
@@ -131,7 +131,7 @@ def _is_held(q, lower, upper, i, push):
 
 
 @njit(cache=True)
-def _step(H, g, damping, q, lower, upper, trial):
+def _damped_step(H, g, damping, q, lower, upper, trial):
     """Write the damped step from q, within the box, to trial (n,); return its largest component.
 
     Joints at, or driven beyond, a limit are fixed there and the others solved again.
@@ -163,11 +163,12 @@ def _step(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
-def _singular_part(L, J):
+def _singularity_status(L, J):
     """Return WRIST_SINGULAR for nearly coplanar last axes, else SHOULDER_SINGULAR."""
     n = J.shape[1]
     a, b, c = three(J[3:, n - 3], 0), three(J[3:, n - 2], 0), three(J[3:, n - 1], 0)
-    return _WRIST_SINGULAR if abs(dot(a, cross(b, c))) < _ALIGNED * L**3 else _SHOULDER_SINGULAR
+    coplanar = abs(dot(a, cross(b, c))) < _COPLANAR_AXES * L**3
+    return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
 @njit(cache=True)
@@ -178,7 +179,7 @@ def follow_pose(
 
     Args:
         table: `ArmModel.table`.
-        L: `turn_length` [m].
+        L: `orientation_length` [m].
         pose: (7,) X_WS ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any nonzero length.
         reference: (n,) normally the last command [rad, m].
         lower: (n,) limits.
@@ -203,59 +204,63 @@ def follow_pose(
         for i in range(n):
             q[i] = q[i] if sound(reference) else np.nan
         return _BAD_POSE
-    start, drawn = q.copy(), n > 6 and pull > 0.0
-    if drawn:
+    start, towards_posture = q.copy(), n > 6 and pull > 0.0
+    if towards_posture:
         for i in range(n):
             q[i] = min(max(q[i] + pull * (posture[i] - q[i]), low[i]), high[i])
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _look(table, L, pose, q, x, J, e)
-    _normal(J, B)
-    damping = max(singular * singular - _weakest(B, u), 0.0)
-    before, still_to_win = np.inf, 0.0
+    squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+    _normal_matrix(J, B)
+    damping = max(singular * singular - _smallest_eigenvalue(B, u), 0.0)
+    before, expected_gain = np.inf, 0.0
     while True:
         put(anchor, 0, q, 0, n)
-        cost, caution, idle, better = squared, _CAUTION, 0, True
+        cost, relative_damping, stalled_steps, better = squared, _INITIAL_DAMPING, 0, True
         for _ in range(steps):
-            if squared < _EXACT * _EXACT or idle > 3 or caution > 1e9:
+            if (
+                squared < _ROUNDING_ERROR_M * _ROUNDING_ERROR_M
+                or stalled_steps > 3
+                or relative_damping > 1e9
+            ):
                 break
             if better:
-                _normal(J, H)
+                _normal_matrix(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i])
                     for k in range(6):
                         g[i] += J[k, i] * e[k]
-            stiff = damping + max(_LEAST, caution * squared)
-            if _step(H, g, stiff, q, low, high, trial) < _EXACT:
+            stiff = damping + max(_MIN_DAMPING, relative_damping * squared)
+            if _damped_step(H, g, stiff, q, low, high, trial) < _ROUNDING_ERROR_M:
                 break
-            found = _look(table, L, pose, trial, x, J, e)
+            found = _jacobian_and_error(table, L, pose, trial, x, J, e)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
             better = total < cost
             if better:
-                idle = idle + 1 if total > 0.99 * cost else 0
-                squared, cost, caution = found, total, 0.2 * caution
+                stalled_steps = stalled_steps + 1 if total > 0.99 * cost else 0
+                squared, cost, relative_damping = found, total, 0.2 * relative_damping
                 put(q, 0, trial, 0, n)
             else:
-                caution = 10.0 * max(caution, _CAUTION)
-        _look(table, L, pose, q, x, J, e)
-        p, turned = three(e, 0), three(e, 3)
-        if dot(p, p) <= MET * MET and dot(turned, turned) <= L * L * MET * MET:
+                relative_damping = 10.0 * max(relative_damping, _INITIAL_DAMPING)
+        _jacobian_and_error(table, L, pose, q, x, J, e)
+        p, rotation = three(e, 0), three(e, 3)
+        if dot(p, p) <= MET * MET and dot(rotation, rotation) <= L * L * MET * MET:
             return _OK
-        if drawn:
+        if towards_posture:
             # The pose has priority: repeat without the posture.
-            drawn = False
+            towards_posture = False
             put(q, 0, start, 0, n)
-            squared = _look(table, L, pose, q, x, J, e)
+            squared = _jacobian_and_error(table, L, pose, q, x, J, e)
             continue
         if before < np.inf:
-            if squared < (1.0 - 1e-7) * before - still_to_win:
-                return _singular_part(L, J)
+            if squared < (1.0 - 1e-7) * before - expected_gain:
+                return _singularity_status(L, J)
             put(q, 0, kept, 0, n)
-            far = before > _NEAR * _NEAR and still_to_win < 1e-3 * before
-            return _OUT_OF_REACH if far else _singular_part(L, J)
+            far = before > _REACH_TOLERANCE_M * _REACH_TOLERANCE_M and expected_gain < 1e-3 * before
+            return _OUT_OF_REACH if far else _singularity_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
             push = 0.0
@@ -267,23 +272,25 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _STUCK * _STUCK * squared:
-            return _singular_part(L, J) if damping > 0.0 else _SPEED_LIMIT
+        if singular > 0.0 and free > _ZERO_GRADIENT * _ZERO_GRADIENT * squared:
+            return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
         # Gain expected from later samples; without it, every pose would count as reachable.
-        still_to_win = 4.0 * free / max(damping, _LEAST)
+        expected_gain = 4.0 * free / max(damping, _MIN_DAMPING)
         put(kept, 0, q, 0, n)
         # Displace along the weakest direction, in proportion to the error, so that noise does not
         # move the arm.
-        _weakest(H, g)
-        size = min(_NUDGE, 10.0 * np.sqrt(squared) / L) if singular > 0.0 else _NUDGE_FROM_AFAR
-        way = 0.0
+        _smallest_eigenvalue(H, g)
+        size = _SEARCH_ESCAPE_STEP
+        if singular > 0.0:
+            size = min(_ESCAPE_STEP, 10.0 * np.sqrt(squared) / L)
+        slope = 0.0
         for i in range(n):
             for k in range(6):
-                way += g[i] * J[k, i] * e[k]
+                slope += g[i] * J[k, i] * e[k]
         for i in range(n):
-            q[i] = min(max(q[i] + (size if way >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _look(table, L, pose, q, x, J, e)
+            q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
+        squared = _jacobian_and_error(table, L, pose, q, x, J, e)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
@@ -302,29 +309,29 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     ratio = 2.0
     for _ in range(30):
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
-    start, status, L, least = reference, _OUT_OF_REACH, turn_length(arm), np.inf
+    start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
     x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
-    for k in range(_STARTS):
+    for k in range(_SEARCH_STARTS):
         found = follow_pose(
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
-            _STEPS_FROM_AFAR, q,
+            _SEARCH_STEPS, q,
         )  # fmt: skip
         if found in (_OK, _BAD_POSE):
             turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
             nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
             return np.where((lower <= nearer) & (nearer <= upper), nearer, q), IkStatus(found)
-        squared = _look(arm.table, L, pose, q, x, J, e)
-        if squared < least:
-            least, nearest = squared, q.copy()
+        squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
+        if squared < smallest:
+            smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
-            if squared < _NEARLY**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
-                status = _singular_part(L, J)
+            if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
+                status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = lower + part * (upper - lower)
     return nearest, IkStatus(status)
 
 
-def turn_length(arm: ArmModel) -> float:
+def orientation_length(arm: ArmModel) -> float:
     """Return the length [m] that weights orientation against position error: reach / 5."""
     return float(np.linalg.norm(arm.table[:, TRANSLATION:PHI], axis=1).sum()) / 5.0
 
@@ -342,13 +349,13 @@ def _follow_command(
     put(q, 0, last, 0, n)
     if not sound(position):
         return _BAD_POSE
-    reference, max_step, since = q.copy(), np.zeros(n), max(time - last[n], 0.0)
-    if since > 0.0:  # inf * 0 is nan
+    reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)
+    if elapsed > 0.0:  # inf * 0 is nan
         for i in range(n):
-            max_step[i] = speed[i] * since
+            max_step[i] = speed[i] * elapsed
     steps = np.int64(STEPS)  # a literal would compile `follow_pose` again
     return follow_pose(
-        table, L, pose, reference, lower, upper, max_step, posture, min(pull * since, 1.0),
+        table, L, pose, reference, lower, upper, max_step, posture, min(pull * elapsed, 1.0),
         SINGULAR, steps, q,
     )  # fmt: skip
 
@@ -384,7 +391,7 @@ class NumericInverseKinematics(LeafSystem):
         #: Joint speed limits (n,) [rad/s, m/s]; values may be changed in place.
         self.speed_limit = arm.velocity_limit.copy()
         limits = arm.lower, arm.upper, self.speed_limit
-        self._fixed = (arm.table, turn_length(arm), *limits, posture)
+        self._fixed = (arm.table, orientation_length(arm), *limits, posture)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
         self.DeclareDiscreteState(np.append(posture, 0.0))  # last command and its time

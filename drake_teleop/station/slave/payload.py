@@ -11,7 +11,7 @@ from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import quantity
 
-_STEEL = 7850.0  # kg/m^3
+_STEEL_DENSITY = 7850.0  # kg/m^3
 
 
 @settings
@@ -27,7 +27,7 @@ def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
     """Weld the payload to a frame that coincides with S, if it has mass."""
     if payload.mass == 0.0:
         return
-    radius = (payload.mass / _STEEL * 3 / (4 * math.pi)) ** (1 / 3)
+    radius = (payload.mass / _STEEL_DENSITY * 3 / (4 * math.pi)) ** (1 / 3)
     inertia = SpatialInertia.SolidSphereWithMass(payload.mass, radius)
     body = plant.AddRigidBody("payload", holder.model_instance(), inertia)
     weld = WeldJoint("payload_weld", holder, body.body_frame(), RigidTransform(payload.com))

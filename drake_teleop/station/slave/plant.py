@@ -26,14 +26,14 @@ from drake_teleop.station.slave.forward_kinematics import pose_into
 from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.model_check import check_size
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.payload import AddPayload
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.station.slave.tool import AddTool, shapes_reach
 
 # Shapes within this distance of the farthest one share the contact, as two fingers do [m].
-_ABREAST = 1e-3
+_SAME_REACH_M = 1e-3
 #: Name of the arm's model instance in every plant.
 ARM = "arm"
 
@@ -123,10 +123,10 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 def NominalSlave(slave: Slave) -> SlavePlant:
     """Return the slave without environment, from a cache; raises as `AddSlavePlant`."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
-    return _nominal_slave(_Known(slave), written)
+    return _nominal_slave(_HashableSlave(slave), written)
 
 
-class _Known:
+class _HashableSlave:
     """Hashable slave, compared by all values."""
 
     def __init__(self, slave: Slave) -> None:
@@ -136,12 +136,12 @@ class _Known:
         return hash(self._values)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self._values == other._values
+        return isinstance(other, _HashableSlave) and self._values == other._values
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _nominal_slave(known: _Known, _: tuple[int, ...]) -> SlavePlant:
-    return AddSlavePlant(DiagramBuilder(), known.slave, None)
+def _nominal_slave(key: _HashableSlave, _: tuple[int, ...]) -> SlavePlant:
+    return AddSlavePlant(DiagramBuilder(), key.slave, None)
 
 
 def AddSlavePlant(
@@ -169,15 +169,15 @@ def AddSlavePlant(
         plant.set_stiction_tolerance(environment.slip)
     parsed = ParseSlave(plant, slave)
     instance, tool = parsed.instance, parsed.tool
-    touched = None if environment is None else AddEnvironment(plant, environment)
-    with drakes_errors_said(slave.path):
+    surroundings = None if environment is None else AddEnvironment(plant, environment)
+    with translate_drake_errors(slave.path):
         finalize(plant)
     contact = no_contact()
-    if environment is not None and touched is not None:
+    if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
         _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
-        contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
+        contact = ContactWith(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
@@ -245,18 +245,18 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
     if plant.HasModelInstanceNamed(ARM):
         plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
     plant.RenameModelInstance(model.instance, ARM)
-    frame, own = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
+    frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:
         tool = AddTool(plant, slave.tool, frame, slave.packages)
         assumptions += tool.assumptions
         folders += [tool.folder] if tool.folder is not None else []
-        if own:
-            names = ", ".join(body.name() for body in own)
+        if model_bodies:
+            names = ", ".join(body.name() for body in model_bodies)
             assumptions.append(f"{names} of the model on the sensor beside the tool")
         on_sensor, holder = tool.body, tool.body.body_frame()
     else:
-        on_sensor, holder = own[0] if own else frame.body(), frame
+        on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
     AddPayload(plant, holder, slave.payload)
     return ParsedSlave(
         slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions), folders
@@ -332,11 +332,11 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _farthest(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return p_S (3,) in the middle of the shapes that reach farthest along z_S."""
     reach = max(float(hull[:, 2].max()) for hull in hulls)
-    abreast = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _ABREAST]
-    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in abreast]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
 
@@ -357,5 +357,5 @@ def _tip(
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else shapes_reach(slave.tool)
     if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
-        return _farthest(hulls)
+        return _end_of_hulls(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)

@@ -15,7 +15,7 @@ from drake_teleop.station.slave.tool_contact import environment_wrench
 
 
 @njit(cache=True)
-def joined(state, around, x):
+def assemble_state(state, around, x):
     """Write x from [q; v] and [deflection, rate, the plant's state]."""
     n = state.shape[0] // 2
     put(x, 0, state, 0, n)
@@ -39,7 +39,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
         x[half - 1 : 2 * half : half],
         x[2 * half :],
     )
-    if not _is_told(told, x, wrench_W):
+    if not _take_given_wrench(told, x, wrench_W):
         environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
     else:
         applied = np.empty(6)
@@ -49,7 +49,7 @@ def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
 
 
 @njit(cache=True)
-def _is_told(told, x, wrench_W):
+def _take_given_wrench(told, x, wrench_W):
     """Copy the next given contact wrench to `wrench_W` and return True; if missing, request it.
 
     `told` has rows of wrenches (6) after row 0 [number given, number used, x of the request]; it is

@@ -30,7 +30,7 @@ from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
 # and dr/dt (n each), and the queue.
 _COUNT, _OLDEST = 0, 1
 # v^2 = 2 a d with 80 % of the largest acceleration.
-_BRAKES = 2 * 0.8
+_BRAKING_FACTOR = 2 * 0.8
 
 
 @settings
@@ -113,7 +113,7 @@ def _generate(command, interface, limits, memory, reference):
     memory[_COUNT] = (memory[_COUNT] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
-        fastest = min(limits[0, i], math.sqrt(_BRAKES * limits[1, i] * abs(away)))
+        fastest = min(limits[0, i], math.sqrt(_BRAKING_FACTOR * limits[1, i] * abs(away)))
         towards = min(max(away / lookahead, -fastest), fastest)
         wanted = gain * lookahead * (towards - speed[i])
         wanted = min(max(wanted, -limits[1, i]), limits[1, i])
@@ -197,10 +197,10 @@ class PositionServo(LeafSystem):
         )
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
+        zeros, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
         self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
-        memory = np.concatenate([[0.0, 0.0], q_start, q_start, still, *(queued * [q_start])])
+        memory = np.concatenate([[0.0, 0.0], q_start, q_start, zeros, *(queued * [q_start])])
         self.DeclareDiscreteState(memory)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

@@ -25,24 +25,24 @@ from drake_teleop.station.slave.joint_control import (
     servo_numbers,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_rates import joined, plant_rates
+from drake_teleop.station.slave.plant_rates import assemble_state, plant_rates
 
 Array = NDArray[np.float64]
 
 #: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
-_EVENTS = 2000.0
+_EVENT_HZ = 2000.0
 
 
-def samples_within(control_hz: float, hand_hz: float) -> int:
+def samples_per_event(control_hz: float, hand_hz: float) -> int:
     """Return the largest number of servo samples per event with events at 2 kHz or more.
 
     Each operator-side sample remains an event.
     """
-    for_each_hand = control_hz / hand_hz
-    whole = round(for_each_hand)
-    if whole < 1 or abs(for_each_hand - whole) > 1e-9 * whole:
+    ratio = control_hz / hand_hz
+    whole = round(ratio)
+    if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
-    most = max(int(control_hz / _EVENTS), 1)
+    most = max(int(control_hz / _EVENT_HZ), 1)
     return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
 
 
@@ -65,25 +65,25 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
-    seen, wrench_W, nothing = np.empty(2 * n), np.empty(6), np.zeros(6)
-    joined(state, sheet, x)
+    predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
+    assemble_state(state, sheet, x)
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):
-        put(seen, 0, x, 0, n)
-        put(seen, n, x, n + 1, n)
+        put(predicted, 0, x, 0, n)
+        put(predicted, n, x, n + 1, n)
         joint_control_torque(
-            arm, command, seen, servo[0], servo[1], servo[2], servo[3], scratch, torque
+            arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
         )
         for i in range(n):
             now[i] += torque[i]
             rate[i] += (k - 0.5 * (samples - 1)) * torque[i]
         if k == samples - 1:
             break
-        plant_rates(physics, x, torque, nothing, wrench_W, xdot)
+        plant_rates(physics, x, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             half[i] = x[i] + 0.5 * period * xdot[i]
-        plant_rates(physics, half, torque, nothing, wrench_W, xdot)
+        plant_rates(physics, half, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):
@@ -95,7 +95,7 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
 
 
 @njit(cache=True)
-def _on_line(state, time, torque):
+def _evaluate_line(state, time, torque):
     """Write the torque (n,) at `time`; `state` is `line` and its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
@@ -141,9 +141,9 @@ class SampledServo(LeafSystem):
         self._at_rest, self._sheet = np.zeros(2), None
         if slave.sensed_sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
-        self.DeclareDiscreteState(np.concatenate([holding, still, holding, [0.0]]))
+        zeros, holding = np.zeros(n), np.zeros(n)
+        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
+        self.DeclareDiscreteState(np.concatenate([holding, zeros, holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
@@ -152,7 +152,7 @@ class SampledServo(LeafSystem):
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
-        _on_line(line, context.get_time(), output.get_mutable_value())
+        _evaluate_line(line, context.get_time(), output.get_mutable_value())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n

@@ -26,12 +26,12 @@ from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
-from drake_teleop.station.slave.moving_pose import can_be_told
+from drake_teleop.station.slave.moving_pose import supports_pose
 
 #: Folders of converted meshes, kept while the process runs.
-_CONVERTED: list[TemporaryDirectory[str]] = []
-_OWN = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_RESOLUTION = 0.005  # m, of the mesh of the tool's ball
+_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
+_RESERVED_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
+_MESH_RESOLUTION_M = 0.005  # m, of the mesh of the tool's ball
 
 
 @settings
@@ -79,10 +79,10 @@ class Scene(Environment):
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
-            _CONVERTED.append(folder)
+            _MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
-            if body.name() in _OWN:
+            if body.name() in _RESERVED_NAMES:
                 raise DrakeTeleopError(
                     f"a body is called {body.name()}, as one of the station's frames",
                     where=str(path),
@@ -90,15 +90,15 @@ class Scene(Environment):
                 )
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
-            if not can_be_told(joint):
+            if not supports_pose(joint):
                 raise DrakeTeleopError(
                     f"{joint.name()} is of the kind {joint.type_name()}",
                     where=str(path),
                     remedy="let it turn about an axis (several, for more), slide along one, or be"
                     " free",
                 )
-        hung = {joint.child_body().index() for joint in joints}
-        bases = [index for index in map(BodyIndex, added) if index not in hung]
+        attached = {joint.child_body().index() for joint in joints}
+        bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)
         for body in map(plant.get_body, bases):
             if self.fixed:
@@ -125,7 +125,9 @@ class Scene(Environment):
         for shape in own:
             properties = ProximityProperties(inspector.GetProximityProperties(shape))
             if not is_hydroelastic(properties):
-                AddCompliantHydroelasticProperties(_RESOLUTION, self.tool_modulus, properties)
+                AddCompliantHydroelasticProperties(
+                    _MESH_RESOLUTION_M, self.tool_modulus, properties
+                )
                 scene_graph.AssignRole(
                     plant.get_source_id(), shape, properties, RoleAssign.kReplace
                 )

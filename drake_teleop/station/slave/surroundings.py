@@ -19,8 +19,8 @@ from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import JOINT_WIDTH, JointTable
 from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
 
-_SAME = 1e-12  # rounding of frames
-_NO_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
+_FRAME_TOLERANCE = 1e-12  # rounding of frames
+_MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
 class Touched(NamedTuple):
@@ -113,7 +113,7 @@ def ContactWith(
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    if beyond := _beyond(environment, contact):
+    if beyond := _unmodelled_contact(environment, contact):
         return contact._replace(beyond=beyond)
     joints, order = contact.joints, list[int]()
     if contact.moving:
@@ -126,8 +126,8 @@ def ContactWith(
     inspector, slip = scene_graph.model_inspector(), environment.slip
     try:
         found = ContactPairs(plant, inspector, from_S, touched.instances, slip, order)
-    except DrakeTeleopError as endless:
-        return contact._replace(beyond=str(endless))
+    except DrakeTeleopError as error:
+        return contact._replace(beyond=str(error))
     known, watched, unknown = found
     if not len(known):
         return contact._replace(beyond=unknown or "nothing has a shape")
@@ -140,14 +140,14 @@ def _X_SBody(
 ) -> RigidTransform:
     frame = plant.get_body(index).body_frame()
     X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-    return RigidTransform() if X_SBody.IsNearlyIdentity(_SAME) else X_SBody
+    return RigidTransform() if X_SBody.IsNearlyIdentity(_FRAME_TOLERANCE) else X_SBody
 
 
 def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
     if not contact.moving:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-    if not inertia.min() > _NO_INERTIA:
+    if not inertia.min() > _MIN_INERTIA:
         bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
@@ -157,7 +157,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> 
         )
 
 
-def _beyond(environment: Environment, contact: Contact) -> str:
+def _unmodelled_contact(environment: Environment, contact: Contact) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
     if contact.sheet is not None and len(environment.parts) > 1:
@@ -176,12 +176,12 @@ def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _plain(body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()): (
-            body.index()
-        )
+        _signal_name(
+            body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
+        ): (body.index())
         for body in moving
     }
 
 
-def _plain(name: str) -> str:
+def _signal_name(name: str) -> str:
     return re.sub(r"\W+", "_", name)

@@ -16,7 +16,7 @@ from drake_teleop.common.quantities import plain, quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
-_STEEL = 7850.0  # kg/m^3
+_STEEL_DENSITY = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
 _STIFFNESS, _DISSIPATION, _FRICTION = 4e5, 1.0, 0.2
 _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
@@ -154,4 +154,4 @@ def _inertia(tool: Tool) -> SpatialInertia:
 
 def _radius(tool: Tool) -> float:
     """Return the radius of a steel ball with the tool's mass [m]."""
-    return float((tool.mass / _STEEL * 3 / (4 * np.pi)) ** (1 / 3))
+    return float((tool.mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))

@@ -22,8 +22,8 @@ from drake_teleop.station.slave.surroundings import Contact
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 FAR, TOUCHING, WATCHED = range(3)
-_WATCHED_FROM = 0.02  # m, larger than any motion between two checks
-_ROUNDING = 1e-9  # m
+_WATCHED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_TOUCH_TOLERANCE_M = 1e-9  # m
 
 
 @njit(cache=True)
@@ -40,11 +40,11 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
         state: the plant's [q; v], unused without joints.
         wrench_W: (6,) output [N, N m].
     """
-    acts = pairs.shape[0] > 0
+    has_wrench = pairs.shape[0] > 0
     for i in range(6):
         wrench_W[i] = applied_W[i]
-        acts = acts or applied_W[i] != 0.0
-    if not acts:
+        has_wrench = has_wrench or applied_W[i] != 0.0
+    if not has_wrench:
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
@@ -53,7 +53,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
         depth = indentation(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -63,21 +63,21 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
             put(twist, 0, J @ v, 0, 6)
             has_twist = True
         lever = minus(three(normal, 3), p_WS)
-        moving = plus(three(twist, 0), cross(three(twist, 3), lever))
+        point_velocity = plus(three(twist, 0), cross(three(twist, 3), lever))
         for i in range(3):
-            velocity[i] = moving[i] - pair[19 + i] * sheet[1]
+            velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
         if pair[BODY] >= 0.0:
             body = bodies[int(pair[BODY])]
             lever = minus(three(normal, 3), three(body, 4))
-            moving = plus(three(body, 10), cross(three(body, 7), lever))
+            point_velocity = plus(three(body, 10), cross(three(body, 7), lever))
             for i in range(3):
-                velocity[i] -= moving[i]
+                velocity[i] -= point_velocity[i]
         contact_force(pair, depth, normal[:3], velocity, force)
         add_force(wrench_W, normal[3:], force)
 
 
 @njit(cache=True)
-def _place(pair, bodies, placed):
+def _place_box(pair, bodies, placed):
     """Return `placed` (28,): the pair with its box at its body's pose."""
     body = bodies[int(pair[BODY])]
     put(placed, 0, pair, 0, WIDTH)
@@ -98,14 +98,14 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
         if pair[BODY] >= 0.0:
-            _place(pair, bodies, placed)
+            _place_box(pair, bodies, placed)
         else:
             put(placed, 0, pair, 0, WIDTH)
-        if apart(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
+        if apart(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
             return WATCHED
     for pair in pairs:
-        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_ROUNDING:
+        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
             return TOUCHING
     return FAR
 
