@@ -118,8 +118,8 @@ def test_one_friction_value_applies_to_all_joints():
     ("friction", "expected"),
     [
         ([1.0, 2.0], "slave.friction: has 2 numbers, the arm has 6 joints"),
-        ([-1.0], "slave.friction: has to be a list of finite numbers from 0 on"),
-        ([float("nan")], "slave.friction: has to be a list"),
+        ([-1.0], "slave.friction: must be a list of finite numbers >= 0"),
+        ([float("nan")], "slave.friction: must be a list"),
         ([4.0], "slave.friction: the friction stops a joint within 0.0.. ms, too fast for steps"),
     ],
 )

@@ -50,7 +50,7 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
     else:
-        remedy = "move it, or give slave.home: joint positions of a posture that the arm can take"
+        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
         raise DrakeTeleopError(
             f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
@@ -85,9 +85,9 @@ def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
     """Raise DrakeTeleopError for a joint without inertia or with too weak a motor."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA:
         raise DrakeTeleopError(
-            "nothing resists a torque: its links have too little inertia for its joints",
+            "the mass matrix is singular: the links have too little inertia",
             where="slave.model",
-            remedy="give the links their masses and inertias, or the joints rotor inertias",
+            remedy="give masses and inertias of the links, or rotor inertias of the joints",
         )
     zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
     inverse_dynamics(arm.table, q, zeros, zeros, torque)

@@ -31,13 +31,17 @@ COMPUTED_TORQUE = "computed_torque"
 class JointControlConfig:
     """Joint control of the slave: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
-    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
+    position_bandwidth_hz: float = quantity(
+        12.0, "Hz", 0.1, 1e4, "bandwidth of the position loop (E)"
+    )
+    velocity_bandwidth_hz: float = quantity(
+        70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
+    )
     servo: str = choice(
         COMPUTED_TORQUE,
         (COMPUTED_TORQUE, *INTERFACES, "position"),
-        "computed_torque has the bandwidths above; the others are arms that take positions, by"
-        " name or, position, by `interface` alone",
+        "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
+        " position for the fields of `interface`",
     )
     interface: PositionInterface | None = None
 
@@ -66,7 +70,7 @@ class JointControlConfig:
         """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE and self.interface is not None:
             raise DrakeTeleopError(
-                "computed torque takes the bandwidths, not an interface",
+                "computed torque uses bandwidths, not an interface",
                 where=f"{where}.interface",
                 remedy="leave it out, or choose another servo, such as position",
             )
@@ -78,10 +82,10 @@ class JointControlConfig:
         """Raise DrakeTeleopError, with subject `what`, if the servo is not computed torque."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
-                f"{what} does not know the servo {self.servo}",
+                f"{what} does not support the servo {self.servo}",
                 where="joint_control.servo",
                 remedy=f"choose {COMPUTED_TORQUE}, with a position_bandwidth_hz of"
-                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` has them all",
+                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` supports every servo",
             )
 
 

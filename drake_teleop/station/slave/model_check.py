@@ -76,10 +76,10 @@ def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
         f"{what} {', '.join(names)}"
         for what, names in (
             ("no inertia of", massless),
-            ("1 kg, as SDF has it, for", one_kg),
-            ("an inertia of rounded numbers made a body's for", rounded),
-            ("a body's inertia, which no joint of the arm moves, for", corrected),
-            ("not the model's own dry friction of", with_friction),
+            ("1 kg, the default of SDF, for", one_kg),
+            ("an inertia corrected for rounding of", rounded),
+            ("an inertia corrected, which no joint of the arm moves, of", corrected),
+            ("no dry friction, which the model has, of", with_friction),
         )
         if names
     ]
@@ -134,7 +134,7 @@ def _check_scope(scope: Element, where: str) -> None:
         raise DrakeTeleopError(
             f"{roots[0]} and {roots[1]} are both the child of no joint",
             where=where,
-            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
+            remedy="a URDF has one root: connect the other links by joints, or remove them",
         )
 
 
@@ -176,7 +176,7 @@ def _check_limit(limit: Element, where: str) -> None:
             raise DrakeTeleopError(
                 f"{name} {text} is not finite",
                 where=where,
-                remedy="leave out what has no limit: what is assumed will be said",
+                remedy="leave the limit out; the assumed limit is reported",
             )
 
 
@@ -282,5 +282,5 @@ def check_size(arm: ArmModel, where: str) -> None:
         # Root mean square distance of the mass from the joint's origin.
         distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
         if distance > _MAX_LENGTH_M:
-            what = f"what {name} moves is {distance:.3g} m away from it"
+            what = f"the mass moved by {name} is {distance:.3g} m away from it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -149,11 +149,11 @@ def ParseTool(
     bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
-        names = ", ".join(body.name() for body in roots)
+        names = ", ".join(body.name() for body in roots) or "none"
         raise DrakeTeleopError(
-            f"{names or 'nothing'} can be put on the sensor",
+            f"the tool has {len(roots)} roots: {names}",
             where=str(path),
-            remedy="a tool is one tree of links, whose root is put on the sensor frame",
+            remedy="give one tree of links; its root is welded to the sensor frame",
         )
     with translate_drake_errors(path):
         assumptions = [*read.assumptions, *_weld_other_joints(plant, before, [])]
@@ -173,7 +173,9 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
     missing += [f"{name} {what}" for name, what in read.collect(unsupported_joints).items()]
     if missing:
         raise DrakeTeleopError(
-            missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
+            missing[0],
+            where=str(path),
+            remedy="correct it; every object that the tool could touch must be readable",
         )
     return read.folder
 
@@ -237,9 +239,9 @@ def _parse(
                 instances = parser.AddModels(str(path))
     if expected is _ROBOT and plant.num_force_elements() > forces:
         raise DrakeTeleopError(
-            "has springs, or other forces of its own",
+            "has springs or other force elements",
             where=str(path),
-            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
+            remedy="remove them; only motors, gravity and contact move the arm",
         )
     return _ModelContent(instances, list(roots.values()), assumptions, converted)
 
@@ -262,9 +264,9 @@ def _check_free_bodies(
     for index in (k for instance in instances for k in plant.GetBodyIndices(instance)):
         if index not in held:
             raise DrakeTeleopError(
-                f"{plant.get_body(index).name()} hangs on nothing, beside the arm",
+                f"{plant.get_body(index).name()} is not connected to the arm",
                 where=where,
-                remedy="take it out, and put what there is to touch into the environment",
+                remedy="remove it; list objects that the tool touches in environment",
             )
 
 
@@ -418,8 +420,8 @@ def _weld_base(
         plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
     elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
         raise DrakeTeleopError(
-            f"the model fastens {chain[-1].child_body().name()} to the world itself",
+            f"the model welds {chain[-1].child_body().name()} to the world itself",
             where=where,
-            remedy="leave the base pose out, or take that joint out of the model",
+            remedy="leave slave.base_pose out, or remove that joint from the model",
         )
     return [joint.index() for joint in reversed(chain)]

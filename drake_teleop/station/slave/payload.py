@@ -19,8 +19,8 @@ _STEEL_DENSITY = 7850.0  # kg/m^3
 class Payload:
     """A ball of steel, welded to the tool, without a collision shape; part of the load."""
 
-    mass: float = quantity(0.0, "kg", 0.0, 10.0, "0: the tool holds nothing")
-    com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "its centre, p_SoBcm_S")
+    mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
+    com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
 
 
 def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:

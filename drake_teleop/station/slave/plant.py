@@ -234,7 +234,7 @@ class ParsedSlave:
         check_size(arm, str(self.slave.path))
         arm, assumed = with_all_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"with {arm.num_joints} joints the tool follows as far as it can")
+            assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
 
 

@@ -38,16 +38,20 @@ _BRAKING_FACTOR = 2 * 0.8
 class PositionInterface:
     """Position interface of an arm, see `position_servo`; m/s for prismatic joints."""
 
-    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "how often it takes a command")
+    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
     dead_time: float = quantity(
-        0.004, "s", 0.0, 1.0, "until it acts on one; whole periods of command_hz"
+        0.004, "s", 0.0, 1.0, "dead time of a command; whole periods of command_hz"
     )
-    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "from an error to acceleration")
-    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "by which it lags behind a steady motion")
-    max_speed: float = quantity(math.pi, "rad/s", 1e-3, 100.0, "of a joint, or its own limit")
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "of a joint")
+    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per position error")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
+    max_speed: float = quantity(
+        math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
+    )
+    max_acceleration: float = quantity(
+        40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
+    )
     drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "of the drives, which follow what is generated: how stiff it is"
+        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets the joint stiffness"
     )
 
     def check(self, where: str, rate: float) -> None:

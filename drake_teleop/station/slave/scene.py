@@ -44,19 +44,21 @@ class Scene(Environment):
         ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
     )
     position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of what hangs on nothing in the file, in W"
+        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots of the file, in W"
     )
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of it"
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
     )
-    fixed: bool = plain(True, "what hangs on nothing is welded there; false: it can be pushed")
+    fixed: bool = plain(True, "weld free roots of the file there; false: they float")
     contact: str = choice(
-        "point", ("point", "hydroelastic"), "Drake's model; what cannot be hydroelastic has points"
+        "point",
+        ("point", "hydroelastic"),
+        "Drake's contact model; shapes that are not hydroelastic use point",
     )
     tool_modulus: float = quantity(
         1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool's shapes (E)"
     )
-    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
+    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
     def path(self) -> Path:
@@ -84,7 +86,7 @@ class Scene(Environment):
         for body in map(plant.get_body, map(BodyIndex, added)):
             if body.name() in _RESERVED_NAMES:
                 raise DrakeTeleopError(
-                    f"a body is called {body.name()}, as one of the station's frames",
+                    f"the body name {body.name()} is reserved for the station",
                     where=str(path),
                     remedy="give it another name in the file",
                 )
@@ -92,10 +94,9 @@ class Scene(Environment):
         for joint in joints:
             if not supports_pose(joint):
                 raise DrakeTeleopError(
-                    f"{joint.name()} is of the kind {joint.type_name()}",
+                    f"{joint.name()} has the unsupported type {joint.type_name()}",
                     where=str(path),
-                    remedy="let it turn about an axis (several, for more), slide along one, or be"
-                    " free",
+                    remedy="use revolute, prismatic, fixed or free joints",
                 )
         attached = {joint.child_body().index() for joint in joints}
         bases = [index for index in map(BodyIndex, added) if index not in attached]

@@ -65,7 +65,7 @@ def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoA
     Raises:
         DrakeTeleopError: for a servo other than computed torque.
     """
-    config.check_computed_torque("what a method is told of the arm")
+    config.check_computed_torque("the servo model of the passivity methods")
     inertia = operational_inertia(arm, q)
     blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
     unit = 1 / np.sqrt(np.repeat(blocks, 3))

@@ -29,38 +29,39 @@ class Slave:
     inverse_kinematics: str = choice(
         AUTOMATIC,
         (AUTOMATIC, *METHODS),
-        "how a pose becomes joint angles: closed_form is that of arms like the RX90; numeric, for"
-        " any arm, keeps their speeds; automatic takes the first where it can",
+        "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
+        " speeds; automatic: closed_form where possible",
     )
     model: str = plain(
-        "", "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; else an RX90"
+        "",
+        "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90",
     )
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in model and tool, from the scenario's folder"
     )
     base_pose: list[float] = quantity(
-        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: its place; roll, pitch, yaw"
+        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
     )
     sensor_frame: str = plain(
         "sensor", "frame or link of the model at which the sensor measures: S; z_S towards the tool"
     )
     home: list[float] = plain(
-        [], "joint positions to start at [rad, m]; by default found for position"
+        [], "joint positions at the start [rad, m]; default: computed from position"
     )
     friction: list[float] = plain(
         [],
-        "dry friction of the joints [N m, N], one for all or each, which joint control does not"
-        " know; by default none",
+        "dry friction of the joints [N m, N], one for all or each, not compensated by joint"
+        " control; default: none",
     )
     tool: Tool | None = field(
         default_factory=Tool,
-        metadata={"doc": "what hangs on the sensor; null: what the model has beyond its frame"},
+        metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
 
     tip: list[float] = plain(
         [],
-        "p_STip [m], where contact is made; by default the tool's frame of that name, or how far"
-        " its shapes reach along z_S",
+        "contact point p_STip [m]; default: the tool's frame `tip`, or the end of its shapes along"
+        " z_S",
     )
 
     @property
@@ -86,13 +87,13 @@ class Slave:
         """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
-                "has to be a list of finite numbers from 0 on", where=f"{where}.friction"
+                "must be a list of finite numbers >= 0", where=f"{where}.friction"
             )
         for name, length in (("home", len(self.home)), ("tip", 3)):
             values = getattr(self, name)
             if values and (len(values) != length or not all(np.isfinite(values))):
                 raise DrakeTeleopError(
-                    "has to be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
+                    "must be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
                     where=f"{where}.{name}",
                 )
         if self.tool is not None:

@@ -27,7 +27,7 @@ _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 class Ball:
     """A ball that can make contact."""
 
-    radius: float = quantity(0.012, "m", 1e-4, 1.0, "of the ball")
+    radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
 
     @property
@@ -69,15 +69,15 @@ class Tool:
 
     model: str = plain("", "file of a tool: its root link is put on S")
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
-    com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "its centre, p_SoBcm_S")
+    com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
         [0.0] * 6,
         "kg m^2",
         -10.0,
         10.0,
-        "about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel's",
+        "about the centre of mass: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel",
     )
-    shapes: list[Ball | Block] = plain([], "what of it may touch: !Ball, !Block")
+    shapes: list[Ball | Block] = plain([], "collision shapes: !Ball, !Block")
 
     @property
     def path(self) -> Path:
@@ -88,14 +88,12 @@ class Tool:
         """Raise DrakeTeleopError for file and mass, shapes without mass, or an invalid inertia."""
         if self.model and self.mass:
             raise DrakeTeleopError(
-                "both a file and a mass say what the tool is",
+                "both a file and a mass define the tool",
                 where=f"{where}.mass",
                 remedy="leave one of them out",
             )
         if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            raise DrakeTeleopError(
-                "a tool of its own shapes or inertia needs a mass", where=f"{where}.mass"
-            )
+            raise DrakeTeleopError("shapes and inertia require a mass", where=f"{where}.mass")
         if not _inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
                 "no body has this inertia",
