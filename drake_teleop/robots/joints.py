@@ -11,7 +11,7 @@ from drake_teleop.robots.streams import JOINTS, POSE, Part, PartSource
 
 
 class SensorPoseOfJoints(Protocol):
-    """The kinematics of an arm, such as `drake_teleop.station.slave.joint_poses.Arm`."""
+    """The kinematics of an arm, such as `drake_teleop.station.slave.plant.Arm`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -24,11 +24,10 @@ from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.ik_methods import ik_method_name
-from drake_teleop.station.slave.monitor import SlaveMonitor
+from drake_teleop.station.slave.joint_commands import SlaveMonitor, ik_method_name
+from drake_teleop.station.slave.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.skeleton import AddSkeleton
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Block, Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.slave.joint_trajectory import JointTrajectory
+from drake_teleop.station.slave.joint_commands import JointTrajectory
 
 
 def test_trajectory_rests_before_and_after_one_period():

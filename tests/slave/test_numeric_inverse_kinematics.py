@@ -15,12 +15,12 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import ArmModel, jacobian
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.ik_methods import METHODS
 from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
     solve_pose_command,
 )
+from drake_teleop.station.slave.joint_commands import IK_METHODS
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
     MET,
     SINGULAR,
@@ -351,7 +351,7 @@ def test_posture_rate_is_independent_of_period(seven, period, left):
 
 
 def test_methods_have_the_same_ports(rx90):
-    systems = [make(rx90.arm, BENT, PERIOD) for make in METHODS.values()]
+    systems = [make(rx90.arm, BENT, PERIOD) for make in IK_METHODS.values()]
     assert {type(system) for system in systems} == {InverseKinematics, NumericInverseKinematics}
     for ports in ("input", "output"):
         names = [
@@ -370,7 +370,7 @@ def test_station_gives_same_result_with_both_methods(rx90):
     scenario = replace(scenario, simulation__duration=0.04, load_estimator__enabled=True)
     commands = [
         simulate(MakeTeleopStation(s), s.simulation)["joint_command"]
-        for s in (replace(scenario, slave__inverse_kinematics=method) for method in METHODS)
+        for s in (replace(scenario, slave__inverse_kinematics=method) for method in IK_METHODS)
     ]
     assert np.ptp(commands[0], axis=0).max() > 1e-3
     np.testing.assert_allclose(commands[1], commands[0], atol=1e-8)

@@ -15,9 +15,8 @@ from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inerti
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance
-from drake_teleop.station.slave.payload import Payload
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import Payload, Slave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])

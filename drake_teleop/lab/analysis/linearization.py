@@ -40,7 +40,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.ik_methods import AUTOMATIC, ik_method_name
+from drake_teleop.station.slave.joint_commands import AUTOMATIC, ik_method_name
 from drake_teleop.station.slave.plant import ARM, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 

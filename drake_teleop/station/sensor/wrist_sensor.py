@@ -75,8 +75,7 @@ from drake_teleop.station.slave.arm import (
     forward_kinematics,
     sensor_motion,
 )
-from drake_teleop.station.slave.contact_twin import ContactTwin
-from drake_teleop.station.slave.drake_contact import contact_wrench_W
+from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
 from drake_teleop.station.slave.plant_rates import assemble_state, plant_rates, rates_under
 from drake_teleop.station.slave.tool_contact import (

@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quaternions import quaternion_of
 from drake_teleop.common.vectors import (
     add_into,
     apply,
@@ -288,6 +291,13 @@ def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Arr
         tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
 
 
+def holding_torque(arm: ArmModel, q: Array) -> Array:
+    """Return the joint torques (n,) [N m] that hold the arm at rest at q (n,)."""
+    zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
+    inverse_dynamics(arm.table, q, zeros, zeros, torque)
+    return torque
+
+
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
     """Add a link's inertia about Wo, in W, in the order of phi."""
@@ -391,3 +401,41 @@ def forward_dynamics(
             vdot_out[row] += dry_friction(table[row, FRICTION], v[row])
     _mass_matrix(table, link, inertia, M)
     solve_spd(M, vdot_out)
+
+
+@njit(cache=True)
+def pose_into(arm, q, pose):
+    """Write X_WS (7,) [qw qx qy qz px py pz] of the arm table at q (n,) [rad]."""
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm, q, R, p)
+    orientation = quaternion_of(R)
+    for i in range(4):
+        pose[i] = orientation[i]
+    for i in range(3):
+        pose[4 + i] = p[i]
+
+
+class ForwardKinematics(LeafSystem):
+    """Pose of the slave's sensor frame.
+
+    .. pydrake_system::
+
+        name: ForwardKinematics
+        input_ports:
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        output_ports:
+        - pose_slave: (7,) X_WS
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel) -> None:
+        super().__init__()
+        self._arm = arm.table
+        self._n = arm.num_joints
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        inputs = {self._state.ticket()}
+        self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc), inputs)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())

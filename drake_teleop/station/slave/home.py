@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.arm import SLIDES, ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import SLIDES, ArmModel, holding_torque
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.servo import mass_matrix
@@ -89,8 +89,7 @@ def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
             where="slave.model",
             remedy="give masses and inertias of the links, or rotor inertias of the joints",
         )
-    zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
-    inverse_dynamics(arm.table, q, zeros, zeros, torque)
+    torque = holding_torque(arm, q)
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())
     if share[k] > 1.0:

@@ -20,7 +20,7 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface, PositionServo
 
 COMPUTED_TORQUE = "computed_torque"
@@ -159,9 +159,8 @@ class JointControl(LeafSystem):
         self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        zeros, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
-        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
+        holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
+        self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -6,6 +6,7 @@ import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -17,18 +18,17 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.read.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION, ArmModel
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.assumed_limits import with_all_limits
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
 from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.model_check import check_size
 from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
-from drake_teleop.station.slave.payload import AddPayload
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.station.slave.tool import AddTool, shapes_reach
 
@@ -359,3 +359,33 @@ def _tip(
     if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
         return _end_of_hulls(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """Joint names from the base outwards, and `ArmModel.table`."""
+
+    joint_names: tuple[str, ...]
+    table: Array
+
+    def pose(self, q: Array) -> Array:
+        """Return X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self.table, q, R_WS, p_WS)
+        return np.concatenate([quaternions(R_WS[None])[0], p_WS])
+
+
+def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
+    """Return the kinematics of the arm in a model file.
+
+    Raises:
+        DrakeTeleopError: if the model cannot be read or is no serial arm.
+    """
+    plant = MultibodyPlant(0.0)
+    with translate_drake_errors(model):
+        parsed = ParseModel(plant, model, sensor_frame, package_paths)
+        finalize(plant)
+        found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    arm = Arm(found.joint_names, found.table)
+    arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
+    return arm

@@ -24,7 +24,7 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import quantity
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
 # Memory: periods since the last command, index of the oldest command in the queue; then target, r
 # and dr/dt (n each), and the queue.
@@ -201,10 +201,9 @@ class PositionServo(LeafSystem):
         )
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        zeros, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
-        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
-        memory = np.concatenate([[0.0, 0.0], q_start, q_start, zeros, *(queued * [q_start])])
+        holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
+        self.DeclareStateOutputPort("joint_torque", holding)
+        memory = np.concatenate([[0.0, 0.0], q_start, q_start, np.zeros(n), *(queued * [q_start])])
         self.DeclareDiscreteState(memory)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

@@ -18,7 +18,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import inverse_dynamics
+from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
     joint_control_torque,
@@ -141,9 +141,8 @@ class SampledServo(LeafSystem):
         self._at_rest, self._sheet = np.zeros(2), None
         if slave.sensed_sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        zeros, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, zeros, zeros, holding)
-        self.DeclareDiscreteState(np.concatenate([holding, zeros, holding, [0.0]]))
+        holding = holding_torque(arm, q_start)
+        self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)

@@ -26,7 +26,7 @@ from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
-from drake_teleop.station.slave.moving_pose import supports_pose
+from drake_teleop.station.slave.surroundings import supports_pose
 
 #: Folders of converted meshes, kept while the process runs.
 _MESH_FOLDERS: list[TemporaryDirectory[str]] = []

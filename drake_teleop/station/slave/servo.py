@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, inverse_dynamics, jacobian
+from drake_teleop.station.slave.arm import (
+    ArmModel,
+    forward_dynamics,
+    holding_torque,
+    inverse_dynamics,
+    jacobian,
+)
 from drake_teleop.station.slave.joint_control import JointControlConfig
 
 Array = NDArray[np.float64]
@@ -15,11 +21,10 @@ Array = NDArray[np.float64]
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
     """Return M(q) (n, n) with rotors and tool, by inverse dynamics of unit accelerations."""
-    still, weight = np.zeros(len(q)), np.empty(len(q))
-    inverse_dynamics(arm.table, q, still, still, weight)
+    zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
     columns = np.empty((len(q), len(q)))
     for unit, column in zip(np.eye(len(q)), columns, strict=True):
-        inverse_dynamics(arm.table, q, still, unit, column)
+        inverse_dynamics(arm.table, q, zeros, unit, column)
         column -= weight
     return columns.T
 

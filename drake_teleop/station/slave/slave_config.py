@@ -1,4 +1,4 @@
-"""Settings of the slave in a scenario: arm, base pose, start and tool."""
+"""Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -7,14 +7,24 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.resources import models_dir
-from drake_teleop.station.slave.ik_methods import AUTOMATIC, METHODS
-from drake_teleop.station.slave.payload import Payload
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.joint_commands import AUTOMATIC, IK_METHODS
+from drake_teleop.station.slave.tool import Tool, steel_ball_radius
+
+
+@settings
+@dataclass
+class Payload:
+    """A ball of steel, welded to the tool, without a collision shape; part of the load."""
+
+    mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
+    com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
 
 
 @settings
@@ -28,7 +38,7 @@ class Slave:
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
         AUTOMATIC,
-        (AUTOMATIC, *METHODS),
+        (AUTOMATIC, *IK_METHODS),
         "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
         " speeds; automatic: closed_form where possible",
     )
@@ -114,3 +124,13 @@ class Slave:
             package_paths=[found(path) for path in self.package_paths],
             tool=tool,
         )
+
+
+def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
+    """Weld the payload to a frame that coincides with S, if it has mass."""
+    if payload.mass == 0.0:
+        return
+    inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))
+    body = plant.AddRigidBody("payload", holder.model_instance(), inertia)
+    weld = WeldJoint("payload_weld", holder, body.body_frame(), RigidTransform(payload.com))
+    plant.AddJoint(weld)

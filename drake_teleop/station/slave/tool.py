@@ -131,7 +131,7 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     friction = CoulombFriction(_FRICTION, _FRICTION)
     AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
     if not tool.shapes:  # for the 3D replay
-        seen = RigidTransform(tool.com), Sphere(_radius(tool))
+        seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
     for k, each in enumerate(tool.shapes):
         name = f"tool_{k}"
@@ -143,13 +143,13 @@ def _inertia(tool: Tool) -> SpatialInertia:
     if tool.mass == 0.0:
         return SpatialInertia.Zero()
     if not any(tool.inertia):
-        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, _radius(tool))
+        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, steel_ball_radius(tool.mass))
         return about_com.Shift(np.negative(tool.com))
     xx, xy, xz, yy, yz, zz = np.array(tool.inertia) / tool.mass
     about_S = UnitInertia(xx, yy, zz, xy, xz, yz).ShiftFromCenterOfMass(np.negative(tool.com))
     return SpatialInertia(tool.mass, tool.com, about_S, skip_validity_check=True)
 
 
-def _radius(tool: Tool) -> float:
-    """Return the radius of a steel ball with the tool's mass [m]."""
-    return float((tool.mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))
+def steel_ball_radius(mass: float) -> float:
+    """Return the radius [m] of a steel ball with a mass [kg]."""
+    return float((mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))
