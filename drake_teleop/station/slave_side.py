@@ -29,13 +29,12 @@ from drake_teleop.station.slave.joint_commands import (
     SlaveMonitor,
     ik_method_name,
 )
-from drake_teleop.station.slave.joint_control import MakeJointControl
+from drake_teleop.station.slave.joint_control import MakeJointControl, mass_matrix
 from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
+from drake_teleop.station.slave.plant_dynamics import ToolContact
 from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
-from drake_teleop.station.slave.servo import mass_matrix
 from drake_teleop.station.slave.surroundings import MovingPose
-from drake_teleop.station.slave.tool_contact import ToolContact
 from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]

@@ -34,17 +34,17 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromDa
 from drake_teleop.station.simulation import MakeSimulator, simulate
 from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.scene import Scene
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
-from drake_teleop.station.slave.tool import Block as ToolBox
-from drake_teleop.station.slave.tool_contact import (
+from drake_teleop.station.slave.plant_dynamics import (
     FAR,
     TOUCHING,
     WATCHED,
     environment_wrench,
     nearness,
 )
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.tool import Block as ToolBox
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """

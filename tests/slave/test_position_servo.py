@@ -11,10 +11,9 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_control import MakeJointControl
+from drake_teleop.station.slave.joint_control import MakeJointControl, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface
-from drake_teleop.station.slave.servo import servo_at_tool
 
 HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 PERIOD = 5e-4

@@ -11,8 +11,8 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import inverse_dynamics, jacobian
 from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.joint_control import operational_inertia, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.servo import operational_inertia, servo_at_tool
 
 SCENARIO = Scenario()
 

@@ -14,8 +14,8 @@ from drake_teleop.station.environment.point_contact import ContactPairs, apart
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant_dynamics import environment_wrench
 from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool_contact import environment_wrench
 
 
 def drake_wrench(plant, context, tool) -> np.ndarray:

@@ -24,9 +24,9 @@ from drake_teleop.station.environment.wall import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, SlavePlant
-from drake_teleop.station.slave.servo import mass_matrix
 
 Array = NDArray[np.float64]
 

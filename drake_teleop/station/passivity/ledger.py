@@ -85,7 +85,7 @@ Translation and rotation are two groups with a ledger each; what is touched is o
 packets were missing, or it has changed, the wrench goes over gradually. Not for a wall that goes:
 that would be felt for longer than the news takes, and a hand that falls into it is not braked for
 what pushed it before. A wrench against n is another contact. In a station the mass is that of its
-arm at the start, see `slave.servo`. It is 54 kg in its heaviest direction and counts as 79 kg,
+arm at the start (`slave.joint_control`). It is 54 kg in its heaviest direction and counts as 79 kg,
 since it may turn too: with R_s = 0.1 J it goes no faster than 0.2 m/s. A task at v needs
 R_s = k_f m v^2 / 2. With sigma > 0 weight and inertia of the slave's load are felt as well, and are
 no contact: what is touched, its direction, stiffness and prediction are of the contact's wrench w

@@ -18,7 +18,7 @@ port, to rounding. A step that costs more than was stored leaves E negative unti
 The port is that of hand and slave's *motors*, and so no energy comes out at the slave's actual
 motion either, as long as the servo's K and D are those that were told: with 20 % more or less a
 third of an adversary's runs create some. By default that is the servo of the reference of one
-degree of freedom; a station's is stiffer (`drake_teleop.station.slave.servo`), and has to be told.
+degree of freedom; a station's is stiffer (`slave.joint_control`), and has to be told.
 
 At the slave spring and damper are the servo's, and the wanted position is the received pose. At the
 hand the wanted position is where a spring K_h shows the received wrench, x + f / K_h, next to a

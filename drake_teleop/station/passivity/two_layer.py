@@ -15,7 +15,7 @@ What is sent leaves the tank *before* that is asked. So the tanks are never over
 and slave's *motors*, whatever the network does, as long as the hand and the walls accelerate no
 more than `acceleration`, and the servo's K, D and the slave's mass m (or more) are those that were
 told: by default those of the reference of one degree of freedom; a station's arm is stiffer and
-heavier (`drake_teleop.station.slave.servo`), so these values must be set. The energy at the actual
+heavier (`slave.joint_control`), so these values must be set. The energy at the actual
 motion is then never negative either: energy of the motors that the wall does not get moves the
 slave or is lost in friction. A tank that was overdrawn all the same carries its deficit.
 

@@ -77,13 +77,15 @@ from drake_teleop.station.slave.arm import (
 )
 from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_rates import assemble_state, plant_rates, rates_under
-from drake_teleop.station.slave.tool_contact import (
+from drake_teleop.station.slave.plant_dynamics import (
     FAR,
     TOUCHING,
     WATCHED,
+    assemble_state,
     environment_wrench,
     nearness,
+    plant_rates,
+    rates_under,
 )
 
 Array = NDArray[np.float64]

@@ -17,8 +17,8 @@ from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, Leaf
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant_dynamics import add_force
 from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool_contact import add_force
 
 
 def contact_wrench_W(

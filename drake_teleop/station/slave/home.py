@@ -11,8 +11,8 @@ from pydrake.math import RotationMatrix
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import SLIDES, ArmModel, holding_torque
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.servo import mass_matrix
 from drake_teleop.station.slave.slave_config import Slave
 
 # Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.

@@ -7,7 +7,7 @@ Computed torque decouples the joints.
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,16 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
+from drake_teleop.station.slave.arm import (
+    ArmModel,
+    forward_dynamics,
+    holding_torque,
+    inverse_dynamics,
+    jacobian,
+)
 from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface, PositionServo
+
+Array = NDArray[np.float64]
 
 COMPUTED_TORQUE = "computed_torque"
 
@@ -115,9 +123,7 @@ def joint_control_torque(
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
-def servo_numbers(
-    arm: ArmModel, config: JointControlConfig
-) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
+def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, float, Array, Array]:
     """Return gains and limits for `joint_control_torque`."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
@@ -151,7 +157,7 @@ class JointControl(LeafSystem):
         arm: ArmModel,
         config: JointControlConfig,
         period: float,
-        q_start: NDArray[np.float64],
+        q_start: Array,
     ) -> None:
         super().__init__()
         n = arm.num_joints
@@ -174,7 +180,7 @@ class JointControl(LeafSystem):
 
 
 def MakeJointControl(
-    arm: ArmModel, config: JointControlConfig, period: float, q_start: NDArray[np.float64]
+    arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
 ) -> LeafSystem:
     """Return the block for the servo of `config`; arguments as for `JointControl`."""
     interface = config.position_interface
@@ -186,3 +192,65 @@ def MakeJointControl(
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
     """Return the default `interface` of the servo that a `joint_control` block names."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
+
+
+def mass_matrix(arm: ArmModel, q: Array) -> Array:
+    """Return M(q) (n, n) with rotors and tool, by inverse dynamics of unit accelerations."""
+    zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
+    columns = np.empty((len(q), len(q)))
+    for unit, column in zip(np.eye(len(q)), columns, strict=True):
+        inverse_dynamics(arm.table, q, zeros, unit, column)
+        column -= weight
+    return columns.T
+
+
+def operational_inertia(arm: ArmModel, q: Array) -> Array:
+    """Return Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W; q is not singular.
+
+    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    """
+    n = arm.num_joints
+    still, J = np.zeros(n), np.empty((6, n))
+    mobility, rates = np.empty((n, n)), np.empty(n)
+    forward_dynamics(arm.table, q, still, still, np.zeros(6), rates)
+    falling = rates.copy()
+    for i, torque in enumerate(np.eye(n)):
+        forward_dynamics(arm.table, q, still, torque, np.zeros(6), rates)
+        mobility[i] = rates - falling
+    jacobian(arm.table, q, J)
+    return np.linalg.inv(J @ mobility @ J.T)
+
+
+class ServoAtTool(NamedTuple):
+    """Servo with the wrench K (x_command - x) - D v; two values each, translation and rotation.
+
+    Attributes:
+        stiffness: K [N/m, N m/rad].
+        damping: D [N s/m, N m s/rad].
+        mass: of arm and tool [kg, kg m^2].
+    """
+
+    stiffness: list[float]
+    damping: list[float]
+    mass: list[float]
+
+
+def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
+    """Return stiffness, damping and mass of the slave for the passivity methods.
+
+    Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
+    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy of any
+    motion. The joint loops accelerate with kv (kp (x_command - x) - v), hence K and D.
+
+    Raises:
+        DrakeTeleopError: for a servo other than computed torque.
+    """
+    config.check_computed_torque("the servo model of the passivity methods")
+    inertia = operational_inertia(arm, q)
+    blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
+    unit = 1 / np.sqrt(np.repeat(blocks, 3))
+    mass = np.linalg.eigvalsh(unit[:, np.newaxis] * inertia * unit)[-1] * np.array(blocks)
+    kp, kv = (
+        2 * np.pi * hertz for hertz in (config.position_bandwidth_hz, config.velocity_bandwidth_hz)
+    )
+    return ServoAtTool((kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist())

@@ -317,9 +317,7 @@ def _default_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def _actuate(
-    plant: MultibodyPlant, chain: list[JointIndex], effort_limits: dict[str, float]
-) -> None:
+def _actuate(plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float]) -> None:
     """Give each moving joint of the chain one actuator, in the order of the chain."""
     moving = [index for index in chain if _moves(plant, index)]
     actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
@@ -338,7 +336,7 @@ def _actuate(
         plant.RemoveJointActuator(each)
     for index in moving:
         joint = plant.get_joint(index)
-        effort, rotor, gear = known.get(index, (effort_limits.get(joint.name(), 0.0), 0.0, 1.0))
+        effort, rotor, gear = known.get(index, (limits.get(joint.name(), 0.0), 0.0, 1.0))
         effort = effort if effort > 0.0 else np.inf
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(rotor)

@@ -25,7 +25,7 @@ from drake_teleop.station.slave.joint_control import (
     servo_numbers,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_rates import assemble_state, plant_rates
+from drake_teleop.station.slave.plant_dynamics import assemble_state, plant_rates
 
 Array = NDArray[np.float64]
 

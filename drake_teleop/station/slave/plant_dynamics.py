@@ -1,4 +1,8 @@
-"""Wrench of the environment on the tool: contacts of balls with boxes, and applied wrenches."""
+"""Compiled dynamics of the plant inside one step, with the wrench of the environment on the tool.
+
+Covers arm, tool, balls on boxes and one leaf (otherwise see `Contact.beyond`). The state is x = [q,
+leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ from drake_teleop.station.environment.point_contact import (
     contact_force,
     indentation,
 )
-from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, jacobian
+from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import Contact
 
 #: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
@@ -156,3 +160,70 @@ class ToolContact(LeafSystem):
             self._nothing if self._plant is None else self._plant.Eval(context),
             output.get_mutable_value(),
         )
+
+
+@njit(cache=True)
+def assemble_state(state, around, x):
+    """Write x from [q; v] and [deflection, rate, the plant's state]."""
+    n = state.shape[0] // 2
+    put(x, 0, state, 0, n)
+    put(x, n + 1, state, n, n)
+    x[n], x[2 * n + 1] = around[0], around[1]
+    put(x, 2 * n + 2, around, 2, around.shape[0] - 2)
+
+
+@njit(cache=True)
+def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
+    """Write the time derivative xdot (2 n + 2,) and the environment's wrench.
+
+    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
+    `wrench_W` are those of `environment_wrench`.
+    """
+    arm, _, pairs, _, joints, given = physics
+    half = tau.shape[0] + 1
+    q, v, sheet, plant = (
+        x[: half - 1],
+        x[half : 2 * half - 1],
+        x[half - 1 : 2 * half : half],
+        x[2 * half :],
+    )
+    if not _take_given_wrench(given, x, wrench_W):
+        environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
+    else:
+        applied = np.empty(6)
+        environment_wrench(arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied)
+        wrench_W += applied
+    rates_under(physics, x, tau, applied_W, wrench_W, xdot)
+
+
+@njit(cache=True)
+def _take_given_wrench(given, x, wrench_W):
+    """Copy the next given contact wrench to `wrench_W` and return True; if missing, request it.
+
+    `given` is empty, or has row 0 [number given, number used, x of the request] and then wrenches.
+    """
+    if given.shape[0] == 0:
+        return False
+    number = int(given[0, 1])
+    given[0, 1] += 1.0
+    if number < given[0, 0]:
+        put(wrench_W, 0, given[1 + number], 0, 6)
+        return True
+    if number == given[0, 0]:
+        put(given[0], 2, x, 0, x.shape[0])
+    return False
+
+
+@njit(cache=True)
+def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
+    """Write the time derivative of x under a given environment wrench."""
+    arm, _, pairs, leaf, _, _ = physics
+    half = tau.shape[0] + 1
+    q, v = x[: half - 1], x[half : 2 * half - 1]
+    forward_dynamics(arm, q, v, tau, wrench_W, xdot[half:-1])
+    put(xdot, 0, x, half, half)
+    push = 0.0
+    if pairs.shape[0] > 0:  # all belong to the leaf, or none does
+        for i in range(3):
+            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
+    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[2 * half - 1]) / leaf[0] + leaf[3]
