@@ -208,8 +208,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the motion that an ideal sensor at S measures to out (21,).
 
-    It has the specific force [m/s^2], omega_WS [rad/s] and alpha_WS [rad/s^2] in S; then p_WS [m]
-    and R_WS by rows.
+    It has s [m/s^2], omega_WS and alpha_WS in S, then p_WS [m] and R_WS by rows.
     """
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
@@ -376,8 +375,7 @@ def forward_dynamics(
 ) -> None:
     """Write accelerations: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    Includes the terms of `inverse_dynamics`, dry friction, and the wrench F (6,) on the load, about
-    the world's origin, in W [N, N m].
+    F (6,) is the wrench on the load, about the world's origin, in W [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)

@@ -53,8 +53,8 @@ def ArmModelFromPlant(
     Joints beyond the sensor frame are held at their default positions.
 
     Raises:
-        DrakeTeleopError: if the frame is missing, the path to it is not a chain of welds, revolute
-            and prismatic joints, or a link carries another moving joint.
+        DrakeTeleopError: if the frame is missing, or its path is not a chain of welds, revolute and
+            prismatic joints without branches that move.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(

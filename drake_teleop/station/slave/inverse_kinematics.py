@@ -228,8 +228,7 @@ def nearest_branch(
         R_WS: (3, 3).
         p_WS: (3,) [m].
         q_reference: (6,) [rad], normally the current positions.
-        lower: (6,) joint limits [rad].
-        upper: (6,) joint limits [rad].
+        lower, upper: (6,) joint limits [rad].
         max_step: largest distance of a joint from the reference [rad].
     """
     q = np.empty(6)

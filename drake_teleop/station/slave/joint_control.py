@@ -239,8 +239,8 @@ def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoA
     """Return stiffness, damping and mass of the slave for the passivity methods.
 
     Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
-    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy of any
-    motion. The joint loops accelerate with kv (kp (x_command - x) - v), hence K and D.
+    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy. The joint
+    loops accelerate with kv (kp (x_command - x) - v), hence K and D.
 
     Raises:
         DrakeTeleopError: for a servo other than computed torque.

@@ -1,8 +1,8 @@
 """Checks of a robot model before Drake parses it.
 
-Drake aborts on, or never finishes, joint loops and links with two parents, and silently replaces
-invalid inertias. Here each is one error that names the joint or link. Missing values become
-assumptions. Inertias with rounding errors, or of links that no joint moves, are corrected.
+Drake aborts on, or never finishes, joint loops, and silently replaces invalid inertias. Here each
+fault is one error that names the joint or link. Missing values become assumptions. Inertias with
+rounding errors, or of links that no joint moves, are corrected.
 """
 
 from __future__ import annotations

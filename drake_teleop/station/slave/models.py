@@ -84,14 +84,7 @@ def ParseModel(
     """Parse an arm, in which only the joints up to S move, each with one actuator.
 
     A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
-    at their default positions.
-
-    Args:
-        plant: not finalized.
-        path: URDF, SDF or another format that Drake reads.
-        sensor_frame: frame or link at which the sensor measures.
-        package_paths: folders of `package://` addresses.
-        X_WBase: pose of a free base.
+    at their default positions. `package_paths` are folders of `package://` addresses.
 
     Raises:
         DrakeTeleopError: if the file cannot be read, has no such frame, fails `check_model`, or
@@ -138,10 +131,10 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parse a tool and weld its root to S by the joint "sensor_weld"; hold its joints.
+    """Parse a tool with one root and weld it to S by the joint "sensor_weld"; hold its joints.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read or does not have exactly one root.
+        DrakeTeleopError: if the file cannot be read or has another number of roots.
     """
     before = set(plant.GetJointIndices())
     read = _parse(plant, path, package_paths)

@@ -181,15 +181,13 @@ def follow_pose(
         table: `ArmModel.table`.
         L: `orientation_length` [m].
         pose: (7,) X_WS ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any nonzero length.
-        reference: (n,) normally the last command [rad, m].
-        lower: (n,) limits.
-        upper: (n,) limits.
+        reference: (n,) normally the last command.
+        lower, upper: (n,) limits.
         max_step: (n,) largest distance from the reference.
         posture: (n,) target of a redundant arm.
-        pull: fraction of the way to the posture, 0 to 1.
+        pull: fraction of the way to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number.
-        q: (n,) output.
 
     Returns:
         The `IkStatus` as a plain integer.
@@ -297,9 +295,8 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     """Return joint positions (n,) that meet a pose (7,), and the status.
 
     The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
-    joints take the full rotation nearest to the reference. A missing limit counts as pi from it.
-    Without a solution, the nearest positions are returned, with OUT_OF_REACH, JOINT_LIMIT or,
-    within 1 mm, the singularity.
+    joints take the full rotation nearest to the reference. Without a solution, the nearest
+    positions are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
     """
     n = arm.num_joints
     lower = np.where(np.isfinite(arm.lower), arm.lower, reference - np.pi)

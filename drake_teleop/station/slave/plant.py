@@ -45,15 +45,12 @@ class SlavePlant:
     Attributes:
         plant: continuous MultibodyPlant, finalized.
         instance: of the arm's joints.
-        sensor_frame: S.
         tool: body on the sensor.
         arm: chain up to S, with all bodies beyond S as its load.
         start: (n,) joint positions [rad].
         X_WS_start: (7,) see `start_pose`.
         tip: (3,) p_STip, contact point of the tool [m].
-        contact: with the environment.
         assumptions: data missing in the models.
-        config: settings.
         environment: objects that the tool can touch, or None.
     """
 
@@ -152,12 +149,12 @@ def AddSlavePlant(
 ) -> SlavePlant:
     """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
 
-    A scene graph, which slows every step, is added only with an environment. Only the tool makes
-    contact, not the arm.
+    A scene graph slows every step and is added only with an environment. Only the tool makes
+    contact.
 
     Raises:
         DrakeTeleopError: if a model cannot be read, or the arm cannot reach the start or hold its
-            load there.
+            load.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))

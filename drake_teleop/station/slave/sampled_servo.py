@@ -1,12 +1,11 @@
 """Joint control that samples faster than the simulation's events.
 
-Events at 10 kHz would slow the simulation. Instead, each event predicts the motion with
-`plant_rates`, one midpoint step per sample of the controller:
+Each event predicts the motion with `plant_rates`, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
 The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
-steps; b = 0 if m = 1. The prediction includes contacts, but no other force on the tool.
+steps. The prediction includes contacts, but no other force on the tool.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         samples: m.
         period: T [s].
         scratch: (3 n,).
-        line: (3 n,) torque [N m], its rate [N m/s], last sample [N m]; updated.
+        line: (3 n,) torque [N m], its rate [N m/s], last sample [N m].
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
