@@ -40,7 +40,7 @@ from drake_teleop.robots import table
 from drake_teleop.robots.recording import Recorder
 from drake_teleop.robots.streams import Compensated, Reading
 from drake_teleop.station.scenario import LoadScenario, Scenario
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 
 _SECRET = b"what is in no model's folder, and in no page"
 _NAMES = (
@@ -201,7 +201,7 @@ def model(path: Path) -> None:
         first = folder / next(iter(files), "a.sdf")
         ParseModel(plant, first, "l")
         logging.getLogger("drake").setLevel(logging.ERROR)  # of textures that are not there
-        with drakes_errors_said(first):
+        with translate_drake_errors(first):
             plant.Finalize()
             meshcat = Meshcat(MeshcatParams(host="localhost"))
             MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)

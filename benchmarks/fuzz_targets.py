@@ -56,7 +56,7 @@ from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.station.scenario_reference import commented
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
@@ -409,7 +409,7 @@ def _sdfs(_: Path) -> list[bytes]:
 def _model(path: Path) -> None:
     plant = MultibodyPlant(0.0)
     ParseModel(plant, path, "sensor")
-    with drakes_errors_said(path):
+    with translate_drake_errors(path):
         plant.Finalize()
 
 

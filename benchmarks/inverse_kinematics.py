@@ -59,7 +59,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
     STEPS,
     find_posture,
     follow_pose,
-    turn_length,
+    orientation_length,
 )
 from drake_teleop.station.slave.plant import ParseSlave, finalize
 
@@ -196,7 +196,7 @@ class Follower:
     """`follow_pose` as a station calls it."""
 
     def __init__(self, arm: ArmModel, q: Array) -> None:
-        self.arm, self.L, self.posture, self.q = arm, turn_length(arm), q.copy(), q.copy()
+        self.arm, self.L, self.posture, self.q = arm, orientation_length(arm), q.copy(), q.copy()
         self.max_step = arm.velocity_limit * PERIOD
 
     def __call__(self, pose: Array) -> int:
@@ -357,7 +357,7 @@ class ClosedForm:
 
 def against_the_closed_form(arm: ArmModel, poses: int) -> dict[str, Any]:
     """From references up to 0.02 rad off, away from where steps are damped."""
-    random, worst, L = np.random.default_rng(1), 0.0, turn_length(arm)
+    random, worst, L = np.random.default_rng(1), 0.0, orientation_length(arm)
     statuses: Counter[str] = Counter()
     while statuses.total() < poses:
         q = random.uniform(arm.lower + 0.1, arm.upper - 0.1)

@@ -20,7 +20,7 @@ from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.new_station import find_place, new_command, plan_station
 from drake_teleop.station.scenario import LoadScenario
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture

@@ -13,8 +13,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.payload import Payload
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import Payload, Slave
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])

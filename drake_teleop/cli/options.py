@@ -324,6 +324,6 @@ def _arm(model: Path | None, sensor_frame: str | None, package_paths: tuple[Path
             where="--sensor-frame",
             remedy="name the frame or link at which the sensor measures",
         )
-    from drake_teleop.station.slave.joint_poses import arm_of
+    from drake_teleop.station.slave.plant import arm_of
 
     return arm_of(model, sensor_frame, package_paths)

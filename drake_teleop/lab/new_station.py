@@ -27,8 +27,7 @@ from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM, Ma
 from drake_teleop.station.master.phantom import FORCE_LIMIT
 from drake_teleop.station.scenario import LoadScenario, Rates
 from drake_teleop.station.sensor.presets import PRESETS
-from drake_teleop.station.slave.arm import ROTATION, TRANSLATION, ArmModel
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import ROTATION, TRANSLATION, ArmModel, pose_into
 from drake_teleop.station.slave.home import R_WS_HOME, tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture

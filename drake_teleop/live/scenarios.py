@@ -19,8 +19,8 @@ from drake_teleop.station.passivity.methods import METHODS
 from drake_teleop.station.passivity.safe_state import RESUME_TIME
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.sensor.presets import PRESETS as SENSOR_PRESETS
-from drake_teleop.station.slave.payload import Payload
 from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Payload
 
 Array = NDArray[np.float64]
 

@@ -86,7 +86,7 @@ class Parts:
 
 
 class SensorPoseOfJoints(Protocol):
-    """Kinematics of an arm, such as `station.slave.joint_poses.Arm`."""
+    """Kinematics of an arm, such as `station.slave.plant.Arm`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -14,8 +14,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.channel.channel import TeleopChannel
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, check_scenario
+from drake_teleop.station.slave.joint_control import servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
-from drake_teleop.station.slave.servo import servo_at_tool
 from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]

@@ -45,10 +45,14 @@ from drake_teleop.station.master.phantom import serial_joint_angles
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario, Scenario
 from drake_teleop.station.signals import POSE_OF
-from drake_teleop.station.slave.moving_pose import positions_of
+from drake_teleop.station.slave.meshes import AddSkeleton
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
-from drake_teleop.station.slave.skeleton import AddSkeleton
-from drake_teleop.station.slave.surroundings import AddEnvironment, MovingBodies, Touched
+from drake_teleop.station.slave.surroundings import (
+    AddEnvironment,
+    MovingBodies,
+    Touched,
+    positions_of,
+)
 
 Array = NDArray[np.float64]
 Signals = Mapping[str, Array]

@@ -42,7 +42,7 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.joint_control import JointControlConfig, interface_of
+from drake_teleop.station.slave.joint_control import JointControlConfig, default_interface
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -250,7 +250,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
     defaults = Scenario(
         wrist_sensor=preset_of(data.get("wrist_sensor")),
         master=Master(figures=figures_of(data.get("master"))),
-        joint_control=JointControlConfig(interface=interface_of(data.get("joint_control"))),
+        joint_control=JointControlConfig(interface=default_interface(data.get("joint_control"))),
     )
     scenario = yaml_load_typed(schema=Scenario, data=yaml_dump(data), defaults=defaults)
     scenario.check(where)

@@ -20,19 +20,21 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import estimated_motion_std
 from drake_teleop.station.sensor.wrist_sensor import AddWristSensor
 from drake_teleop.station.signals import POSE_OF
+from drake_teleop.station.slave.arm import ForwardKinematics
 from drake_teleop.station.slave.drake_contact import DrakeContact
-from drake_teleop.station.slave.forward_kinematics import ForwardKinematics
-from drake_teleop.station.slave.ik_methods import METHODS, method_of
-from drake_teleop.station.slave.joint_control import MakeJointControl
-from drake_teleop.station.slave.joint_follower import JointFollower
+from drake_teleop.station.slave.joint_commands import (
+    IK_METHODS,
+    JointFollower,
+    JointTrajectory,
+    SlaveMonitor,
+    ik_method_name,
+)
+from drake_teleop.station.slave.joint_control import MakeJointControl, mass_matrix
 from drake_teleop.station.slave.joint_friction import FRICTION_SPEED
-from drake_teleop.station.slave.joint_trajectory import JointTrajectory
-from drake_teleop.station.slave.monitor import SlaveMonitor
-from drake_teleop.station.slave.moving_pose import MovingPose
 from drake_teleop.station.slave.plant import AddSlavePlant, SlavePlant
-from drake_teleop.station.slave.sampled_servo import SampledServo, samples_within
-from drake_teleop.station.slave.servo import mass_matrix
-from drake_teleop.station.slave.tool_contact import ToolContact
+from drake_teleop.station.slave.plant_dynamics import ToolContact
+from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event
+from drake_teleop.station.slave.surroundings import MovingPose
 from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
@@ -89,7 +91,7 @@ def MakeSlaveSide(
     arm = body.slave.arm
 
     start, led = body.slave.start, scenario.master.leads_joints
-    make_ik = METHODS[method_of(scenario.slave.inverse_kinematics, arm)]
+    make_ik = IK_METHODS[ik_method_name(scenario.slave.inverse_kinematics, arm)]
     make_ik = JointFollower if led else make_ik
     ik = builder.AddNamedSystem("inverse_kinematics", make_ik(arm, start, body.command_period))
     if not led:
@@ -267,7 +269,7 @@ def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.beyond or contact.plant_size or interface is not None:
         return 1
-    return samples_within(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
+    return samples_per_event(scenario.rates.joint_control_hz, scenario.rates.hand_hz)
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:

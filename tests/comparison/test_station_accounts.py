@@ -18,8 +18,7 @@ from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfi
 from drake_teleop.station.scenario import LoadScenario, Rates, Scenario, Simulation, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import jacobian, sensor_motion
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import jacobian, pose_into, sensor_motion
 from drake_teleop.station.station import MakeTeleopStation
 
 SCENARIO = replace(

@@ -29,9 +29,9 @@ from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.home import R_WS_HOME
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, nearest_branch
 from drake_teleop.station.slave.plant import AddSlavePlant, ParseSlave
+from drake_teleop.station.slave.plant_dynamics import environment_wrench
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment
-from drake_teleop.station.slave.tool_contact import environment_wrench
 from drake_teleop.station.station import MakeTeleopStation
 
 

@@ -30,20 +30,19 @@ from drake_teleop.station.operator.operator import MinimumJerk
 from drake_teleop.station.replay import ReplayScene
 from drake_teleop.station.scenario import LoadScenario, Scenario, ScenarioFromData, replace
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.contact_twin import ContactTwin
-from drake_teleop.station.slave.drake_contact import contact_wrench_W
+from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.scene import Scene
-from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool import Ball, Tool
-from drake_teleop.station.slave.tool import Block as ToolBox
-from drake_teleop.station.slave.tool_contact import (
+from drake_teleop.station.slave.plant_dynamics import (
     FAR,
     TOUCHING,
     WATCHED,
     environment_wrench,
     nearness,
 )
+from drake_teleop.station.slave.scene import Scene
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Tool
+from drake_teleop.station.slave.tool import Block as ToolBox
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
 SOFT_PAD = """

@@ -19,10 +19,9 @@ from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.scaling.joint_coupling import JointCoupling
 from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
-from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import jacobian, pose_into
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
-from drake_teleop.station.slave.joint_follower import JointFollower
+from drake_teleop.station.slave.joint_commands import JointFollower
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Tool

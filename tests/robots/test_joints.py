@@ -26,7 +26,7 @@ from drake_teleop.robots.connections import open_source
 from drake_teleop.robots.ros2 import Messages
 from drake_teleop.robots.streams import JOINTS, POSE, WRENCH, Part
 from drake_teleop.station.slave.arm import sensor_motion
-from drake_teleop.station.slave.joint_poses import arm_of
+from drake_teleop.station.slave.plant import arm_of
 
 DT = 0.002
 NAMES = ("lift", "bend", "roll", "yaw")

@@ -1,4 +1,4 @@
-"""Arms as plants: the station's, one about odd axes, one that slides in the middle."""
+"""Test arms: the RX90, an arm with oblique axes, and one with a prismatic joint."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SEVEN_AXES = [
 
 
 def other_arm_urdf(last_joint: str = "fixed", root: str = "world", slides: int = 0) -> str:
-    """Seven joints about odd axes (one may slide), a tilted base, a camera on link 3, a gripper."""
+    """Return a 7-joint arm with oblique axes, a tilted base, a camera on link 3 and a gripper."""
     parts = [f'<robot name="other"><link name="{root}"/>', link("base")]
     parts.append(joint("to_base", "fixed", root, "base", "0.1 -0.2 0.3", "0.3 0.2 -0.1"))
     parent = "base"

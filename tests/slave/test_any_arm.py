@@ -1,4 +1,4 @@
-"""Foreign arms in the station: seven joints, one of which slides, and what may be wrong."""
+"""User-supplied arms in the station: seven joints, one of them prismatic, and invalid scenarios."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import MakeSimulator, simulate
-from drake_teleop.station.slave.ik_methods import method_of
-from drake_teleop.station.slave.monitor import SlaveMonitor
+from drake_teleop.station.slave.joint_commands import SlaveMonitor, ik_method_name
+from drake_teleop.station.slave.meshes import AddSkeleton
 from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, ParseSlave, start_pose
-from drake_teleop.station.slave.skeleton import AddSkeleton
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.slave.tool import Ball, Block, Tool
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
@@ -48,7 +47,7 @@ slave:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A scenario and beside it an arm that has a gripper, and strong motors."""
+    """Folder with a scenario and an arm with a gripper and strong motors."""
     folder = tmp_path_factory.mktemp("station")
     text = other_arm_urdf(slides=4).replace('effort="40"', 'effort="400"')
     text = text.replace('ixy="0.001" ixz="-0.002" iyz="0.0015"', 'ixy="0" ixz="0" iyz="0"')
@@ -65,7 +64,7 @@ def scenario(folder):
     return LoadScenario(folder / "station.yaml")
 
 
-def test_the_wrench_is_the_reaction_of_the_weld_to_what_hangs_there(scenario):
+def test_wrench_is_reaction_of_sensor_weld(scenario):
     scenario = replace(scenario, wrist_sensor__ideal=True)
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -91,7 +90,7 @@ def test_the_wrench_is_the_reaction_of_the_weld_to_what_hangs_there(scenario):
     assert np.abs(sample).max() > 5.0
 
 
-def test_a_run_has_as_many_components_as_the_arm_has_joints(scenario):
+def test_log_has_one_component_per_joint(scenario):
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     result = simulate(station, scenario.simulation, progress=False)
     for name in ("joint_position", "joint_torque", "joint_command"):
@@ -104,7 +103,7 @@ def test_a_run_has_as_many_components_as_the_arm_has_joints(scenario):
     assert len(SIGNALS["slave_state"].components) == 12
 
 
-def test_what_it_starts_with(scenario):
+def test_start_pose_and_assumptions(scenario):
     slave = NominalSlave(scenario.slave)
     assert NominalSlave(scenario.slave) is slave
     np.testing.assert_array_equal(slave.start, HOME)
@@ -121,17 +120,17 @@ def test_what_it_starts_with(scenario):
     np.testing.assert_array_equal(slave.arm.effort_limit, 400.0)
 
 
-def test_an_arm_of_the_rx90s_numbers_is_moved_by_its_closed_form():
+def test_arm_with_rx90_geometry_uses_closed_form():
     copy = Slave(model=str(models_dir() / "rx90.sdf"))
     arm = NominalSlave(copy).arm
-    assert method_of("automatic", arm) == "closed_form"
+    assert ik_method_name("automatic", arm) == "closed_form"
     np.testing.assert_array_equal(NominalSlave(copy).start, NominalSlave(Slave()).start)
     np.testing.assert_array_equal(NominalSlave(copy).tip, [0.0, 0.0, 0.2])
     moved = Slave(base_pose=[0.1, -0.2, 0.3, 0.0, 0.0, 0.5])
     arm = NominalSlave(moved).arm
-    assert method_of("automatic", arm) == "numeric"
+    assert ik_method_name("automatic", arm) == "numeric"
     with pytest.raises(DrakeTeleopError, match="closed form is that of an RX90"):
-        method_of("closed_form", arm)
+        ik_method_name("closed_form", arm)
     plant, context = NominalSlave(moved).plant, NominalSlave(moved).plant.CreateDefaultContext()
     found = plant.GetFrameByName("sensor").CalcPoseInWorld(context)
     np.testing.assert_allclose(found.translation(), [0.55, 0.0, 0.45], atol=1e-8)
@@ -140,7 +139,7 @@ def test_an_arm_of_the_rx90s_numbers_is_moved_by_its_closed_form():
     np.testing.assert_allclose(base.translation(), [0.1, -0.2, 0.3], atol=1e-15)
 
 
-def test_a_tool_of_numbers():
+def test_tool_from_mass_and_shapes():
     inertia = [0.02, 1e-3, -2e-3, 0.03, 1.5e-3, 0.025]
     shapes = [Ball(0.02, [0, 0, 0.1]), Block([0.02, 0.06, 0.1], [0, 0.01, 0.1], [np.pi / 2, 0, 0])]
     tool = Tool(mass=2.0, com=[0.01, -0.02, 0.06], inertia=inertia, shapes=shapes)
@@ -158,7 +157,7 @@ def test_a_tool_of_numbers():
     np.testing.assert_allclose(touching.contact_pairs[0, :4], [0, 0, 0.1, 0.02], atol=1e-15)
 
 
-def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_path):
+def test_only_load_makes_contact(folder, tmp_path):
     ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
     path, tool = tmp_path / "arm.urdf", Tool(mass=1.0, shapes=[Ball()])
     text = (folder / "arm.urdf").read_text()
@@ -170,7 +169,7 @@ def test_the_arm_touches_nothing_but_what_hangs_on_its_sensor_does(folder, tmp_p
         assert (len(contact.pairs), contact.beyond) == (1, "")
 
 
-def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_path):
+def test_model_directives_find_files_and_packages(folder, tmp_path):
     (tmp_path / "packages" / "parts").mkdir(parents=True)
     (tmp_path / "packages" / "parts" / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     shape = '<visual><geometry><mesh filename="package://parts/a.obj"/></geometry></visual>'
@@ -187,7 +186,7 @@ def test_model_directives_lead_to_other_files_and_their_packages(folder, tmp_pat
     assert found.plant.HasModelInstanceNamed("arm")
 
 
-def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
+def test_arm_without_visuals_is_shown_as_sticks(scenario):
     slave, builder = NominalSlave(scenario.slave), DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
     parsed = ParseSlave(plant, scenario.slave)
@@ -209,7 +208,7 @@ def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
         ({"home": HOME[:6]}, "6 joint positions for 7 joints"),
         ({"home": [9.0, *HOME[1:]]}, "j1 at 9 is outside -2 to 2.5"),
         ({"home": [], "position": [4.0, 0.0, 0.4]}, "cannot reach.*slave.home"),
-        ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "fastens base to the world itself"),
+        ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "welds base to the world itself"),
         ({"inverse_kinematics": "closed_form"}, "closed form is that of an RX90"),
         ({"tool": Tool(mass=90.0)}, "hold its 90.9 kg at the start: j4 needs 566 of its 400 N;"),
         ({"sensor_frame": "finger"}, "nothing with a mass hangs on finger"),
@@ -217,24 +216,24 @@ def test_of_an_arm_without_shapes_sticks_are_seen(scenario):
         ({"tool": Tool(model="a.sdf", mass=1.0)}, "slave.tool.mass: both a file and a mass"),
         ({"tool": Tool(shapes=[Ball()])}, "needs a mass"),
         ({"tool": Tool(mass=1.0, inertia=[1, 0, 0, 1, 0, 3])}, "no body has this inertia"),
-        ({"tip": [0.0, 0.1]}, "slave.tip: has to be a list of finite numbers, 3 of them"),
+        ({"tip": [0.0, 0.1]}, "slave.tip: must be a list of finite numbers, 3 of them"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_one_error(scenario, change, expected):
+def test_invalid_slave_raises_one_error(scenario, change, expected):
     changed = replace(scenario, **{f"slave__{name}": value for name, value in change.items()})
     with pytest.raises(DrakeTeleopError, match=expected):
         MakeTeleopStation(changed, load_estimate=np.ones(16))
 
 
-def test_links_without_inertia_are_refused(folder, tmp_path):
+def test_links_without_inertia_are_rejected(folder, tmp_path):
     path, text = tmp_path / "arm.urdf", (folder / "arm.urdf").read_text()
     path.write_text(re.sub("<inertial>.*?</inertial>|<transmission.*?</transmission>", "", text))
     massless = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=Tool(mass=1.0))
-    with pytest.raises(DrakeTeleopError, match="nothing resists a torque"):
+    with pytest.raises(DrakeTeleopError, match="the mass matrix is singular"):
         NominalSlave(massless)
 
 
-def test_of_five_joints_the_ledger_knows_no_mass(folder, scenario):
+def test_ledger_rejects_arm_with_five_joints(folder, scenario):
     five = replace(scenario, slave__sensor_frame="l5", slave__home=HOME[:5])
     assert NominalSlave(five.slave).arm.num_joints == 5
     assert "held: j6, j7, to_finger" in NominalSlave(five.slave).assumptions
@@ -244,7 +243,7 @@ def test_of_five_joints_the_ledger_knows_no_mass(folder, scenario):
         MakeTeleopStation(over, load_estimate=true_load(five))
 
 
-def test_a_spring_is_refused(tmp_path):
+def test_spring_is_rejected(tmp_path):
     path, text = tmp_path / "arm.sdf", (models_dir() / "rx90.sdf").read_text()
     sprung = "<dynamics><spring_stiffness>5</spring_stiffness></dynamics></axis>"
     path.write_text(text.replace("</axis>", sprung, 1))
@@ -252,7 +251,7 @@ def test_a_spring_is_refused(tmp_path):
         NominalSlave(Slave(model=str(path)))
 
 
-def test_a_loop_is_refused(folder, tmp_path):
+def test_kinematic_loop_is_rejected(folder, tmp_path):
     text = (folder / "arm.urdf").read_text()
     loop = (
         '<drake:ball_constraint><drake:ball_constraint_body_A name="l3"/></drake:ball_constraint>'
@@ -263,7 +262,7 @@ def test_a_loop_is_refused(folder, tmp_path):
         NominalSlave(Slave(model=str(path), sensor_frame="ft", home=HOME))
 
 
-def test_an_edited_model_is_read_again(folder, tmp_path):
+def test_edited_model_is_read_again(folder, tmp_path):
     path, text = tmp_path / "arm.urdf", (folder / "arm.urdf").read_text()
     path.write_text(text)
     slave = Slave(model=str(path), sensor_frame="ft", home=HOME, tool=None)
@@ -272,13 +271,13 @@ def test_an_edited_model_is_read_again(folder, tmp_path):
     assert NominalSlave(slave).arm.phi_load[0] == pytest.approx(before + 1.0)
 
 
-def test_without_an_arm_the_scenario_is_the_papers():
+def test_default_arm_is_rx90():
     assert Scenario().slave.path == models_dir() / "rx90.sdf"
     assert NominalSlave(Slave()).assumptions == ()
 
 
-def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
-    """Between two fingers, each of which is a turned box, and not at the centre of mass."""
+def test_tip_is_between_fingers_of_gripper(folder, scenario):
+    """The tip is between two rotated boxes, not at the centre of mass."""
     text = (folder / "arm.urdf").read_text()
     box = '<collision><geometry><box size="0.06 0.01 0.02"/></geometry></collision></link>'
     for side in (-1, 1):
@@ -302,8 +301,8 @@ def test_contact_is_where_a_models_own_gripper_reaches(folder, scenario):
 
 @pytest.mark.parametrize(("beyond", "stops"), [(0.005, False), (0.02, True), (np.nan, True)])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_joint_may_swing_a_little_beyond_its_limit(scenario, beyond, stops, side):
-    """One that follows a command that stays at its limit does, before the arm is at its stop."""
+def test_joint_may_overshoot_limit_by_1_percent(scenario, beyond, stops, side):
+    """An arm that is commanded to its limit overshoots before its mechanical stop."""
     arm = NominalSlave(scenario.slave).arm
     monitor = SlaveMonitor(arm, 1e-3)
     context, q = monitor.CreateDefaultContext(), np.array(HOME)
@@ -319,31 +318,31 @@ def test_a_joint_may_swing_a_little_beyond_its_limit(scenario, beyond, stops, si
         simulator.AdvanceTo(2e-3)
 
 
-def slowest(scenario):
-    """Of the motions of the linearised station, the multipliers of those that die last."""
+def slowest_multipliers(scenario):
+    """Return the multipliers of the slowest modes of the linearized station."""
     system = linearize_station(scenario, load_estimate=true_load(scenario))
     return np.abs(system.multipliers[:20])
 
 
 @pytest.fixture(scope="module")
 def free(scenario):
-    return slowest(scenario)
+    return slowest_multipliers(scenario)
 
 
 @pytest.mark.slow
-def test_a_redundant_arm_nears_its_posture_by_what_the_kinematics_pull(scenario, free):
+def test_redundant_arm_approaches_posture_at_pull_rate(scenario, free):
     period = 1.0 / scenario.rates.hand_hz
     assert free[0] == pytest.approx(np.exp(-NumericInverseKinematics.PULL * period), abs=1e-5)
     assert free[1] < 0.9990
 
 
 @pytest.mark.slow
-def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
-    """Commands are displaced by more than what the kinematics are solved to, as without them."""
+def test_untouched_surroundings_change_no_multiplier(scenario, free):
+    """The command displacement exceeds the tolerance of the kinematics in both cases."""
     beside = replace(scenario, environment=[Wall(position=[0.0, 0.0, -2.0])])
     beside = replace(beside, slave__tool=Tool(mass=1.0, shapes=[Ball(0.01, [0.0, 0.0, 0.1])]))
-    alone = slowest(replace(beside, environment=[]))
-    np.testing.assert_allclose(slowest(beside), alone, atol=1e-6)
+    alone = slowest_multipliers(replace(beside, environment=[]))
+    np.testing.assert_allclose(slowest_multipliers(beside), alone, atol=1e-6)
     with_wall, without = (
         linearize(station, load_estimate=true_load(station))
         for station in (beside, replace(beside, environment=[]))
@@ -352,11 +351,11 @@ def test_surroundings_that_are_not_touched_change_no_multiplier(scenario, free):
 
 
 @pytest.mark.slow
-def test_a_slow_joint_changes_no_multiplier(folder, scenario, free):
-    """What a joint may go in a period is no part of small motions."""
+def test_joint_speed_limit_changes_no_multiplier(folder, scenario, free):
+    """Speed limits do not affect small motions."""
     text = (folder / "arm.urdf").read_text()
     j4 = text.index('<joint name="j4"')
     slow = text[:j4] + text[j4:].replace('velocity="3"', 'velocity="0.02"', 1)
     (folder / "slow.urdf").write_text(slow)
     slower = replace(scenario, slave__model=str(folder / "slow.urdf"))
-    np.testing.assert_allclose(slowest(slower), free, atol=1e-6)
+    np.testing.assert_allclose(slowest_multipliers(slower), free, atol=1e-6)

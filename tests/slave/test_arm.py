@@ -1,4 +1,4 @@
-"""The compiled arm kernels against the Drake plant that they were read from."""
+"""Compiled arm kernels against the Drake plant from which they are read."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def random_states(arm, count=50):
         yield rng.uniform(arm.lower, arm.upper), rng.normal(size=n) * 3, rng.normal(size=n) * 20
 
 
-def full(plant, arm, values):
-    """The plant's vector (other joints at zero) that holds the arm's values."""
+def plant_vector(plant, arm, values):
+    """Return the plant's vector with the arm's values and zeros for other joints."""
     vector = np.zeros(plant.num_velocities())
     vector[arm.velocity_index] = values
     return vector
@@ -51,7 +51,7 @@ def test_pose_and_jacobian_equal_the_plant(case):
     context = plant.CreateDefaultContext()
     R, p, J = np.zeros((3, 3)), np.zeros(3), np.zeros((6, arm.num_joints))
     for q, _, _ in random_states(arm):
-        plant.SetPositions(context, full(plant, arm, q))
+        plant.SetPositions(context, plant_vector(plant, arm, q))
         X_WS = frame_S.CalcPoseInWorld(context)
         forward_kinematics(arm.table, q, R, p)
         np.testing.assert_allclose(R, X_WS.rotation().matrix(), atol=1e-12)
@@ -74,14 +74,16 @@ def test_motion_of_the_sensor_equals_the_plant(case):
     context = plant.CreateDefaultContext()
     out = np.full(MOTION_SIZE, np.nan)
     for q, v, vdot in random_states(arm):
-        plant.SetPositions(context, full(plant, arm, q))
-        plant.SetVelocities(context, full(plant, arm, v))
+        plant.SetPositions(context, plant_vector(plant, arm, q))
+        plant.SetVelocities(context, plant_vector(plant, arm, v))
         X_WS = frame_S.CalcPoseInWorld(context)
         R = X_WS.rotation().matrix()
         V = frame_S.CalcSpatialVelocityInWorld(context)
         # The plant gives accelerations of bodies only; shift the body's to the origin of S.
         body = frame_S.body()
-        accelerations = plant.CalcSpatialAccelerationsFromVdot(context, full(plant, arm, vdot))
+        accelerations = plant.CalcSpatialAccelerationsFromVdot(
+            context, plant_vector(plant, arm, vdot)
+        )
         p_BS_W = X_WS.translation() - body.EvalPoseInWorld(context).translation()
         A = accelerations[body.index()].Shift(p_BS_W, V.rotational())
         sensor_motion(arm.table, q, v, vdot, out)
@@ -99,19 +101,19 @@ def test_inverse_dynamics_equals_the_plant(case):
     context = plant.CreateDefaultContext()
     tau = np.zeros(arm.num_joints)
     for q, v, vdot in random_states(arm):
-        plant.SetPositions(context, full(plant, arm, q))
-        plant.SetVelocities(context, full(plant, arm, v))
+        plant.SetPositions(context, plant_vector(plant, arm, q))
+        plant.SetVelocities(context, plant_vector(plant, arm, v))
         forces = MultibodyForces(plant)
         plant.CalcForceElementsContribution(context, forces)
-        expected = plant.CalcInverseDynamics(context, full(plant, arm, vdot), forces)
+        expected = plant.CalcInverseDynamics(context, plant_vector(plant, arm, vdot), forces)
         inverse_dynamics(arm.table, q, v, vdot, tau)
         np.testing.assert_allclose(
             tau, expected[arm.velocity_index], atol=1e-10 * np.linalg.norm(expected)
         )
 
 
-def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(case):
-    """With a wrench on the load: J^T F on top of the torques."""
+def test_forward_dynamics_inverts_inverse_dynamics(case):
+    """A wrench on the load adds J^T F to the torques."""
     _, _, arm = case
     n, random = arm.num_joints, np.random.default_rng(5)
     tau, found, J = np.zeros(n), np.zeros(n), np.zeros((6, n))
@@ -127,7 +129,7 @@ def test_forward_dynamics_is_the_inverse_of_inverse_dynamics(case):
         np.testing.assert_allclose(found, vdot, atol=1e-9 * np.linalg.norm(vdot))
 
 
-def test_acceleration_from_the_torques_is_the_one_asked_for():
+def test_plant_accelerates_as_requested():
     plant, instance, frame = rx90_plant()
     arm = ArmModelFromPlant(plant, instance, frame)
     context = plant.CreateDefaultContext()
@@ -140,7 +142,7 @@ def test_acceleration_from_the_torques_is_the_one_asked_for():
         np.testing.assert_allclose(actual, vdot, rtol=1e-9)
 
 
-def test_the_tool_is_the_load_and_can_be_taken_off():
+def test_tool_is_load_and_can_be_removed():
     plant, instance, frame = rx90_plant()
     arm = ArmModelFromPlant(plant, instance, frame)
     bare = ArmModelFromPlant(*rx90_plant(tool=False))
@@ -164,7 +166,7 @@ def test_limits_are_read_from_the_model():
     np.testing.assert_array_equal(arm.effort_limit, np.full(7, 40.0))
 
 
-def test_of_two_motors_on_a_joint_the_weaker_one_is_the_limit():
+def test_weaker_of_two_motors_sets_effort_limit():
     plant = MultibodyPlant(0.0)
     (arm,) = Parser(plant).AddModelsFromString(other_arm_urdf(), "urdf")
     plant.AddJointActuator("second", plant.GetJointByName("j3", arm), effort_limit=7.0)
@@ -173,12 +175,12 @@ def test_of_two_motors_on_a_joint_the_weaker_one_is_the_limit():
     np.testing.assert_array_equal(limits, [40.0, 40.0, 7.0, 40.0, 40.0, 40.0, 40.0])
 
 
-def test_the_chain_goes_on_through_a_gripper_to_its_finger():
+def test_chain_continues_through_gripper_to_finger():
     arm = ArmModelFromPlant(*other_plant()[:2], "finger")
     np.testing.assert_array_equal(arm.table[:, SLIDES], [0, 0, 0, 0, 0, 0, 0, 1, 0])
 
 
-def test_what_is_no_serial_chain_is_refused():
+def test_non_serial_chain_is_rejected():
     with pytest.raises(DrakeTeleopError, match="no frame named 'elsewhere'"):
         ArmModelFromPlant(*rx90_plant()[:2], "elsewhere")
     with pytest.raises(DrakeTeleopError, match="to_camera: link l3 carries a moving part"):

@@ -1,4 +1,4 @@
-"""Models that something is wrong with: one error that says what, or an assumption that is named."""
+"""Faulty models cause one error that names the fault, or an assumption."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def joint(k, kind="revolute", inside="", parent=None, child=None, name=None, tag
 
 
 def arm(joints=6, beyond="", j3=None, l3=None, l0=None):
-    """A URDF whose third joint and link are as given."""
+    """Return a URDF with the given third joint and link."""
     parts = [l0 or link("l0")]
     for k in range(1, joints + 1):
         parts += [j3 if j3 and k == 3 else joint(k), l3 if l3 and k == 3 else link(f"l{k}")]
@@ -82,7 +82,7 @@ def sdf_joint(kind, axis="<axis><xyz>0 0 1</xyz></axis>"):
 
 
 def read(slave):
-    """What `run` and `new` do first, and `excite` but for tool and start; the assumptions."""
+    """Read the slave as `run` and `new` do; return the assumptions."""
     slave.check("slave")
     plant = MultibodyPlant(0.0)
     parsed = ParseSlave(plant, slave)
@@ -175,12 +175,12 @@ ERRORS = {
     "no triangle": ("urdf", with_inertial(('izz="0.01"', 'izz="0.05"')),
                     "link l3: no body has this inertia.*0.02, 0.02, 0.05"),
     "massless, without a tool": ("urdf", re.sub("<inertial>.*?</inertial>", "", arm()),
-                                 "slave.model: nothing resists a torque"),
+                                 "slave.model: the mass matrix is singular"),
     # Units
     "in mm": ("urdf", scaled(1000), "is 1.25e.03 m long; give lengths in m"),
     "in km": ("urdf", scaled(0.001), "is 0.00125 m long; give lengths in m"),
     "inertia in kg mm^2": ("urdf", with_inertial(('"0.02"', '"2e4"'), ('"0.01"', '"1e4"')),
-                           r"what j\d moves is \d+\.?\d* m away from it"),
+                           r"the mass moved by j\d is \d+\.?\d* m away from it"),
     # MJCF, SDF, directives
     "MJCF without bodies": ("xml", mjcf(""), "no frames are named 'l6'; give a model"),
     "MJCF of a loop": ("xml", mjcf("<body name='l6'/>", "<equality><weld body1='l6'/></equality>"),
@@ -195,7 +195,7 @@ ERRORS = {
                          "a has a spring .stiffness"),
     "MJCF of something loose": ("xml", TWO.format("<body name='cup'><freejoint/>"
                                                   "<geom size='.1'/></body>"),
-                                "cup hangs on nothing, beside the arm"),
+                                "cup is not connected to the arm"),
     "MJCF without its other file": ("xml", "<mujoco><include file='x.xml'/></mujoco>",
                                     "Failed to load <include> file"),
     "SDF of two models": ("sdf", sdf("</model><model name='n'>"), "cannot be read as a robot"),
@@ -228,18 +228,18 @@ ASSUMED = {
                           "limits in rad, though more than 25.13 apart, for j3"),
     "massless": (arm(l3=link("l3", "")), "no inertia of l3"),
     "an inertia of rounded numbers": (with_inertial(('izz="0.01"', 'izz="0.040001"')),
-                                      "rounded numbers made a body's for l3"),
+                                      "an inertia corrected for rounding of l3"),
     "a base of an impossible inertia": (arm(l0=link("l0", INERTIAL.replace("0.01", "0.05"))),
-                                        "inertia, which no joint of the arm moves, for l0"),
+                                        "corrected, which no joint of the arm moves, of l0"),
     "the same of a base that is screwed down": (
         arm(l0=link("mount", "") + joint(1, "fixed", "", "mount", "l0", "bolts")
-            + link("l0", INERTIAL.replace("0.01", "0.05"))), "joint of the arm moves, for l0"),
+            + link("l0", INERTIAL.replace("0.01", "0.05"))), "joint of the arm moves, of l0"),
     "an impossible inertia beside the arm": (
         arm(beyond=link("x", INERTIAL.replace('ixx="0.02"', 'ixx="-2"'))
-            + joint(8, parent="l0", child="x")), "which no joint of the arm moves, for x"),
+            + joint(8, parent="l0", child="x")), "which no joint of the arm moves, of x"),
     "an inertia that is rounding": (
         with_inertial(('ixx="0.02" ixy="0"', 'ixx="0" ixy="2e-35"'), ('"0.02"', '"0"'),
-                      ('"0.01"', '"0"')), "rounded numbers made a body's for l3"),
+                      ('"0.01"', '"0"')), "an inertia corrected for rounding of l3"),
     "a mesh missing": (shaped('<mesh filename="package://none/a.stl"/>'),
                        "shapes are missing of l3: meshes were not found .--package-path"),
     "a mesh of no kind": (shaped('<mesh filename="arm.urdf"/>'), ".urdf meshes cannot be read"),
@@ -251,14 +251,14 @@ ASSUMED = {
     "a base that floats": (arm(l0=WORLD + joint(1, "floating", "", "world", "l0", "free")),
                            "welded to the world, where it may float: l0"),
     "dry friction": (arm(j3=joint(3, inside='<dynamics friction="2"/>')),
-                     "not the model's own dry friction of j3"),
-    "four joints": (arm(4).replace('"l4"', '"l6"'), "with 4 joints the tool follows as far as"),
+                     "no dry friction, which the model has, of j3"),
+    "four joints": (arm(4).replace('"l4"', '"l6"'), "4 joints the tool follows part of the pose"),
     "nine joints": (arm(9).replace('"l6"', '"x"').replace('"l9"', '"l6"'), "acceleration limits"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", ERRORS)
-def test_what_cannot_be_is_one_error(tmp_path, case):
+def test_faulty_model_raises_one_error(tmp_path, case):
     suffix, text, expected = ERRORS[case]
     path, other = tmp_path / f"arm.{suffix}", tmp_path / "other.urdf"
     tool = Tool(mass=1.0)
@@ -276,7 +276,7 @@ def test_what_cannot_be_is_one_error(tmp_path, case):
 
 
 @pytest.mark.parametrize("case", ASSUMED)
-def test_what_is_missing_is_assumed_and_named(tmp_path, case):
+def test_missing_data_become_named_assumptions(tmp_path, case):
     path = tmp_path / "arm.urdf"
     path.write_text(ASSUMED[case][0])
     joints = {"four joints": 4, "nine joints": 9}.get(case, 6)
@@ -285,8 +285,8 @@ def test_what_is_missing_is_assumed_and_named(tmp_path, case):
     assert re.search(ASSUMED[case][1], "; ".join(assumed))
 
 
-def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
-    """Of the same arm with other limits each time, in places that it can reach."""
+def test_start_posture_avoids_joint_limits(tmp_path):
+    """One arm with different limits, at reachable positions."""
     path = tmp_path / "arm.urdf"
     path.write_text(arm())
     slave = Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0))
@@ -303,8 +303,8 @@ def test_an_arm_starts_away_from_its_limits_if_it_can(tmp_path):
     assert of_home[of_first].all() and of_home.sum() > 1.3 * of_first.sum()
 
 
-def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
-    """In its place Drake takes a ball's: 0.005, and not 0.02 and 0.04 kg m^2."""
+def test_rounded_inertia_is_preserved(tmp_path):
+    """Drake would replace it by that of a ball: 0.005 instead of 0.02 and 0.04 kg m^2."""
     path, plant = tmp_path / "arm.urdf", MultibodyPlant(0.0)
     path.write_text(ASSUMED["an inertia of rounded numbers"][0])
     ParseSlave(plant, Slave(model=str(path), sensor_frame="l6", home=HOME, tool=Tool(mass=1.0)))
@@ -321,13 +321,13 @@ def test_an_inertia_of_rounded_numbers_stays_what_it_is(tmp_path):
         ({"home": [], "position": [3.0, 0.0, 0.4]}, "slave.position: the arm cannot reach"),
         ({"home": [3.0, *HOME[1:]]}, "slave.home: j1 at 3 is outside -2.5 to 2.5"),
         ({"home": HOME[:5]}, "slave.home: 5 joint positions for 6 joints"),
-        ({"tip": [0.0, 0.1]}, "slave.tip: has to be a list"),
+        ({"tip": [0.0, 0.1]}, "slave.tip: must be a list"),
         ({"tool": Tool(mass=90.0)}, "slave.tool: the arm cannot hold its 90 kg .* j2 needs"),
         ({"tool": Tool(model="none.sdf")}, "none.sdf: there is no such file"),
         ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: nothing with a mass hangs on tcp"),
     ],
 )  # fmt: skip
-def test_what_a_scenario_says_of_a_good_model(tmp_path, change, expected):
+def test_invalid_settings_of_valid_model_raise_error(tmp_path, change, expected):
     path = tmp_path / "arm.urdf"
     tcp = '<joint name="t" type="fixed"><parent link="l6"/><child link="tcp"/></joint>'
     path.write_text(arm(beyond=link("tcp", "") + tcp))
@@ -339,14 +339,14 @@ def test_what_a_scenario_says_of_a_good_model(tmp_path, change, expected):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (sdf("<link name='a'/><link name='b'/>"), "a, b can be put on the sensor"),
+        (sdf("<link name='a'/><link name='b'/>"), "2 roots: a, b"),
         (sdf("<link name='a'><inertial><mass>0</mass></inertial></link>"), "an inertia, but no"),
         (sdf(sdf_joint("revolute", "<axis><xyz>0 0 1</xyz><dynamics><spring_stiffness>3"
                        "</spring_stiffness></dynamics></axis>")), "has springs"),
         ("", "tool.sdf: is not XML"),
     ],
 )  # fmt: skip
-def test_tools_that_are_none(tmp_path, text, expected):
+def test_invalid_tool_raises_error(tmp_path, text, expected):
     path, tool = tmp_path / "arm.urdf", tmp_path / "tool.sdf"
     path.write_text(arm())
     tool.write_text(text)

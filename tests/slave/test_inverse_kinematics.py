@@ -1,4 +1,4 @@
-"""The closed-form inverse kinematics of the RX90 against the plant and against its own forward."""
+"""Closed-form inverse kinematics of the RX90 against the plant and the forward kinematics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def forward(arm, q):
     return R, p
 
 
-def turned(difference):
+def angle_difference(difference):
     return difference - 2 * np.pi * np.round(difference / (2 * np.pi))
 
 
@@ -61,13 +61,13 @@ def test_lengths_are_those_of_the_model(plant):
 
 
 @pytest.mark.slow
-def test_random_poses_come_back_and_all_eight_branches_meet_them(arm):
+def test_all_eight_branches_meet_random_poses(arm):
     rng = np.random.default_rng(0)
     for _ in range(10_000):
         q = rng.uniform(arm.lower, arm.upper)
         R, p = forward(arm, q)
         branches = inverse_kinematics(R, p)
-        assert np.abs(turned(branches - q)).max(axis=1).min() < 1e-9
+        assert np.abs(angle_difference(branches - q)).max(axis=1).min() < 1e-9
         for branch in branches:
             R_branch, p_branch = forward(arm, branch)
             assert np.abs(R_branch - R).max() < 1e-9
@@ -77,13 +77,15 @@ def test_random_poses_come_back_and_all_eight_branches_meet_them(arm):
         np.testing.assert_allclose(nearest, q, atol=1e-9)
 
 
-def test_branches_are_where_the_docstring_says(arm):
+def test_row_order_of_branches(arm):
     q = np.array([0.3, -0.5, -1.2, 0.4, 0.8, -0.6])
     branches = inverse_kinematics(*forward(arm, q))
     np.testing.assert_allclose(branches[2], q, atol=1e-12)
     assert np.all(branches[[0, 1, 4, 5], 2] > 0) and np.all(branches[[2, 3, 6, 7], 2] < 0)
     assert np.all(branches[0::2, 4] > 0) and np.all(branches[1::2, 4] < 0)
-    np.testing.assert_allclose(turned(branches[4:, 0] - branches[:4, 0] - np.pi), 0, atol=1e-12)
+    np.testing.assert_allclose(
+        angle_difference(branches[4:, 0] - branches[:4, 0] - np.pi), 0, atol=1e-12
+    )
     assert len(np.unique(branches.round(6), axis=0)) == 8
     assert np.all(np.abs(branches) <= np.pi)
 
@@ -99,7 +101,7 @@ def test_every_branch_meets_the_pose_in_the_plant(plant):
         np.testing.assert_allclose(X_WS.translation(), P_HOME, atol=1e-12)
 
 
-def test_home_has_the_elbow_up_and_is_well_inside_the_limits(arm):
+def test_home_has_elbow_up_and_margin_to_limits(arm):
     q, status = nearest_branch(R_DOWN, P_HOME, Q_HOME, arm.lower, arm.upper)
     assert status == IkStatus.OK
     np.testing.assert_allclose(q, Q_HOME, atol=1e-6)
@@ -107,7 +109,7 @@ def test_home_has_the_elbow_up_and_is_well_inside_the_limits(arm):
 
 
 @pytest.mark.parametrize("turn", [-2 * np.pi, 0.0, 2 * np.pi])
-def test_the_turn_nearest_to_the_reference_within_the_limits(arm, turn):
+def test_full_rotation_nearest_to_reference_is_selected(arm, turn):
     q = np.array([0.2, -0.4, -1.3, 0.3, -0.7, -2.0])
     near = q + np.array([0, 0, 0, 0, 0, turn])
     found, status = nearest_branch(*forward(arm, q), near, arm.lower, arm.upper)
@@ -116,7 +118,7 @@ def test_the_turn_nearest_to_the_reference_within_the_limits(arm, turn):
     np.testing.assert_allclose(found, [*q[:5], inside], atol=1e-12)
 
 
-def test_out_of_reach_the_arm_stretches_towards_the_pose(arm):
+def test_arm_stretches_towards_pose_out_of_reach(arm):
     direction = np.array([0.64, -0.6, -0.48])
     shoulder = np.array([0, 0, ik.SHOULDER_HEIGHT])
     p = shoulder + 1.3 * direction + ik.FLANGE * R_DOWN[:, 2]
@@ -130,7 +132,7 @@ def test_out_of_reach_the_arm_stretches_towards_the_pose(arm):
     np.testing.assert_allclose(wrist, shoulder + reach * direction, atol=1e-12)
 
 
-def test_at_the_wrist_singularity_q4_is_kept_and_q6_takes_the_rest(arm):
+def test_q4_is_kept_at_wrist_singularity(arm):
     reference = np.array([0.1, -0.5, -1.0, 0.7, 0.02, -0.1])
     R, p = forward(arm, [0.1, -0.5, -1.0, 0.2, 0.0, 0.9])
     q, status = nearest_branch(R, p, reference, arm.lower, arm.upper)
@@ -140,7 +142,7 @@ def test_at_the_wrist_singularity_q4_is_kept_and_q6_takes_the_rest(arm):
 
 
 @pytest.mark.parametrize("q5", [1e-15, 1e-12, 1e-10, 2e-9, 1e-8, 1e-6, 1e-4])
-def test_near_the_wrist_singularity_the_pose_is_still_met(arm, q5):
+def test_pose_is_met_near_wrist_singularity(arm, q5):
     R, p = forward(arm, [0.1, -0.5, -1.0, 2.0, q5, -0.4])
     reference = np.array([0.1, -0.5, -1.0, 0.3, 0.0, 1.3])
     q, _ = nearest_branch(R, p, reference, arm.lower, arm.upper)
@@ -151,7 +153,7 @@ def test_near_the_wrist_singularity_the_pose_is_still_met(arm, q5):
     assert abs(q[3] - 0.3) <= np.pi / 2 + 1e-6
 
 
-def test_at_the_shoulder_singularity_q1_is_kept(arm):
+def test_q1_is_kept_at_shoulder_singularity(arm):
     # q3 = -2 q2 puts the wrist's centre above the shoulder.
     R, p = forward(arm, [0.4, -0.5, 1.0, 0.2, 0.5, 0.1])
     reference = np.array([0.9, -0.4, 1.1, 0.1, 0.4, 0.1])
@@ -163,7 +165,7 @@ def test_at_the_shoulder_singularity_q1_is_kept(arm):
     np.testing.assert_allclose(p_found, p, atol=1e-9)
 
 
-def test_branches_outside_the_limits_are_not_taken(arm):
+def test_branches_outside_limits_are_rejected(arm):
     lower, upper = arm.lower.copy(), arm.upper.copy()
     lower[4] = 0.0
     q, status = nearest_branch(R_DOWN, P_HOME, Q_HOME, lower, upper)
@@ -176,7 +178,7 @@ def test_branches_outside_the_limits_are_not_taken(arm):
     np.testing.assert_array_equal(held, np.clip(Q_HOME, lower, upper))
 
 
-def test_a_pose_on_a_limit_is_inside(arm):
+def test_pose_on_limit_is_accepted(arm):
     q = np.array([arm.upper[0], -0.5, arm.lower[2], arm.upper[3], arm.lower[4], 0.0])
     found, status = nearest_branch(*forward(arm, q), q, arm.lower, arm.upper)
     assert status == IkStatus.OK
@@ -184,7 +186,7 @@ def test_a_pose_on_a_limit_is_inside(arm):
     assert np.all(found >= arm.lower) and np.all(found <= arm.upper)
 
 
-def test_branches_further_than_max_step_are_not_taken(arm):
+def test_branches_beyond_max_step_are_rejected(arm):
     reference = Q_HOME + np.array([0, 0, 0, 0, 2.5, 0])
     held, status = nearest_branch(R_DOWN, P_HOME, reference, arm.lower, arm.upper, max_step=1.5)
     assert status == IkStatus.JOINT_LIMIT
@@ -192,20 +194,20 @@ def test_branches_further_than_max_step_are_not_taken(arm):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e9])
-def test_a_pose_that_is_no_number_holds_the_reference(arm, bad):
+def test_invalid_pose_holds_reference(arm, bad):
     p = P_HOME + np.array([0, bad, 0])
     q, status = nearest_branch(R_DOWN, p, Q_HOME, arm.lower, arm.upper)
     assert status == IkStatus.BAD_POSE
     np.testing.assert_array_equal(q, Q_HOME)
 
 
-def test_of_a_reference_that_is_no_number_nothing_follows(arm):
+def test_invalid_reference_gives_invalid_result(arm):
     reference = np.where(np.arange(6) == 3, np.nan, Q_HOME)
     q, status = nearest_branch(R_DOWN, P_HOME, reference, arm.lower, arm.upper)
     assert status == IkStatus.BAD_POSE and np.isnan(q).all()
 
 
-def test_whatever_is_asked_the_answer_is_finite_and_within_the_limits(arm):
+def test_result_is_finite_and_within_limits_for_any_pose(arm):
     rng = np.random.default_rng(3)
     seen = set()
     for k in range(3000):

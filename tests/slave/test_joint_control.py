@@ -37,7 +37,7 @@ def torque(arm, command, q, v):
     return out
 
 
-def test_at_the_setpoint_it_holds_the_arm_against_gravity(arm):
+def test_torque_at_setpoint_compensates_gravity(arm):
     q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
     gravity = np.zeros(6)
     inverse_dynamics(arm.table, q, np.zeros(6), np.zeros(6), gravity)
@@ -45,7 +45,7 @@ def test_at_the_setpoint_it_holds_the_arm_against_gravity(arm):
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e9])
-def test_without_encoders_the_motors_carry_the_arm_and_without_a_command_they_hold(arm, bad):
+def test_torque_with_invalid_encoders_or_command(arm, bad):
     q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
     one = np.where(np.arange(6) == 2, bad, 0.0)
     gravity = torque(arm, q, q, np.zeros(6))
@@ -54,8 +54,8 @@ def test_without_encoders_the_motors_carry_the_arm_and_without_a_command_they_ho
     np.testing.assert_array_equal(torque(arm, q + one, q, np.zeros(6)), 0.0)  # what stood there
 
 
-def test_the_joints_do_not_disturb_each_other(arm):
-    """Computed torque: an error of one joint accelerates that joint alone."""
+def test_joints_are_decoupled(arm):
+    """Computed torque: the error of one joint accelerates this joint only."""
     q, error = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), np.zeros(6)
     error[1] = 0.001
     wanted = np.zeros(6)
@@ -65,7 +65,7 @@ def test_the_joints_do_not_disturb_each_other(arm):
     np.testing.assert_allclose(torque(arm, q + error, q, np.zeros(6)), expected, rtol=1e-12)
 
 
-def test_torque_stays_within_the_motors_limits(arm):
+def test_torque_stays_within_motor_limits(arm):
     q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
     far = torque(arm, q + 3.0, q, np.zeros(6))
     assert (np.abs(far) <= arm.effort_limit).all()
@@ -73,8 +73,8 @@ def test_torque_stays_within_the_motors_limits(arm):
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize("share", [0.999, 1.0, 1.001])
-def test_at_its_speed_limit_a_joint_is_not_accelerated_any_more(arm, way, share):
-    """However far away the setpoint is; beyond the limit it is braked, by the block as by hand."""
+def test_joint_does_not_accelerate_beyond_speed_limit(arm, way, share):
+    """Beyond the limit it brakes, however far the setpoint; the block equals the formula."""
     q, config = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), JointControlConfig()
     limit = way * arm.velocity_limit
     braking = 2 * np.pi * config.velocity_bandwidth_hz * (1.0 - share) * limit

@@ -1,4 +1,4 @@
-"""Dry friction in the arm's joints: the plant has it, the compiled dynamics too, no controller."""
+"""Dry joint friction: in the plant and the compiled dynamics, but in no controller."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ FRICTION = [11.1, 16.7, 7.0, 0.84, 0.9, 0.28]  # N m, about 30 N at the tool
 
 
 class Arm:
-    """The plant by itself, with motors that hold a torque."""
+    """The plant alone, with constant motor torques."""
 
     def __init__(self, friction):
         builder = DiagramBuilder()
@@ -49,8 +49,8 @@ def arm():
 
 
 @pytest.mark.parametrize("speed", [0.3 * FRICTION_SPEED, 0.4])
-def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, speed):
-    """What computed torque means to be a motion lacks the friction, of which it is not told."""
+def test_friction_is_in_dynamics_but_not_in_computed_torque(arm, speed):
+    """Computed torque does not compensate the friction."""
     random, table = np.random.default_rng(3), arm.slave.arm.table
     torque, compiled = np.empty(6), np.empty(6)
     for _ in range(10):
@@ -67,14 +67,14 @@ def test_plant_and_compiled_dynamics_have_it_and_computed_torque_does_not(arm, s
         np.testing.assert_allclose(missing - torque, slip, atol=1e-10)
 
 
-def test_a_steady_joint_takes_all_of_it_from_the_motor(arm):
+def test_motor_balances_friction_at_constant_speed(arm):
     q, v, torque = arm.slave.start, np.array([0.1, -0.1, 0.1, -0.1, 0.1, -0.1]), np.empty(6)
     inverse_dynamics(arm.slave.arm.table, q, v, np.zeros(6), torque)
     arm.put(q, v, torque + np.sign(v) * FRICTION)
     np.testing.assert_allclose(arm.acceleration(), 0.0, atol=1e-9)
 
 
-def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
+def test_joint_creeps_below_friction_torque(arm):
     weight, share = np.empty(6), np.array([0.5, -0.5, 0.9, 0.2, 0.0, -0.7])
     still = np.zeros(6)
     inverse_dynamics(arm.slave.arm.table, arm.slave.start, still, still, weight)
@@ -88,8 +88,8 @@ def test_less_torque_than_friction_moves_a_joint_by_creeping_alone(arm):
     assert (np.abs(q - arm.slave.start) <= 0.1 * 2e-3 * np.arctanh(np.abs(share)) + 1e-5).all()
 
 
-def test_it_takes_energy_and_never_gives_any(arm):
-    """The arm swings on with no torque but its friction: what is lost is friction's work."""
+def test_friction_only_dissipates(arm):
+    """An arm swings without torque; the lost energy equals the friction's work."""
     v = np.array([1.0, -0.8, 0.9, -2.0, 1.5, 3.0])
     arm.put(arm.slave.start, v, np.zeros(6))
     arm.simulator.get_mutable_context().SetTime(0.0)
@@ -106,7 +106,7 @@ def test_it_takes_energy_and_never_gives_any(arm):
     assert energies[-1] - energies[0] == pytest.approx(lost, rel=1e-3)
 
 
-def test_one_number_is_for_all_and_none_adds_nothing():
+def test_one_friction_value_applies_to_all_joints():
     for friction, expected in (([2.0], 6 * [2.0]), ([], 6 * [0.0])):
         builder = DiagramBuilder()
         slave = AddSlavePlant(builder, Slave(friction=friction), None)
@@ -118,12 +118,12 @@ def test_one_number_is_for_all_and_none_adds_nothing():
     ("friction", "expected"),
     [
         ([1.0, 2.0], "slave.friction: has 2 numbers, the arm has 6 joints"),
-        ([-1.0], "slave.friction: has to be a list of finite numbers from 0 on"),
-        ([float("nan")], "slave.friction: has to be a list"),
+        ([-1.0], "slave.friction: must be a list of finite numbers >= 0"),
+        ([float("nan")], "slave.friction: must be a list"),
         ([4.0], "slave.friction: the friction stops a joint within 0.0.. ms, too fast for steps"),
     ],
 )
-def test_what_cannot_be_is_one_line(friction, expected):
+def test_invalid_friction_raises_one_line(friction, expected):
     scenario = replace(
         LoadScenario("free_motion_force"), slave__friction=friction, force_scaling__sigma=1.0
     )

@@ -1,14 +1,14 @@
-"""One period of an excitation trajectory, begun late, at rest before and after."""
+"""One delayed period of an excitation trajectory, at rest before and after."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from drake_teleop.load.trajectory import FourierTrajectory
-from drake_teleop.station.slave.joint_trajectory import JointTrajectory
+from drake_teleop.station.slave.joint_commands import JointTrajectory
 
 
-def test_it_rests_then_plays_once_then_rests_again():
+def test_trajectory_rests_before_and_after_one_period():
     rng = np.random.default_rng(0)
     trajectory = FourierTrajectory(rng.normal(size=6), *rng.normal(size=(2, 6, 2)), 0.5)
     start, period = 1.25, trajectory.period

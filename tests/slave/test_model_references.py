@@ -1,4 +1,4 @@
-"""Files that a model names are read inside its folder and packages; nothing ends the process."""
+"""Referenced files are read only inside the model folder and packages; no file ends the process."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def gltf(**more: object) -> dict:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Of a model, beside a file that is somebody else's."""
+    """Folder of a model, beside a secret file."""
     (tmp_path / "secret.png").write_bytes(b"secret")
     (tmp_path / "other.sdf").write_text(sdf('<link name="l"/>'))
     (tmp_path / "solid.obj").write_text(SOLID)
@@ -83,7 +83,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def write(folder: Path, **files: str | dict) -> Path:
-    """The first of some files, whose names have _ for the point."""
+    """Write files, with _ for the point in their names; return the first."""
     paths = [folder / name.replace("_", ".", 1) for name in files]
     for path, content in zip(paths, files.values(), strict=True):
         path.write_text(content if isinstance(content, str) else json.dumps(content))
@@ -107,7 +107,7 @@ IMAGES = {
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_a_gltf_reads_no_file_outside(folder: Path, name: str) -> None:
+def test_gltf_reads_no_file_outside_folder(folder: Path, name: str) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=IMAGES[name](folder))
     assert any(OUTSIDE in words for words in parse(path).assumptions)
 
@@ -146,7 +146,7 @@ def test_an_obj_reads_no_material_and_no_texture_outside(
         *("package://home/solid.obj", "package://../solid.obj", "package://away/solid.obj"),
     ],
 )
-def test_a_mesh_outside_is_left_out_and_the_remedy_named(tmp_path: Path, where: str) -> None:
+def test_mesh_outside_folder_is_removed_with_remedy(tmp_path: Path, where: str) -> None:
     home = tmp_path / "home"
     (home / "model").mkdir(parents=True)
     (home / "solid.obj").write_text(SOLID)
@@ -162,24 +162,27 @@ def test_a_mesh_outside_is_left_out_and_the_remedy_named(tmp_path: Path, where: 
     assert not any("shapes" in words for words in parse(path).assumptions)
 
 
-def circle(text: Callable[[str], str], *names: str) -> dict[str, str]:
-    """Files that name each other."""
+def include_cycle(text: Callable[[str], str], *names: str) -> dict[str, str]:
+    """Return files that include each other."""
     others = (*names[1:], names[0])
     return {name.replace(".", "_"): text(other) for name, other in zip(names, others, strict=True)}
 
 
 INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
-    "sdf itself": (lambda _: circle(including, "a.sdf"), "names itself"),
-    "sdf in a circle": (lambda _: circle(including, "a.sdf", "b.sdf", "c.sdf"), "names itself"),
+    "sdf itself": (lambda _: include_cycle(including, "a.sdf"), "names itself"),
+    "sdf in a circle": (
+        lambda _: include_cycle(including, "a.sdf", "b.sdf", "c.sdf"),
+        "names itself",
+    ),
     "sdf by file": (lambda f: {"a_sdf": including(f"file://{f}/a.sdf")}, "names itself"),
     "sdf outside": (lambda _: {"a_sdf": including("../other.sdf")}, OUTSIDE),
     "a fifo": (lambda _: {"a_sdf": including("fifo.sdf")}, "which is no file"),
     "mjcf itself": (
-        lambda _: circle(lambda to: mjcf(f'<include file="{to}"/>'), "a.xml"),
+        lambda _: include_cycle(lambda to: mjcf(f'<include file="{to}"/>'), "a.xml"),
         "names itself",
     ),
     "mjcf in a circle": (
-        lambda _: circle(
+        lambda _: include_cycle(
             lambda to: mjcf(f'<worldbody><include file="{to}"/></worldbody>'), "a.xml", "b.xml"
         ),
         "names itself",
@@ -209,7 +212,9 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
         OUTSIDE,
     ),
     "directives themselves": (
-        lambda f: circle(lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml"),
+        lambda f: include_cycle(
+            lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml"
+        ),
         "names itself",
     ),
     "directives through a folder that is not there": (
@@ -217,7 +222,7 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
         "names itself",
     ),
     "directives in a circle": (
-        lambda f: circle(
+        lambda f: include_cycle(
             lambda to: directive(f"file://{f}/{to}", "add_directives"), "a.yaml", "b.yaml"
         ),
         "names itself",
@@ -259,7 +264,7 @@ INCLUDES: dict[str, tuple[Callable[[Path], dict[str, str]], str]] = {
 
 
 @pytest.mark.parametrize("name", INCLUDES)
-def test_an_include_that_may_not_be_is_one_line(folder: Path, name: str) -> None:
+def test_invalid_include_raises_one_line(folder: Path, name: str) -> None:
     make, says = INCLUDES[name]
     os.mkfifo(folder / "fifo.sdf")
     path = write(folder, **make(folder))
@@ -267,8 +272,8 @@ def test_an_include_that_may_not_be_is_one_line(folder: Path, name: str) -> None
         parse(path)
 
 
-def test_a_name_of_any_length_is_one_line(folder: Path) -> None:
-    """Drake's pattern for addresses ends the process on a long one."""
+def test_long_file_name_raises_one_line(folder: Path) -> None:
+    """Drake's regular expression for addresses aborts on a long one."""
     long = "file://" + "a" * 30_000
     path = folder / "a.yaml"
     path.write_text(f"directives: [add_directives: {{file: '{long}'}}]")
@@ -276,7 +281,7 @@ def test_a_name_of_any_length_is_one_line(folder: Path) -> None:
         parse(path)
 
 
-def test_joints_in_a_circle_are_one_line(folder: Path) -> None:
+def test_joint_loop_raises_one_line(folder: Path) -> None:
     moments = 'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
     inertia = f'<inertial><mass value="1"/><inertia {moments}/></inertial>'
     links = "".join(f'<link name="{name}">{inertia}</link>' for name in "lab")
@@ -290,17 +295,17 @@ def test_joints_in_a_circle_are_one_line(folder: Path) -> None:
         parse(path)
 
 
-def test_a_file_where_the_process_is_is_none_of_the_model(
+def test_file_in_working_folder_is_outside_model(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Drake looks there for what included files include."""
+    """Drake resolves nested includes from the working directory."""
     monkeypatch.chdir(folder.parent)
     path = write(folder, a_sdf=including("b.sdf"), b_sdf=including("other.sdf"))
     with pytest.raises(DrakeTeleopError, match=OUTSIDE):
         parse(path)
 
 
-def test_too_large_files_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_large_files_are_rejected(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(folder, a_urdf=urdf("x.gltf"), x_gltf=gltf())
     monkeypatch.setattr(model_references, "_MAX_TEXT", 400)
     assert any("takes more than" in words for words in parse(path).assumptions)
@@ -310,7 +315,7 @@ def test_too_large_files_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("name", ["model", "robots #2", "a b%20", "ä:b"])
-def test_files_inside_are_read_wherever_the_process_is(
+def test_files_inside_are_read_from_any_working_folder(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / name

@@ -1,4 +1,4 @@
-"""The numeric inverse kinematics against the plants and the closed form, and where it cannot go."""
+"""Numeric inverse kinematics against plants and the closed form, also out of reach."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from drake_teleop.station.scenario import LoadScenario, replace
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import ArmModel, jacobian
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.ik_methods import METHODS
 from drake_teleop.station.slave.inverse_kinematics import (
     IkStatus,
     InverseKinematics,
     solve_pose_command,
 )
+from drake_teleop.station.slave.joint_commands import IK_METHODS
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
     MET,
     SINGULAR,
@@ -28,7 +28,7 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import (
     NumericInverseKinematics,
     find_posture,
     follow_pose,
-    turn_length,
+    orientation_length,
 )
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -42,7 +42,7 @@ BENT = np.array([0.2, -0.5, -1.6, 0.7, 0.8, 0.4])
 
 
 class Case(NamedTuple):
-    """An arm with the plant that says where it is."""
+    """An arm and its plant, which gives the true pose."""
 
     plant: object
     context: object
@@ -59,7 +59,7 @@ class Case(NamedTuple):
         return pose_of(self.X_WS(q))
 
     def errors(self, pose, q):
-        """[m], [rad]."""
+        """Return the errors of position [m] and orientation [rad]."""
         X = self.X_WS(q)
         R = RotationMatrix(X.rotation().inverse().matrix() @ quaternion(pose).matrix())
         return np.linalg.norm(pose[4:] - X.translation()), R.ToAngleAxis().angle()
@@ -99,14 +99,14 @@ def follow(case, pose, reference, *, max_step=np.inf, posture=None, pull=0.0):
     posture = np.array(reference if posture is None else posture, dtype=float)
     reference = np.array(reference, dtype=float)
     status = follow_pose(
-        arm.table, turn_length(arm), pose, reference, arm.lower, arm.upper, far, posture, pull,
-        SINGULAR, STEPS, q,
+        arm.table, orientation_length(arm), pose, reference, arm.lower, arm.upper, far, posture,
+        pull, SINGULAR, STEPS, q,
     )  # fmt: skip
     return q, IkStatus(status)
 
 
 @pytest.mark.parametrize("name", ["rx90", "seven", "sliding"])
-def test_random_poses_are_met_from_afar(name, request):
+def test_search_meets_random_poses(name, request):
     case = request.getfixturevalue(name)
     lower, upper = case.arm.lower, case.arm.upper
     random = np.random.default_rng(2)
@@ -119,7 +119,7 @@ def test_random_poses_are_met_from_afar(name, request):
         assert np.all((lower <= q) & (q <= upper))
 
 
-def test_on_the_rx90_it_is_the_closed_form(rx90):
+def test_rx90_result_equals_closed_form(rx90):
     arm, random = rx90.arm, np.random.default_rng(3)
     closed = np.empty(6)
     for _ in range(100):
@@ -132,8 +132,8 @@ def test_on_the_rx90_it_is_the_closed_form(rx90):
         np.testing.assert_allclose(found, closed, rtol=0, atol=1e-9)
 
 
-def test_of_all_turns_the_one_nearest_to_the_reference(rx90):
-    """Joints 4 and 6 turn by more than 360 degrees."""
+def test_full_rotation_nearest_to_reference_is_selected(rx90):
+    """Joints 4 and 6 have ranges above 360 degrees."""
     q = np.array([0.2, -0.5, -1.6, 0.7, 0.6, 4.0])
     assert q[5] < rx90.arm.upper[5]
     found, status = find_posture(rx90.arm, rx90.pose(q), np.append(q[:5], 3.9))
@@ -143,7 +143,7 @@ def test_of_all_turns_the_one_nearest_to_the_reference(rx90):
     np.testing.assert_allclose(found, [*q[:5], 4.0 - 2 * np.pi], atol=1e-9)
 
 
-def lost_axis(case, q):
+def singular_axis(case, q):
     J = np.empty((6, len(q)))
     jacobian(case.arm.table, q, J)
     axis = np.linalg.svd(J)[0][3:, 5]
@@ -151,12 +151,12 @@ def lost_axis(case, q):
 
 
 def sweep(case, q, solve):
-    """S turns to and fro about the axis about which it can hardly turn at q.
+    """Rotate S back and forth about the axis with the smallest singular value at q.
 
     Returns:
-        Largest step as part of what speeds allow; errors at the end; statuses.
+        Largest step as a share of the speed limits; errors at the end; statuses.
     """
-    axis = lost_axis(case, q)
+    axis = singular_axis(case, q)
     X, largest, statuses = case.X_WS(q), 0.0, set()
     for k in range(3000):
         half = 0.15 * np.sin(min(k * PERIOD, 1.0) * 2 * np.pi)
@@ -171,7 +171,7 @@ def sweep(case, q, solve):
 
 
 @pytest.mark.parametrize("aside", [0.0, 1e-3])
-def test_through_a_singular_wrist_no_joint_is_faster_than_it_can_be(rx90, aside):
+def test_joint_speed_stays_within_limits_at_singular_wrist(rx90, aside):
     arm, start = rx90.arm, np.array([*STRETCHED[:4], aside, STRETCHED[5]])
 
     def closed(pose, reference):
@@ -189,10 +189,10 @@ def test_through_a_singular_wrist_no_joint_is_faster_than_it_can_be(rx90, aside)
     assert IkStatus.JOINT_LIMIT not in statuses
 
 
-def test_next_to_nothing_at_a_singularity_sets_nothing_in_motion(rx90):
-    """Joints 4 and 6 would turn far for 1e-7 rad."""
+def test_small_error_at_singularity_causes_no_motion(rx90):
+    """Joints 4 and 6 would rotate far for 1e-7 rad."""
     X, q = rx90.X_WS(STRETCHED), STRETCHED
-    turn = np.array([1.0, *(0.5e-7 * lost_axis(rx90, STRETCHED))])
+    turn = np.array([1.0, *(0.5e-7 * singular_axis(rx90, STRETCHED))])
     pose = pose_of(RigidTransform(quaternion(turn) @ X.rotation(), X.translation()))
     for _ in range(200):
         q, _ = follow(rx90, pose, q, max_step=rx90.arm.velocity_limit * PERIOD)
@@ -200,8 +200,8 @@ def test_next_to_nothing_at_a_singularity_sets_nothing_in_motion(rx90):
 
 
 @pytest.mark.parametrize(("max_step", "pull"), [(0.01, 0.02), (1e-3, 1.0)])
-def test_what_is_left_over_goes_to_the_posture(seven, max_step, pull):
-    """Away along what the pose leaves open, and back, while the pose is met."""
+def test_null_space_motion_approaches_posture(seven, max_step, pull):
+    """The arm moves in its null space and returns; the pose is met."""
     home, J = np.full(7, 0.4), np.empty((6, 7))
     jacobian(seven.arm.table, home, J)
     pose, q, away = seven.pose(home), home, []
@@ -214,7 +214,7 @@ def test_what_is_left_over_goes_to_the_posture(seven, max_step, pull):
     assert away[0] > 0.1 and away[1] < 1e-3
 
 
-def test_the_posture_does_not_shake_an_arm_that_cannot_reach(sliding):
+def test_posture_causes_no_oscillation_out_of_reach(sliding):
     home = np.array([0.2, 0.6, -0.4, 0.3, 0.9, -0.5, 0.4])
     pose, q, moved = sliding.pose(home), home, 0.0
     pose[4:] += [-3.0, 1.0, 2.0]
@@ -226,7 +226,7 @@ def test_the_posture_does_not_shake_an_arm_that_cannot_reach(sliding):
     assert moved < 1e-3
 
 
-def test_out_of_reach_it_comes_near_stands_still_and_comes_back(rx90):
+def test_arm_stops_at_boundary_and_returns(rx90):
     start, max_step = BENT, rx90.arm.velocity_limit * PERIOD
     pose = rx90.pose(start)
     far = pose.copy()
@@ -244,7 +244,7 @@ def test_out_of_reach_it_comes_near_stands_still_and_comes_back(rx90):
     np.testing.assert_allclose(q, start, atol=1e-8)
 
 
-def test_at_a_limit_the_others_do_what_they_can(rx90):
+def test_other_joints_compensate_for_joint_at_limit(rx90):
     beyond = BENT.copy()
     beyond[0] = rx90.arm.upper[0] + 0.2
     pose, start = rx90.pose(beyond), BENT.copy()
@@ -253,13 +253,13 @@ def test_at_a_limit_the_others_do_what_they_can(rx90):
     assert status == IkStatus.JOINT_LIMIT
     assert q[0] == rx90.arm.upper[0]
     only_this_joint = np.append(q[0], beyond[1:])
-    L = turn_length(rx90.arm)
+    L = orientation_length(rx90.arm)
     ours, simply = (np.hypot(p, L * turn) for p, turn in (
         rx90.errors(pose, q), rx90.errors(pose, only_this_joint)))  # fmt: skip
     assert ours < 0.8 * simply
 
 
-def test_faster_than_allowed_it_lags(sliding):
+def test_arm_lags_beyond_speed_limit(sliding):
     max_step = np.full(7, 1e-3)
     start = np.full(7, 0.4)
     q, status = follow(sliding, sliding.pose(start + 0.1), start, max_step=max_step)
@@ -270,7 +270,7 @@ def test_faster_than_allowed_it_lags(sliding):
 @pytest.mark.parametrize(
     ("place", "value"), [(0, np.nan), (5, np.inf), (5, 2e6), (slice(0, 4), 0.0)]
 )
-def test_what_is_no_pose_is_held_out(rx90, place, value):
+def test_invalid_pose_holds_command(rx90, place, value):
     pose = rx90.pose(BENT)
     pose[place] = value
     q, status = follow(rx90, pose, [BENT[0], 9.0, *BENT[2:]])
@@ -279,18 +279,18 @@ def test_what_is_no_pose_is_held_out(rx90, place, value):
     assert find_posture(rx90.arm, pose, BENT)[1] == IkStatus.BAD_POSE
 
 
-def test_from_nowhere_it_goes_nowhere(rx90):
+def test_invalid_reference_gives_invalid_result(rx90):
     q, status = follow(rx90, rx90.pose(BENT), np.full(6, np.nan))
     assert status == IkStatus.BAD_POSE and np.isnan(q).all()
 
 
-def test_what_cannot_be_met_says_so(rx90):
+def test_status_of_unreachable_pose(rx90):
     pose = rx90.pose(BENT)
     pose[4:] *= 3.0
     assert find_posture(rx90.arm, pose, BENT)[1] in (IkStatus.OUT_OF_REACH, IkStatus.JOINT_LIMIT)
 
 
-def test_the_system_goes_on_from_its_last_command(rx90):
+def test_system_continues_from_last_command(rx90):
     system = NumericInverseKinematics(rx90.arm, BENT, PERIOD)
     context = system.CreateDefaultContext()
     system.GetInputPort("joint_position").FixValue(context, BENT - 0.02)
@@ -316,7 +316,7 @@ def test_the_system_goes_on_from_its_last_command(rx90):
     assert len(follow_pose.signatures) == 1
 
 
-def test_in_no_time_nothing_moves_not_even_a_joint_without_a_limit(rx90):
+def test_command_is_constant_without_elapsed_time(rx90):
     arm = dataclasses.replace(rx90.arm, velocity_limit=np.full(6, np.inf))
     system = NumericInverseKinematics(arm, BENT, PERIOD)
     context = system.CreateDefaultContext()
@@ -330,8 +330,8 @@ def test_in_no_time_nothing_moves_not_even_a_joint_without_a_limit(rx90):
 
 
 @pytest.mark.parametrize(("period", "left"), [(0.01, np.exp(-1.0)), (0.1, 0.9**10), (3.0, 0.0)])
-def test_the_posture_is_neared_by_time_and_not_by_command(seven, period, left):
-    """In a second by all but 1/e of the way, in steps as they come, and never beyond it."""
+def test_posture_rate_is_independent_of_period(seven, period, left):
+    """1/e of the distance remains after 1 s, for any period, without overshoot."""
     home, J = np.full(7, 0.4), np.empty((6, 7))
     jacobian(seven.arm.table, home, J)
     pose, posture = seven.pose(home), home + 0.2 * np.linalg.svd(J)[2][6]
@@ -351,7 +351,7 @@ def test_the_posture_is_neared_by_time_and_not_by_command(seven, period, left):
 
 
 def test_methods_have_the_same_ports(rx90):
-    systems = [make(rx90.arm, BENT, PERIOD) for make in METHODS.values()]
+    systems = [make(rx90.arm, BENT, PERIOD) for make in IK_METHODS.values()]
     assert {type(system) for system in systems} == {InverseKinematics, NumericInverseKinematics}
     for ports in ("input", "output"):
         names = [
@@ -365,12 +365,12 @@ def test_methods_have_the_same_ports(rx90):
         assert names[0] == names[1]
 
 
-def test_in_the_station_both_lead_to_the_same(rx90):
+def test_station_gives_same_result_with_both_methods(rx90):
     scenario = LoadScenario("free_motion_force")
     scenario = replace(scenario, simulation__duration=0.04, load_estimator__enabled=True)
     commands = [
         simulate(MakeTeleopStation(s), s.simulation)["joint_command"]
-        for s in (replace(scenario, slave__inverse_kinematics=method) for method in METHODS)
+        for s in (replace(scenario, slave__inverse_kinematics=method) for method in IK_METHODS)
     ]
     assert np.ptp(commands[0], axis=0).max() > 1e-3
     np.testing.assert_allclose(commands[1], commands[0], atol=1e-8)

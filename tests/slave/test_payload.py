@@ -1,4 +1,4 @@
-"""A payload: the plant carries it, the sensor feels it, the identification finds it."""
+"""Payload: carried by the plant, measured by the sensor, identified as load."""
 
 from __future__ import annotations
 
@@ -15,31 +15,28 @@ from drake_teleop.load.inertia import mass_com_inertia, phi_from_mass_com_inerti
 from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.simulation import MakeSimulator, advance
-from drake_teleop.station.slave.payload import Payload
 from drake_teleop.station.slave.plant import AddSlavePlant
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.slave_config import Payload, Slave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
-HELD_WRENCH = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
+HELD = Payload(mass=2.0, com=[0.02, -0.03, 0.16])
 
 
-def test_it_adds_to_the_tools_parameters():
+def test_payload_adds_to_tool_parameters():
     bare = AddSlavePlant(DiagramBuilder(), Slave(), None).arm.phi_load
-    phi = slave_arm(replace(Scenario(), slave__payload=HELD_WRENCH)).phi_load
+    phi = slave_arm(replace(Scenario(), slave__payload=HELD)).phi_load
     # A steel ball of 2 kg has a radius of 39.3 mm.
-    ball = phi_from_mass_com_inertia(
-        2.0, np.array(HELD_WRENCH.com), 0.4 * 2.0 * 0.03933**2 * np.eye(3)
-    )
+    ball = phi_from_mass_com_inertia(2.0, np.array(HELD.com), 0.4 * 2.0 * 0.03933**2 * np.eye(3))
     np.testing.assert_allclose(phi - bare, ball, rtol=1e-4, atol=1e-15)
     nothing = slave_arm(replace(Scenario(), slave__payload=Payload(mass=0.0)))
     np.testing.assert_array_equal(nothing.phi_load, bare)
 
 
-def test_the_sensor_feels_it_as_its_joint_does():
+def test_sensor_wrench_includes_payload():
     swing = Sine(duration=10.0, ramp=0.1, frequency=3.0, translation=[0.01, 0.01, 0.03])
     scenario = replace(
         Scenario(), operator=OperatorConfig("firm", [swing]), wrist_sensor__ideal=True,
-        slave__payload=HELD_WRENCH,
+        slave__payload=HELD,
     )  # fmt: skip
     station = MakeTeleopStation(scenario)
     simulator = MakeSimulator(station, scenario.simulation)
@@ -62,8 +59,8 @@ def test_the_sensor_feels_it_as_its_joint_does():
 
 
 @pytest.mark.slow
-def test_the_identification_finds_it():
-    scenario = identification_scenario(replace(Scenario(), slave__payload=HELD_WRENCH), 1)
+def test_identification_includes_payload():
+    scenario = identification_scenario(replace(Scenario(), slave__payload=HELD), 1)
     mass, com, _ = mass_com_inertia(identify_load(scenario).estimate[6:])
     true_mass, true_com, _ = mass_com_inertia(slave_arm(scenario).phi_load)
     assert mass == pytest.approx(true_mass, rel=0.005)

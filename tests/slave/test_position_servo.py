@@ -1,4 +1,4 @@
-"""Arms that take joint positions: lag, dead time, limits, and torques that follow."""
+"""Arms with a position interface: lag, dead time, limits and torques."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.scenario import Scenario, ScenarioFromData, replace
 from drake_teleop.station.slave.arm import forward_dynamics, inverse_dynamics
-from drake_teleop.station.slave.joint_control import MakeJointControl
+from drake_teleop.station.slave.joint_control import MakeJointControl, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface
-from drake_teleop.station.slave.servo import servo_at_tool
 
 HOME = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
 PERIOD = 5e-4
@@ -27,9 +26,9 @@ def arm():
 
 
 def follow(arm, interface, command, steps):
-    """(steps, 12) [q; v] of the arm under the block's torque, and the torque (steps, 6).
+    """Return [q; v] (steps, 12) of the arm under the block's torque, and the torque (steps, 6).
 
-    The arm takes semi-implicit steps: the drives' loop, not the integrator, is what is looked at.
+    Integrates with semi-implicit steps.
     """
     config = dataclasses.replace(Scenario().joint_control, servo="position", interface=interface)
     block = MakeJointControl(arm, config, PERIOD, HOME)
@@ -49,7 +48,7 @@ def follow(arm, interface, command, steps):
     return np.array(states), np.array(torques)
 
 
-def test_a_steady_motion_is_followed_by_lookahead_dead_time_and_half_a_hold_later(arm):
+def test_lag_is_lookahead_plus_dead_time_plus_half_a_period(arm):
     speed = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.3])
     states, _ = follow(arm, UR, lambda t: HOME + speed * t, 2400)
     late = (HOME + speed * 2400 * PERIOD - states[-1, :6]) / speed
@@ -57,8 +56,8 @@ def test_a_steady_motion_is_followed_by_lookahead_dead_time_and_half_a_hold_late
     np.testing.assert_allclose(late, expected, atol=1.5 * PERIOD)
 
 
-def test_a_step_begins_after_the_dead_time_and_is_the_closed_form(arm):
-    """Of d2r/dt2 = gain (1 - r - lookahead dr/dt), damped by 0.87."""
+def test_step_response_equals_closed_form_after_dead_time(arm):
+    """Solution of d2r/dt2 = gain (1 - r - lookahead dr/dt), damping ratio 0.87."""
     states, _ = follow(arm, UR, lambda t: HOME + 0.02, 800)
     response = (states[:, 0] - HOME[0]) / 0.02
     assert np.abs(response[: round(UR.dead_time / PERIOD)]).max() < 1e-9
@@ -79,8 +78,8 @@ def test_speed_and_acceleration_stay_within_the_limits(arm):
     assert np.abs(np.diff(speed, axis=0)).max() / PERIOD < 4.0 * (1 + 1e-6)
 
 
-def test_it_brakes_in_time_however_far_the_target_is(arm):
-    """A fast interface of weak motors, such as Franka's: a linear law would shoot far beyond."""
+def test_distant_target_is_reached_without_overshoot(arm):
+    """With a fast interface of weak motors, a linear law would overshoot."""
     franka = INTERFACES["franka_position"]
     states, _ = follow(arm, franka, lambda t: HOME + 0.3, 1600)
     moved = states[:, :6] - HOME
@@ -88,8 +87,8 @@ def test_it_brakes_in_time_however_far_the_target_is(arm):
     assert moved.max() < 0.3 + 2e-3
 
 
-def test_what_it_generates_is_torque_that_the_arm_follows(arm):
-    """Along what is generated, the torque is the inverse dynamics of that motion."""
+def test_torque_is_inverse_dynamics_of_generated_motion(arm):
+    """The torque is the inverse dynamics of the generated motion."""
     states, torques = follow(arm, UR, lambda t: HOME + 0.1, 60)
     q, v = np.split(states[40], 2)
     vdot, expected = (states[41, 6:] - v) / PERIOD, np.empty(6)
@@ -98,7 +97,7 @@ def test_what_it_generates_is_torque_that_the_arm_follows(arm):
 
 
 @pytest.mark.parametrize("bad", [np.nan, 1e9])
-def test_a_command_that_is_none_leaves_the_last_and_lost_encoders_the_weight(arm, bad):
+def test_torque_with_invalid_command_or_encoders(arm, bad):
     held, _ = follow(arm, UR, lambda t: HOME if t < 0.01 else np.full(6, bad), 60)
     np.testing.assert_allclose(held[-1, :6], HOME, atol=1e-6)
     config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
@@ -119,7 +118,7 @@ def test_a_command_that_is_none_leaves_the_last_and_lost_encoders_the_weight(arm
         ({"drive_bandwidth_hz": 500.0}, "drive_bandwidth_hz"),
     ],
 )
-def test_what_cannot_be_is_one_error(changes, where):
+def test_invalid_interface_raises_one_error(changes, where):
     interface = dataclasses.replace(PositionInterface(), **changes)
     scenario = replace(
         Scenario(), joint_control__servo="position", joint_control__interface=interface
@@ -128,7 +127,7 @@ def test_what_cannot_be_is_one_error(changes, where):
         scenario.check()
 
 
-def test_a_file_changes_single_figures_of_a_named_arm():
+def test_scenario_overrides_single_interface_fields():
     data = {"joint_control": {"servo": "franka_position", "interface": {"dead_time": 0.01}}}
     found = ScenarioFromData(data, "x").joint_control.position_interface
     assert found == dataclasses.replace(INTERFACES["franka_position"], dead_time=0.01)
@@ -137,7 +136,7 @@ def test_a_file_changes_single_figures_of_a_named_arm():
         scenario.check()
 
 
-def test_what_is_told_a_stiffness_refuses_it(arm):
+def test_servo_at_tool_rejects_position_servo(arm):
     config = dataclasses.replace(Scenario().joint_control, servo="ur_servoj")
     with pytest.raises(DrakeTeleopError, match="choose computed_torque"):
         servo_at_tool(arm, HOME, config)

@@ -1,4 +1,4 @@
-"""Joint control sampled inside the step, against an event for each of its samples."""
+"""Joint control sampled inside the step, against one event per sample."""
 
 import numpy as np
 import pytest
@@ -16,15 +16,15 @@ from drake_teleop.station.slave.joint_control import (
     servo_numbers,
 )
 from drake_teleop.station.slave.plant import AddSlavePlant, start_pose
-from drake_teleop.station.slave.sampled_servo import SampledServo, samples_within, torque_line
+from drake_teleop.station.slave.sampled_servo import SampledServo, samples_per_event, torque_line
 from drake_teleop.station.slave.slave_config import Slave
 from drake_teleop.station.station import MakeTeleopStation
 
 CONFIG = JointControlConfig()
 
 
-def moved(samples, hz, wall=None):
-    """Where the joints are after 20 ms of a step of the command; an event for each `samples`."""
+def positions_after_step(samples, hz, wall=None):
+    """Return the joint positions 20 ms after a command step, with one event per `samples`."""
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(), wall)
     if samples > 1:
@@ -53,15 +53,15 @@ def moved(samples, hz, wall=None):
     ("wall", "share"),
     [(None, 0.018), (Wall(position=[0.55, 0.0, 0.253], stiffness=2e4), 0.045)],
 )
-def test_samples_inside_a_step_move_the_arm_as_events_do(wall, share):
-    honest = moved(1, 1e4, wall)
-    rate = np.abs(moved(1, 2e3, wall) - honest).max()
+def test_inner_samples_move_arm_like_events(wall, share):
+    honest = positions_after_step(1, 1e4, wall)
+    rate = np.abs(positions_after_step(1, 2e3, wall) - honest).max()
     assert rate > 5e-5  # rad, of five times the rate
-    assert np.abs(moved(5, 1e4, wall) - honest).max() < share * rate
+    assert np.abs(positions_after_step(5, 1e4, wall) - honest).max() < share * rate
 
 
-class Elsewhere(LeafSystem):
-    """A master that wants the tool 2 mm to the side."""
+class DisplacedMaster(LeafSystem):
+    """A master that commands the tool 2 mm to the side."""
 
     def __init__(self, start):
         super().__init__()
@@ -72,7 +72,7 @@ class Elsewhere(LeafSystem):
         )
 
 
-def test_the_sensor_looks_into_steps_in_which_the_torque_changes():
+def test_sensor_uses_torque_line_inside_step():
     scenario = replace(
         LoadScenario("free_motion_force"),
         rates__joint_control_hz=1e4,
@@ -86,7 +86,7 @@ def test_the_sensor_looks_into_steps_in_which_the_torque_changes():
     logs = []
     for step in (1e-3, 1.25e-4):
         simulation = replace(scenario, simulation__max_step=step, simulation__accuracy=1e-8)
-        master = Elsewhere(start_pose(scenario.slave))
+        master = DisplacedMaster(start_pose(scenario.slave))
         station = MakeTeleopStation(simulation, master=master)
         logs.append(simulate(station, simulation.simulation, progress=False))
     measured = [log["measured_wrench_S"][:, :3] for log in logs]
@@ -94,7 +94,7 @@ def test_the_sensor_looks_into_steps_in_which_the_torque_changes():
     np.testing.assert_allclose(*measured, rtol=0.0, atol=1e-5)
 
 
-def test_one_sample_is_the_controller_itself_to_the_last_bit():
+def test_one_sample_equals_joint_control_exactly():
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     n, random = slave.arm.num_joints, np.random.default_rng(0)
     servo, torque = servo_numbers(slave.arm, CONFIG), np.zeros(6)
@@ -110,7 +110,7 @@ def test_one_sample_is_the_controller_itself_to_the_last_bit():
         assert line.tobytes() == np.concatenate([torque, np.zeros(n), torque]).tobytes()
 
 
-def test_a_line_stays_within_the_motors_torque_and_outlives_a_command_that_is_none():
+def test_line_stays_within_torque_limits_and_survives_invalid_command():
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     arm, n = slave.arm, slave.arm.num_joints
     servo, rest = servo_numbers(arm, CONFIG), np.concatenate([slave.start, np.zeros(n)])
@@ -139,5 +139,5 @@ def test_a_line_stays_within_the_motors_torque_and_outlives_a_command_that_is_no
     ("control", "hand", "samples"),
     [(2e3, 2e3, 1), (1e4, 2e3, 5), (1e4, 1e3, 5), (4e3, 500.0, 2), (2e3, 1e3, 1), (1e4, 3e3, 1)],
 )
-def test_events_come_at_2_khz_or_more_and_with_each_sample_of_the_hand(control, hand, samples):
-    assert samples_within(control, hand) == samples
+def test_events_at_2_khz_or_more_include_each_hand_sample(control, hand, samples):
+    assert samples_per_event(control, hand) == samples

@@ -1,4 +1,4 @@
-"""The arm as one servo at the tool: energy, and who is told of it."""
+"""The arm as one servo at the tool: kinetic energy, and the methods that use it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.slave.arm import inverse_dynamics, jacobian
 from drake_teleop.station.slave.home import home_position
+from drake_teleop.station.slave.joint_control import operational_inertia, servo_at_tool
 from drake_teleop.station.slave.plant import NominalSlave
-from drake_teleop.station.slave.servo import operational_inertia, servo_at_tool
 
 SCENARIO = Scenario()
 
@@ -27,8 +27,8 @@ def home(arm):
     return home_position(arm, SCENARIO.slave.position)
 
 
-def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
-    """Against the joints' mass matrix, column by column from the inverse dynamics."""
+def test_operational_inertia_gives_kinetic_energy(arm, home):
+    """Against the mass matrix from the inverse dynamics, column by column."""
     still, weight, J = np.zeros(6), np.empty(6), np.empty((6, 6))
     inverse_dynamics(arm.table, home, still, still, weight)
     mass = np.empty((6, 6))
@@ -39,8 +39,8 @@ def test_operational_inertia_is_the_arms_kinetic_energy(arm, home):
     np.testing.assert_allclose(found, mass - weight, rtol=1e-9, atol=1e-9)
 
 
-def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
-    """And some motion has all of it."""
+def test_mass_bounds_kinetic_energy(arm, home):
+    """One motion reaches the bound."""
     config = SCENARIO.joint_control
     told = servo_at_tool(arm, home, config)
     mass = np.diag(np.repeat(told.mass, 3))
@@ -51,9 +51,7 @@ def test_nothing_moves_with_more_energy_than_its_mass_says(arm, home):
     np.testing.assert_allclose(np.divide(told.damping, told.mass), kv)
 
 
-def test_the_ledger_of_a_station_is_told_of_its_arm_unless_somebody_says_another(
-    arm, home, monkeypatch
-):
+def test_ledger_uses_arm_mass_by_default(arm, home, monkeypatch):
     told, parameters = [], channel.methods.parameters
     monkeypatch.setattr(
         channel.methods,

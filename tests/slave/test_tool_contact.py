@@ -1,4 +1,4 @@
-"""The compiled contact law is Drake's, wherever ball and leaf meet."""
+"""The compiled contact law equals Drake's for ball and leaf."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drake_teleop.station.environment.point_contact import ContactPairs, separat
 from drake_teleop.station.environment.sheet_spring import SheetSpring
 from drake_teleop.station.environment.slot import Slot
 from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant_dynamics import environment_wrench
 from drake_teleop.station.slave.slave_config import Slave
-from drake_teleop.station.slave.tool_contact import environment_wrench
 
 
-def drakes(plant, context, tool) -> np.ndarray:
-    """[f; tau] on the tool about the world's origin, from the plant's own contact results."""
+def drake_wrench(plant, context, tool) -> np.ndarray:
+    """Return [f; tau] on the tool about the world's origin, from the plant's contact results."""
     results, wrench = plant.get_contact_results_output_port().Eval(context), np.zeros(6)
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
@@ -37,7 +37,7 @@ def drakes(plant, context, tool) -> np.ndarray:
     ],
     ids=["face", "edge"],
 )
-def test_it_is_drakes_law(leaf, most):
+def test_wrench_equals_drakes(leaf, most):
     builder = DiagramBuilder()
     slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.36]), leaf)
     root = builder.Build().CreateDefaultContext()
@@ -53,7 +53,7 @@ def test_it_is_drakes_law(leaf, most):
         plant.SetVelocities(context, slave.instance, v)
         plant.SetPositions(context, slave.sheet, sheet[:1])
         plant.SetVelocities(context, slave.sheet, sheet[1:])
-        expected = drakes(plant, context, slave.tool)
+        expected = drake_wrench(plant, context, slave.tool)
         environment_wrench(
             slave.arm.table, *slave.contact.law, np.zeros(6), q, v, sheet, np.zeros(0), found
         )
@@ -63,8 +63,8 @@ def test_it_is_drakes_law(leaf, most):
     assert touching > 40
 
 
-def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
-    """Near the floor, tilted: both balls on floor, walls and chamfers."""
+def test_peg_in_slot_equals_drakes_with_many_pairs():
+    """Tilted near the floor: both balls touch floor, walls and chamfers."""
     builder = DiagramBuilder()
     slot = Slot(position=[0.55, 0.0, 0.2], yaw=0.4, clearance=5e-4, friction=0.3)
     slave = AddSlavePlant(builder, Slave(position=[0.55, 0.0, 0.362]), slot)
@@ -82,11 +82,13 @@ def test_a_peg_in_a_slot_is_drakes_law_with_many_pairs_at_once():
         environment_wrench(
             slave.arm.table, *slave.contact.law, np.zeros(6), q, v, np.zeros(2), np.zeros(0), found
         )
-        np.testing.assert_allclose(found, drakes(plant, context, slave.tool), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            found, drake_wrench(plant, context, slave.tool), rtol=1e-9, atol=1e-9
+        )
     assert most >= 4
 
 
-def test_a_push_is_moved_to_the_worlds_origin():
+def test_applied_wrench_is_shifted_to_world_origin():
     slave = AddSlavePlant(DiagramBuilder(), Slave(position=[0.55, 0.0, 0.36]), None)
     push, found = np.array([1.0, -2.0, 3.0, 0.1, 0.2, 0.3]), np.zeros(6)
     q = slave.plant.GetPositions(slave.plant.CreateDefaultContext(), slave.instance)
@@ -98,8 +100,7 @@ def test_a_push_is_moved_to_the_worlds_origin():
     np.testing.assert_allclose(found[3:], expected, atol=1e-12)
 
 
-def test_other_shapes_are_watched_from_around_them():
-    """A brick turned about z, and a box around a ball; without an end there is none."""
+def test_other_shapes_are_monitored_by_bounding_boxes():
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
     tool = plant.AddRigidBody("tool", SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     table = plant.AddModelInstance("table")
@@ -117,8 +118,8 @@ def test_other_shapes_are_watched_from_around_them():
     np.testing.assert_allclose(np.sort(pairs.watched[0, 37:]), [0.5, 1.0, 2.0])
 
 
-def test_boxes_that_are_apart_do_not_touch():
-    """Never farther than Drake says, and as far where a face is the nearest."""
+def test_distance_of_separate_boxes():
+    """The distance never exceeds Drake's, and equals it if a face is nearest."""
     random, half = np.random.default_rng(3), np.array([[0.02, 0.05, 0.1], [0.08, 0.03, 0.04]])
     plant, _ = AddMultibodyPlantSceneGraph(builder := DiagramBuilder(), 0.0)
     bodies = [

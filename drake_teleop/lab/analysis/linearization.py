@@ -40,7 +40,7 @@ from drake_teleop.station.scenario import Scenario, check_scenario, replace
 from drake_teleop.station.sensor.sensor_chain import without
 from drake_teleop.station.simulation import MakeSimulator
 from drake_teleop.station.slave.arm import jacobian
-from drake_teleop.station.slave.ik_methods import AUTOMATIC, method_of
+from drake_teleop.station.slave.joint_commands import AUTOMATIC, ik_method_name
 from drake_teleop.station.slave.plant import ARM, NominalSlave
 from drake_teleop.station.station import GetBlock, MakeTeleopStation
 
@@ -358,12 +358,12 @@ class _Period:
         self._simulator.get_mutable_integrator().set_fixed_step_mode(True)
         slave = NominalSlave(smooth.slave)
         self._arm, self._joints = slave.arm.table, slave.arm.num_joints
-        self._has_ik_state = method_of(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
+        self._has_ik_state = ik_method_name(smooth.slave.inverse_kinematics, slave.arm) == "numeric"
         self._push = ExternallyAppliedSpatialForce()
         self._push.body_index = slave.tool
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
-        servo.check_is_torque("the linearisation")
+        servo.check_computed_torque("the linearisation")
         scenario.master.check_leads_the_pose("the linearisation")
         if self._has_ik_state:  # a speed limit would be nonlinear
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf

@@ -24,9 +24,9 @@ from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.arm import forward_kinematics, jacobian
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 from drake_teleop.station.slave.plant import AddSlavePlant, NominalSlave, SlavePlant
-from drake_teleop.station.slave.servo import mass_matrix
 
 Array = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def task_direction(
     mobility = tool_W @ np.concatenate([a, alpha])
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
     servo, sheet = scenario.joint_control, scenario.leaf
-    servo.check_is_torque("the model of one axis")
+    servo.check_computed_torque("the model of one axis")
     scenario.master.check_leads_the_pose("the model of one axis")
     forward, backward = scenario.channel.lines()
     axis = OneAxis(

@@ -25,8 +25,7 @@ from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.energy import ledger, port_work
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.slave.arm import inverse_dynamics, jacobian, sensor_motion
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import inverse_dynamics, jacobian, pose_into, sensor_motion
 
 Array = NDArray[np.float64]
 

@@ -24,10 +24,9 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.sensor.motion_estimation import MotionEstimationConfig
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.assumed_limits import with_all_limits
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
 from drake_teleop.station.slave.model_check import check_size
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
 from drake_teleop.station.slave.plant import NominalSlave, ParseSlave, finalize
 from drake_teleop.station.slave.surroundings import AddEnvironment
 
@@ -141,7 +140,7 @@ def RobotFromModel(
         return model.instance, model.sensor_frame
 
     assumptions = ["a table at z = 0"]
-    with drakes_errors_said(path):
+    with translate_drake_errors(path):
         arm = _read_arm(parse)
     check_size(arm, str(path))
     load = arm.phi_load
@@ -163,7 +162,7 @@ def RobotFromModel(
                 remedy="give the total mass beyond the sensor",
             )
         reserve = _compact_load(mass - load[0])
-    with drakes_errors_said(path):
+    with translate_drake_errors(path):
         scene = Scene(parse, reserve, visuals_count=False, where=str(path))
     assumptions += missing
     scene.arm, completed = with_all_limits(

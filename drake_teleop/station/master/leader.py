@@ -38,8 +38,8 @@ from drake_teleop.station.slave.arm import (
     jacobian_and_pose,
 )
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.servo import mass_matrix
 
 Array = NDArray[np.float64]
 

@@ -32,7 +32,7 @@ from drake_teleop.station.slave.arm import (
     forward_kinematics,
 )
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.models import ParsedModel, ParseModel, drakes_errors_said
+from drake_teleop.station.slave.models import ParsedModel, ParseModel, translate_drake_errors
 
 Array = NDArray[np.float64]
 JOINTS = "joints"
@@ -123,7 +123,7 @@ class Leader:
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)
-        with drakes_errors_said(Path(self.file)):
+        with translate_drake_errors(Path(self.file)):
             plant.Finalize()
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())

@@ -12,8 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.station.slave.arm import ArmModel
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import ArmModel, pose_into
 
 Array = NDArray[np.float64]
 

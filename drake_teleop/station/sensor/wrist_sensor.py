@@ -75,16 +75,17 @@ from drake_teleop.station.slave.arm import (
     forward_kinematics,
     sensor_motion,
 )
-from drake_teleop.station.slave.contact_twin import ContactTwin
-from drake_teleop.station.slave.drake_contact import contact_wrench_W
+from drake_teleop.station.slave.drake_contact import ContactTwin, contact_wrench_W
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_rates import joined, plant_rates, rates_under
-from drake_teleop.station.slave.tool_contact import (
+from drake_teleop.station.slave.plant_dynamics import (
     FAR,
     TOUCHING,
     WATCHED,
+    assemble_state,
     environment_wrench,
     nearness,
+    plant_rates,
+    rates_under,
 )
 
 Array = NDArray[np.float64]
@@ -175,7 +176,7 @@ def remember_step(tail, time, state, around):
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
-    joined(state, around, entry[1:])
+    assemble_state(state, around, entry[1:])
     tail[1] += 1.0
 
 
@@ -239,7 +240,7 @@ def sample_step(
     now_dot, between_dot = scratch[2, : 2 * half], scratch[3, : 2 * half]
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
-    joined(state, around, now)
+    assemble_state(state, around, now)
     put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
     _torque_at(held, 0.0, tau)
     if touching_W.shape[0] > 0:
@@ -572,7 +573,7 @@ class WristSensor(LeafSystem):
         n = self._n
         state, around = self._seen(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
-        joined(state, around, x)
+        assemble_state(state, around, x)
         if not np.isfinite(x).all():  # nothing is known; the samples say so
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)

@@ -1,12 +1,10 @@
-"""Kinematics and dynamics of any serial arm of revolute and prismatic joints, compiled.
+"""Compiled kinematics and dynamics of a serial arm with revolute and prismatic joints.
 
-`ArmModel` is the arm as one table of numbers (`arm_from_plant` reads it out of a plant); the
-kernels below run on that table. They repeat what the plant can do because an 8 kHz sample has
-125 us in all and the plant's output ports take 5-20 us each; a test ties each kernel to the plant.
+`ArmModel.table` contains the arm. The kernels replace the plant's output ports, which are too slow
+at 8 kHz. For prismatic joints, read m for rad, N for N m, kg for kg m^2.
 
-The kernels walk from the world outwards in world coordinates. Their state ``x`` is 21 numbers,
-the motion of a frame L: ``[s(3), omega(3), alpha(3), p_WL(3), R_WL(9, by rows)]`` with the specific
-force ``s = a - g`` [m/s^2] of L's origin, angular velocity [rad/s], angular acceleration [rad/s^2].
+The state ``x`` of a frame L has 21 numbers in world coordinates: ``[s(3), omega(3), alpha(3),
+p_WL(3), R_WL(9, by rows)]`` with the specific force ``s = a - g`` of its origin [m/s^2].
 """
 
 from __future__ import annotations
@@ -15,8 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.quaternions import quaternion_of
 from drake_teleop.common.vectors import (
     add_into,
     apply,
@@ -38,7 +39,7 @@ Array = NDArray[np.float64]
 # Columns of ArmModel.table.
 ROTATION, TRANSLATION, PHI, ROTOR, DAMPING, FRICTION, SLIDES = 0, 9, 12, 22, 23, 24, 25
 WIDTH = 26
-# In the last row, which has no joint, gravity stands from here on.
+# First of three columns with gravity, in the last row only.
 GRAVITY = 22
 
 MOTION_SIZE = 21
@@ -47,29 +48,26 @@ MOTION_SIZE = 21
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """A serial chain of n joints from the world to the sensor frame S, as plain arrays.
+    """Serial chain of n joints from the world to the sensor frame S, as arrays.
 
-    Link frame L_j turns with joint j about its z axis, or slides along it, and coincides with the
-    joint's frame J_j at q_j = 0; L_0 is the world. Everything welded to a link belongs to the link;
-    everything outboard of the body that carries S is the load. Where a joint slides, read m for
-    rad, N for N m and kg for kg m^2.
+    Link frame L_j moves about or along its z axis and coincides with joint frame J_j at q_j = 0;
+    L_0 is the world. Welded bodies belong to their link; bodies beyond S belong to the load.
 
     Attributes:
-        joint_names: names of the joints, from the base outwards.
-        table: (n+1, 26), what the kernels read. Row j, of joint j (row n: of S, fixed to L_n):
-            columns 0-8 rotation from the joint's frame to the previous link's (by rows), 9-11 its
-            origin in the previous link's frame [m], 12-21 phi of the link about the origin of L_j
-            in L_j (row n: of the load, in S), ordered [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz],
-            22 reflected rotor inertia [kg m^2], 23 damping [N m s/rad], 24 dry friction [N m],
-            which `forward_dynamics` alone knows, 25 is 1 where the joint slides; in row n columns
-            22-24 are gravity in the world [m/s^2].
+        joint_names: from the base outwards.
+        table: (n+1, 26), a row for each joint and a last row for S, fixed to L_n. Columns: 0-8
+            rotation from the joint's frame to the previous link's, by rows; 9-11 its origin there
+            [m]; 12-21 phi [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] of the link about the origin
+            of L_j, in L_j (last row: of the load, in S); 22 rotor inertia [kg m^2]; 23 damping [N m
+            s/rad]; 24 dry friction [N m], for `forward_dynamics` only; 25 is 1 for a prismatic
+            joint. Last row, 22-24: gravity [m/s^2].
         lower: (n,) joint limits [rad].
         upper: (n,) joint limits [rad].
-        velocity_limit: (n,) [rad/s], inf where the model gives none.
-        acceleration_limit: (n,) [rad/s^2], inf where the model gives none.
-        effort_limit: (n,) [N m], inf where the joint has no actuator or the model gives none.
-        position_index: (n,) where the joints stand in the plant's vector of positions.
-        velocity_index: (n,) where they stand in its vector of velocities.
+        velocity_limit: (n,) [rad/s], inf if unknown.
+        acceleration_limit: (n,) [rad/s^2], inf if unknown.
+        effort_limit: (n,) [N m], inf if unknown.
+        position_index: (n,) indices in the plant's positions.
+        velocity_index: (n,) indices in the plant's velocities.
     """
 
     joint_names: tuple[str, ...]
@@ -84,21 +82,20 @@ class ArmModel:
 
     @property
     def num_joints(self) -> int:
-        """The number of joints n."""
         return len(self.joint_names)
 
     @property
     def phi_load(self) -> Array:
-        """(10,) the load that the dynamics carry, about the origin of S, in S."""
+        """Copy of `load`."""
         return self.load.copy()
 
     @property
     def load(self) -> Array:
-        """The same, a view into the table."""
+        """View (10,) of the load's phi about the origin of S, in S."""
         return self.table[-1, PHI:ROTOR]
 
     def with_load(self, phi: Array) -> ArmModel:
-        """The same arm carrying ``phi`` (10,) beyond S instead; zeros for the bare arm."""
+        """Return a copy of the arm with the load `phi` (10,)."""
         table = self.table.copy()
         table[-1, PHI:ROTOR] = phi
         return replace(self, table=table)
@@ -106,7 +103,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Moves the pose in x from the previous link to this one; returns p_PL_W."""
+    """Move the pose in x from the previous link to this one; return p_PL_W."""
     joint = table[row]
     p_PL_P = three(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
@@ -124,8 +121,8 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 
 @njit(cache=True, inline="always")
-def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
-    """Moves the state x from the previous link to this one."""
+def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
+    """Move the state x from the previous link to this one."""
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, plus_cross(cross(alpha, r), omega, cross(omega, r)))
@@ -137,7 +134,7 @@ def _advance(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) 
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
-    """(N, 3) a = s + g in S, of specific forces s (N, 3) at joint positions q (N, n)."""
+    """Return a = s + g (N, 3) in S for specific forces s (N, 3) at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_into(arm.table, q[k], s[k], out[k])
@@ -146,7 +143,7 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 
 @njit(cache=True)
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
-    """Writes a = s + g of So, in S, of the specific force s (3,) at q (n,) into out (3,)."""
+    """Write one row of `accelerations` to out (3,)."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
@@ -155,8 +152,8 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 
 
 @njit(cache=True, inline="always")
-def _start(table: Array, x: Array) -> None:
-    """The state of the world's frame at rest: s = -g, identity pose."""
+def _set_world_at_rest(table: Array, x: Array) -> None:
+    """Set x to the world frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, GRAVITY + k]
@@ -165,14 +162,7 @@ def _start(table: Array, x: Array) -> None:
 
 @njit(cache=True)
 def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None:
-    """Pose of the sensor frame.
-
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        R_WS: (3, 3) filled with the rotation of S in W.
-        p_WS: (3,) filled with the origin of S in W [m].
-    """
+    """Write the pose of S at q (n,) [rad] to R_WS (3, 3) and p_WS (3,) [m]."""
     n = table.shape[0] - 1
     x = np.zeros(21)
     x[12] = x[16] = x[20] = 1.0
@@ -187,19 +177,13 @@ def forward_kinematics(table: Array, q: Array, R_WS: Array, p_WS: Array) -> None
 
 @njit(cache=True)
 def jacobian(table: Array, q: Array, J_out: Array) -> None:
-    """Geometric Jacobian of the origin of S in W: ``[v_WS; omega_WS] = J v``.
-
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        J_out: (6, n) filled; rows 0-2 velocity of the origin of S, rows 3-5 angular velocity, in W.
-    """
+    """Write the Jacobian (6, n) at So, ``[v_WS; omega_WS] = J v``, in W, to J_out."""
     jacobian_and_pose(table, q, J_out, np.empty(21))
 
 
 @njit(cache=True)
 def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
-    """`jacobian`, and the pose of S in x (21,): ``x[9:12]`` p_WS [m], ``x[12:21]`` R_WS by rows."""
+    """Write `jacobian`, and the pose of S to x (21,): p_WS [m] in 9-11, R_WS in 12-20."""
     n = table.shape[0] - 1
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
@@ -222,22 +206,15 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 
 @njit(cache=True)
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """What a perfect sensor at S would see, and its pose, in one pass.
+    """Write the motion that an ideal sensor at S measures to out (21,).
 
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        v: (n,) joint velocities [rad/s].
-        vdot: (n,) joint accelerations [rad/s^2].
-        out: (21,) filled: ``out[0:3]`` specific force s_S = a - g of the origin of S [m/s^2],
-            ``out[3:6]`` omega_WS_S [rad/s], ``out[6:9]`` alpha_WS_S [rad/s^2], all in S;
-            ``out[9:12]`` p_WS [m] and ``out[12:21]`` R_WS by rows.
+    It has s [m/s^2], omega_WS and alpha_WS in S, then p_WS [m] and R_WS by rows.
     """
     n = table.shape[0] - 1
-    _start(table, out)
+    _set_world_at_rest(table, out)
     for row in range(n):
-        _advance(table, row, q[row], v[row], vdot[row], out)
-    _advance(table, n, 0.0, 0.0, 0.0, out)
+        _advance_state(table, row, q[row], v[row], vdot[row], out)
+    _advance_state(table, n, 0.0, 0.0, 0.0, out)
     R_SW = transposed(nine(out, 12))
     for i in range(0, 9, 3):
         out[i], out[i + 1], out[i + 2] = apply(R_SW, three(out, i))
@@ -245,31 +222,20 @@ def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> 
 
 @njit(cache=True)
 def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
-    """Motion of every link, and of S as the last one, in world coordinates.
-
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        v: (n,) joint velocities [rad/s].
-        vdot: (n,) joint accelerations [rad/s^2].
-        out: (n+1, 21) filled: row j with the state x (see the module) of table's row j.
-    """
+    """Write the state x of each link, and of S, to the rows of out (n+1, 21)."""
     n = table.shape[0] - 1
-    _start(table, out[0])
+    _set_world_at_rest(table, out[0])
     for row in range(n):
         if row > 0:
             out[row] = out[row - 1]
-        _advance(table, row, q[row], v[row], vdot[row], out[row])
+        _advance_state(table, row, q[row], v[row], vdot[row], out[row])
     out[n] = out[n - 1]
-    _advance(table, n, 0.0, 0.0, 0.0, out[n])
+    _advance_state(table, n, 0.0, 0.0, 0.0, out[n])
 
 
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Fills link[row]: axis z and origin p of L, then what moves the link (force; moment about Wo).
-
-    All in W. The wrench is Newton and Euler about the origin of L, Eqs. (1)-(2), taken in L.
-    """
+    """Fill link[row]: z axis and origin of L, inertial force and moment about Wo, Eqs. (1)-(2)."""
     phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], nine(x, 12), three(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
     s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
@@ -286,8 +252,8 @@ def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
 
 
 @njit(cache=True)
-def _to_the_joints(table: Array, link: Array, tau: Array) -> None:
-    """Torques (n,) of the joints for the links' wrenches, see `_link_wrench`; sums them inboard."""
+def _project_on_joints(table: Array, link: Array, tau: Array) -> None:
+    """Sum the wrenches of `_link_wrench` inboard and project them to torques tau (n,)."""
     n = tau.shape[0]
     for row in range(n, 0, -1):
         for k in range(6, 12):
@@ -297,72 +263,70 @@ def _to_the_joints(table: Array, link: Array, tau: Array) -> None:
         if table[row, SLIDES] != 0.0:
             tau[row] = dot(three(x, 0), three(x, 6))
         else:
-            # About the joint's own origin.
+            # Moment about the joint's origin.
             moment = plus_cross(three(x, 9), times(-1.0, three(x, 3)), three(x, 6))
             tau[row] = dot(three(x, 0), moment)
 
 
 @njit(cache=True)
 def inverse_dynamics(table: Array, q: Array, v: Array, vdot: Array, tau_out: Array) -> None:
-    """Joint torques of a motion, recursive Newton-Euler (Luh, Walker, Paul 1980).
+    """Write joint torques (n,) [N m] by recursive Newton-Euler (Luh, Walker, Paul 1980).
 
-    With rotor inertia, joint damping and gravity, and with the table's load beyond S; without
-    contact. The plant's ``CalcInverseDynamics`` leaves damping to its caller, this does not:
-    applying ``tau_out`` to the plant makes it accelerate with ``vdot``.
-
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        v: (n,) joint velocities [rad/s].
-        vdot: (n,) joint accelerations [rad/s^2].
-        tau_out: (n,) filled with the torques [N m].
+    Includes rotors, joint damping, gravity and the load; excludes contact and dry friction. The
+    plant's ``CalcInverseDynamics`` excludes damping.
     """
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
-    _start(table, x)
+    _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance(table, row, q[row], v[row], vdot[row], x)
+            _advance_state(table, row, q[row], v[row], vdot[row], x)
         else:
-            _advance(table, row, 0.0, 0.0, 0.0, x)
+            _advance_state(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
-    _to_the_joints(table, link, tau_out)
+    _project_on_joints(table, link, tau_out)
     for row in range(n):
         tau_out[row] += table[row, ROTOR] * vdot[row] + table[row, DAMPING] * v[row]
 
 
+def holding_torque(arm: ArmModel, q: Array) -> Array:
+    """Return the joint torques (n,) [N m] that hold the arm at rest at q (n,)."""
+    zeros, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
+    inverse_dynamics(arm.table, q, zeros, zeros, torque)
+    return torque
+
+
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
-    """Adds a link's inertia about Wo in W: m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz."""
+    """Add a link's inertia about Wo, in W, in the order of phi."""
     phi, p = table[row, PHI:], three(x, 9)
     m, h, about_Lo = phi[0], apply(nine(x, 12), three(phi, 1)), symmetric(phi, 4)
     inertia[0] += m
     add_into(inertia, 1, plus(h, times(m, p)))
     # From Lo to Wo: 2 p.h 1 - p h' - h p' + m (p.p 1 - p p')
-    across = 2.0 * dot(p, h) + m * dot(p, p)
+    diagonal = 2.0 * dot(p, h) + m * dot(p, p)
     k = 4
     for i in range(3):
-        turned = apply(about_Lo, three(x, 12 + 3 * i))
+        rotated = apply(about_Lo, three(x, 12 + 3 * i))
         for j in range(i, 3):
-            value = dot(turned, three(x, 12 + 3 * j))
+            value = dot(rotated, three(x, 12 + 3 * j))
             value -= p[i] * h[j] + h[i] * p[j] + m * p[i] * p[j]
             if i == j:
-                value += across
+                value += diagonal
             inertia[k] += value
             k += 1
 
 
 @njit(cache=True)
 def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """M (n, n) from the joints' axes in `link` and the links' inertias; sums them inboard.
+    """Compute the lower half of M (n, n) by composite rigid bodies; overwrite `link`.
 
-    Composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2). What
-    is in `link` of wrenches is lost.
+    Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     """
     n = M.shape[0]
     for row in range(n):
-        # Of a unit of the joint's speed: velocity at Wo and angular velocity.
+        # Velocity at Wo and angular velocity for unit joint speed.
         x = link[row]
         x[9], x[10], x[11] = three(x, 0)
         x[6], x[7], x[8] = cross(three(x, 3), three(x, 9))
@@ -375,10 +339,10 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
         c = inertia[row]
         h = three(c, 1)
         v, w = three(link[row], 6), three(link[row], 9)
-        # Momentum about Wo of all that is outboard, for a unit of this joint's speed.
+        # Momentum about Wo of all outboard links for unit speed of this joint.
         linear = plus_cross(times(c[0], v), w, h)
         angular = plus_cross(apply(symmetric(c, 4), w), h, v)
-        # Only the lower half is needed.
+        # `solve_spd` reads the lower half only.
         for i in range(row + 1):
             v, w = three(link[i], 6), three(link[i], 9)
             M[row, i] = dot(w, angular) + v[0] * linear[0] + v[1] * linear[1] + v[2] * linear[2]
@@ -387,10 +351,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
 
 @njit(cache=True)
 def solve_spd(M: Array, x: Array) -> None:
-    """x := M^-1 x by Cholesky in M's lower half.
-
-    As `vectors.solve`, by columns, and with the last digit of its own: m / sqrt(m) on the diagonal.
-    """
+    """Replace x by M^-1 x (Cholesky); rounds differently from `vectors.solve`."""
     n = x.shape[0]
     for j in range(n):
         for k in range(j):
@@ -412,39 +373,67 @@ def solve_spd(M: Array, x: Array) -> None:
 def forward_dynamics(
     table: Array, q: Array, v: Array, tau: Array, wrench_W: Array, vdot_out: Array
 ) -> None:
-    """Accelerations under joint torques and a wrench on what is beyond S.
+    """Write accelerations: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
-    With rotor inertia, joint damping and gravity, as `inverse_dynamics`, of which it is the
-    inverse but for dry friction, which a controller does not know:
-    M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
-
-    Args:
-        table: `ArmModel.table`.
-        q: (n,) joint positions [rad].
-        v: (n,) joint velocities [rad/s].
-        tau: (n,) joint torques [N m].
-        wrench_W: (6,) [f; tau] on the load, about the world's origin, in W [N, N m].
-        vdot_out: (n,) filled with the accelerations [rad/s^2].
+    F (6,) is the wrench on the load, about the world's origin, in W [N, N m].
     """
     n = table.shape[0] - 1
     x = np.empty(21)
     link = np.empty((n + 1, 12))
     inertia = np.zeros((n + 1, 10))
     M = np.empty((n, n))
-    _start(table, x)
+    _set_world_at_rest(table, x)
     for row in range(n + 1):
         if row < n:
-            _advance(table, row, q[row], v[row], 0.0, x)
+            _advance_state(table, row, q[row], v[row], 0.0, x)
         else:
-            _advance(table, row, 0.0, 0.0, 0.0, x)
+            _advance_state(table, row, 0.0, 0.0, 0.0, x)
         _link_wrench(table, row, x, link)
         _composite_inertia(table, row, x, inertia[row])
     for k in range(6):
         link[n, 6 + k] -= wrench_W[k]
-    _to_the_joints(table, link, vdot_out)
+    _project_on_joints(table, link, vdot_out)
     for row in range(n):
         vdot_out[row] = tau[row] - vdot_out[row] - table[row, DAMPING] * v[row]
         if table[row, FRICTION] != 0.0:
             vdot_out[row] += dry_friction(table[row, FRICTION], v[row])
     _mass_matrix(table, link, inertia, M)
     solve_spd(M, vdot_out)
+
+
+@njit(cache=True)
+def pose_into(arm, q, pose):
+    """Write X_WS (7,) [qw qx qy qz px py pz] of the arm table at q (n,) [rad]."""
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm, q, R, p)
+    orientation = quaternion_of(R)
+    for i in range(4):
+        pose[i] = orientation[i]
+    for i in range(3):
+        pose[4 + i] = p[i]
+
+
+class ForwardKinematics(LeafSystem):
+    """Pose of the slave's sensor frame.
+
+    .. pydrake_system::
+
+        name: ForwardKinematics
+        input_ports:
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        output_ports:
+        - pose_slave: (7,) X_WS
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel) -> None:
+        super().__init__()
+        self._arm = arm.table
+        self._n = arm.num_joints
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        inputs = {self._state.ticket()}
+        self.DeclareVectorOutputPort("pose_slave", 7, weak_callback(self._calc), inputs)
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        pose_into(self._arm, self._state.Eval(context)[: self._n], output.get_mutable_value())

@@ -1,8 +1,11 @@
-"""A serial arm of revolute and prismatic joints, read out of a finalized MultibodyPlant."""
+"""Conversion of a finalized MultibodyPlant to an `ArmModel`, and defaults for its limits."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -32,25 +35,26 @@ from drake_teleop.station.slave.arm import (
     Array,
 )
 
+# Default half range and speed: revolute [rad, rad/s], prismatic [m, m/s].
+_DEFAULT_REVOLUTE, _DEFAULT_PRISMATIC = (np.pi, np.pi), (1.0, 1.0)
+# Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
+_MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
+# Default time to full speed [s].
+_TIME_TO_FULL_SPEED_S = 0.4
+
 
 def ArmModelFromPlant(
     plant: MultibodyPlant,
     model_instance: ModelInstanceIndex,
     sensor_frame_name: str = "sensor",
 ) -> ArmModel:
-    """Reads the chain from the world to a sensor frame out of a finalized plant.
+    """Return the chain from the world to a sensor frame of a finalized plant.
 
-    Joints beyond the sensor frame (a gripper's fingers) count as held at their default positions.
-
-    Args:
-        plant: a finalized plant; other models in it do not matter, whatever is attached to the arm
-            counts, whichever model instance it belongs to.
-        model_instance: the arm's.
-        sensor_frame_name: a frame of that model instance, on the last link or welded to it.
+    Joints beyond the sensor frame are held at their default positions.
 
     Raises:
-        DrakeTeleopError: there is no such frame, or what leads to it from the world is not a chain
-            of welds, revolute and prismatic joints, or a link carries a further moving joint.
+        DrakeTeleopError: if the frame is missing, or its path is not a chain of welds, revolute and
+            prismatic joints without branches that move.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -59,10 +63,10 @@ def ArmModelFromPlant(
             remedy="name the frame or link at which the sensor measures",
         )
     frame_S = plant.GetFrameByName(sensor_frame_name, model_instance)
-    inboard = {
+    inboard_joints = {
         joint.child_body().index(): joint for joint in map(plant.get_joint, plant.GetJointIndices())
     }
-    joints = _chain(inboard, frame_S)
+    joints = _joint_chain(inboard_joints, frame_S)
     n = len(joints)
     table = np.zeros((n + 1, WIDTH))
     for row, joint in enumerate(joints):
@@ -73,7 +77,7 @@ def ArmModelFromPlant(
     table[n, GRAVITY:SLIDES] = gravity.gravity_vector() * gravity.is_enabled(model_instance)
 
     context = plant.CreateDefaultContext()
-    # C turns the joint's axis into z.
+    # C rotates the joint's axis to z.
     C = [RigidTransform(RotationMatrix.MakeFromOneVector(_axis(j), 2)) for j in joints]
     X_WS = frame_S.CalcPoseInWorld(context)
     X_WJ = [
@@ -87,13 +91,13 @@ def ArmModelFromPlant(
         table[row, ROTATION:TRANSLATION] = X_PJ.rotation().matrix().ravel()
         table[row, TRANSLATION:PHI] = X_PJ.translation()
     rows = {joint.child_body().index(): row for row, joint in enumerate(joints)}
-    for index in inboard:
+    for index in inboard_joints:
         body = plant.get_body(index)
-        found = _row_of(body, inboard, rows, frame_S.body())
-        if found is not None:
-            X_LB = X_WL[found].InvertAndCompose(body.EvalPoseInWorld(context))
+        body_row = _table_row(body, inboard_joints, rows, frame_S.body())
+        if body_row is not None:
+            X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
-            table[found, PHI:ROTOR] += _phi(M_B, X_LB)
+            table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
@@ -117,11 +121,12 @@ def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
     return axis
 
 
-def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoint | PrismaticJoint]:
-    """The moving joints from the world to S, from the base outwards."""
+def _joint_chain(
+    inboard_joints: dict[BodyIndex, Joint], frame_S: Frame
+) -> list[RevoluteJoint | PrismaticJoint]:
     body, joints = frame_S.body(), list[RevoluteJoint | PrismaticJoint]()
-    while body.index() in inboard:
-        joint = inboard[body.index()]
+    while body.index() in inboard_joints:
+        joint = inboard_joints[body.index()]
         if isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             joints.append(joint)
         elif not isinstance(joint, WeldJoint):
@@ -140,13 +145,12 @@ def _chain(inboard: dict[BodyIndex, Joint], frame_S: Frame) -> list[RevoluteJoin
     return joints[::-1]
 
 
-def _row_of(
+def _table_row(
     body: RigidBody,
-    inboard: dict[BodyIndex, Joint],
+    inboard_joints: dict[BodyIndex, Joint],
     rows: dict[BodyIndex, int],
     sensor_body: RigidBody,
 ) -> int | None:
-    """The row of the table that carries the body's inertia; None if the arm does not carry it."""
     moving = None
     outermost = body
     while True:
@@ -154,9 +158,9 @@ def _row_of(
             return len(rows)
         if body.index() in rows:
             break
-        if body.index() not in inboard:
+        if body.index() not in inboard_joints:
             return None
-        joint = inboard[body.index()]
+        joint = inboard_joints[body.index()]
         if not isinstance(joint, WeldJoint):
             moving = joint
         body = joint.parent_body()
@@ -169,8 +173,8 @@ def _row_of(
     return rows[body.index()]
 
 
-def _phi(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """(10,) phi of a body about the origin of L, in L."""
+def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
+    """Return phi (10,) of a body about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
@@ -188,3 +192,83 @@ def _reflected_inertia(plant: MultibodyPlant, joint: Joint) -> float:
 
 def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
     return min((a.effort_limit() for a in _actuators(plant, joint)), default=np.inf)
+
+
+def with_all_limits(
+    arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
+) -> tuple[ArmModel, list[str]]:
+    """Return the arm with every limit set, and one text per assumption.
+
+    `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
+    assumption about accelerations.
+
+    Raises:
+        DrakeTeleopError: for a fixed joint or a wrong number of accelerations.
+    """
+    n, assumptions = arm.num_joints, []
+    # Exporters write 0 to 0 for unknown limits.
+    unlimited = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper)) | (
+        (arm.lower == 0) & (arm.upper == 0)
+    )
+    slides = arm.table[:-1, SLIDES] != 0.0
+    immovable = ~unlimited & (arm.lower == arm.upper)
+    if immovable.any():
+        unit = "m" if slides[immovable][0] else "rad"
+        raise DrakeTeleopError(
+            f"{np.array(arm.joint_names)[immovable][0]} cannot move: both of its limits are "
+            f"{arm.lower[immovable][0]:g} {unit}",
+            where=where,
+            remedy="correct the limits, or make the joint a fixed one",
+        )
+    reach, speed = (np.where(slides, _DEFAULT_PRISMATIC[k], _DEFAULT_REVOLUTE[k]) for k in range(2))
+    velocity = np.where(_is_specified(arm.velocity_limit), arm.velocity_limit, speed)
+    effort = np.where(_is_specified(arm.effort_limit), arm.effort_limit, np.inf)
+    specified = arm.acceleration_limit
+    if acceleration:
+        if len(acceleration) not in (1, n):
+            raise DrakeTeleopError(
+                f"{len(acceleration)} acceleration limits for {n} joints",
+                where=where,
+                remedy="give one for all joints or one for each",
+            )
+        specified = np.broadcast_to(np.array(acceleration), n).copy()
+    completed = replace(
+        arm,
+        lower=np.where(unlimited, -reach, arm.lower),
+        upper=np.where(unlimited, reach, arm.upper),
+        velocity_limit=velocity,
+        acceleration_limit=np.where(
+            _is_specified(specified), specified, velocity / _TIME_TO_FULL_SPEED_S
+        ),
+        effort_limit=effort,
+    )
+    plausible = slides | unlimited | (arm.upper - arm.lower < _MAX_PLAUSIBLE_RANGE_RAD)
+    acceleration_text = (
+        f"acceleration limits that reach full speed in {_TIME_TO_FULL_SPEED_S:g} s{hint}"
+    )
+    for missing, revolute_text, prismatic_text in (
+        (
+            unlimited,
+            f"a range of +-{_DEFAULT_REVOLUTE[0]:.4g} rad",
+            f"a range of +-{_DEFAULT_PRISMATIC[0]:g} m",
+        ),
+        (
+            ~_is_specified(arm.velocity_limit),
+            f"a speed limit of {_DEFAULT_REVOLUTE[1]:.4g} rad/s",
+            f"a speed limit of {_DEFAULT_PRISMATIC[1]:g} m/s",
+        ),
+        (~_is_specified(specified), acceleration_text, acceleration_text),
+        (~np.isfinite(effort), "no torque limit", "no force limit"),
+        (~plausible, f"limits in rad, though more than {_MAX_PLAUSIBLE_RANGE_RAD:.4g} apart,", ""),
+    ):
+        for text, kind in ((revolute_text, ~slides), (prismatic_text, slides)):
+            assumed = missing & kind
+            if assumed.any():
+                names = ", ".join(np.array(arm.joint_names)[assumed])
+                assumptions.append(f"{text} for {'all joints' if assumed.all() else names}")
+    return completed, assumptions
+
+
+def _is_specified(limits: Array) -> NDArray[np.bool_]:
+    """Return True for specified limits; exporters write 0 for unknown ones."""
+    return np.isfinite(limits) & (limits > 0)

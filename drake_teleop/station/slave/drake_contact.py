@@ -1,8 +1,7 @@
-"""Contact as Drake computes it, for what the wrist sensor's own law does not know.
+"""Contact wrench from Drake's contact results, for contacts outside the compiled law.
 
-Meshes, cylinders, boxes on boxes, pressures over an area. Drake tells the forces of the state that
-the plant is in, so the plant stops at each of the sensor's samples: the wrench is as exact as by
-the compiled law, and takes longer to simulate.
+Examples are meshes, cylinders and hydroelastic contact. The plant stops at each sample of the
+sensor, which takes longer.
 """
 
 from __future__ import annotations
@@ -13,32 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.station.slave.tool_contact import add_force
+from drake_teleop.station.environment.environment import Environment
+from drake_teleop.station.slave.plant import AddSlavePlant
+from drake_teleop.station.slave.plant_dynamics import add_force
+from drake_teleop.station.slave.slave_config import Slave
 
 
 def contact_wrench_W(
     results: ContactResults, bodies: Container[int], shapes: Container[int]
 ) -> NDArray[np.float64]:
-    """(6,) what all contacts exert on the tool, [f; tau] about the world's origin, in W [N, N m].
+    """Return the wrench (6,) of all contacts on the tool, about the world's origin, in W [N, N m].
 
-    Args:
-        results: of the plant.
-        bodies: the tool's, as numbers.
-        shapes: the identifiers of their collision shapes, as numbers.
+    `bodies` are the indices of the tool, `shapes` its collision shapes.
     """
     wrench_W = np.zeros(6)
     for k in range(results.num_point_pair_contacts()):
         contact = results.point_pair_contact_info(k)
-        if int(contact.bodyB_index()) in bodies:  # which the force is on
+        if int(contact.bodyB_index()) in bodies:  # the contact force acts on B
             add_force(wrench_W, contact.contact_point(), contact.contact_force())
         elif int(contact.bodyA_index()) in bodies:
             add_force(wrench_W, contact.contact_point(), -contact.contact_force())
     for k in range(results.num_hydroelastic_contacts()):
         area = results.hydroelastic_contact_info(k)
-        surface, F_Ac_W = area.contact_surface(), area.F_Ac_W()  # on the body of M
+        surface, F_Ac_W = area.contact_surface(), area.F_Ac_W()  # acts on the body of M
         first, second = surface.id_M().get_value(), surface.id_N().get_value()
         sign = float(first in shapes) - float(second in shapes)
         if sign != 0.0:
@@ -48,7 +47,7 @@ def contact_wrench_W(
 
 
 class DrakeContact(LeafSystem):
-    """The true contact wrench for the log, of Drake's contact results; no controller sees it.
+    """True contact wrench for the log, see `contact_wrench_W`.
 
     .. pydrake_system::
 
@@ -57,20 +56,48 @@ class DrakeContact(LeafSystem):
         - contact_results: the plant's
         output_ports:
         - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
-
-    Args:
-        bodies: the tool's, as numbers.
-        shapes: the identifiers of their collision shapes, as numbers.
     """
 
     __slots__ = ONE_DICT
 
     def __init__(self, bodies: Container[int], shapes: Container[int]) -> None:
         super().__init__()
-        self._of = bodies, shapes
+        self._tool_ids = bodies, shapes
         results = Value[ContactResults]()
         self._contacts = self.DeclareAbstractInputPort("contact_results", results)
         self.DeclareVectorOutputPort("true_contact_wrench_W", 6, weak_callback(self._calc))
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._of))
+        output.SetFromVector(contact_wrench_W(self._contacts.Eval(context), *self._tool_ids))
+
+
+Array = NDArray[np.float64]
+
+
+class ContactTwin:
+    """Second copy of the plant, for contact between the states of the simulated one."""
+
+    def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
+        builder = DiagramBuilder()
+        self._slave = AddSlavePlant(builder, config, environment, q_start)
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self._context = self._slave.plant.GetMyMutableContextFromRoot(self._root)
+
+    def wrench_W(self, x: Array, state: Array) -> Array:
+        """Return the contact wrench (6,) on the tool, about the world's origin, in W.
+
+        x is [q, leaf deflection, v, its rate]; `state` is the plant's [q; v], empty without other
+        moving bodies.
+        """
+        plant, context, contact = self._slave.plant, self._context, self._slave.contact
+        half = len(x) // 2
+        if len(state):
+            plant.SetPositionsAndVelocities(context, state)
+        arm, leaf = (self._slave.instance, slice(half - 1)), (contact.sheet, slice(half - 1, half))
+        for instance, own in (arm, leaf):
+            if instance is not None:
+                plant.SetPositions(context, instance, x[:half][own])
+                plant.SetVelocities(context, instance, x[half:][own])
+        results = plant.get_contact_results_output_port().Eval(context)
+        return contact_wrench_W(results, contact.bodies, contact.shapes)

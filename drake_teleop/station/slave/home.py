@@ -1,4 +1,4 @@
-"""Where an arm starts: a posture with its tool down, which its motors can hold."""
+"""Start posture of the arm, with the tool down."""
 
 from __future__ import annotations
 
@@ -9,37 +9,34 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.slave.arm import SLIDES, ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import SLIDES, ArmModel, holding_torque
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form, nearest_branch
+from drake_teleop.station.slave.joint_control import mass_matrix
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
-from drake_teleop.station.slave.servo import mass_matrix
 from drake_teleop.station.slave.slave_config import Slave
 
-# Of any motion of the joints [kg m^2]: 1e-9 is that of a grain of sand at an arm's length.
-_LEAST_INERTIA = 1e-9
-#: S at home: the tool points down, x_S along x_W.
+# Smallest eigenvalue of a valid mass matrix [kg m^2]: a grain of sand at an arm's length.
+_MIN_INERTIA = 1e-9
+#: Orientation of S at home: the tool points down, x_S along x_W.
 R_WS_HOME = RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-# Of the joints' ranges, about their middles: where an arm starts if it can, and else.
-_OF_RANGES = (0.7, 0.9, 1.0)
-#: Elbow up, reaching forward (negative q2 and q3 lean to +x); home is the branch nearest to it.
-_Q_NEAR_HOME = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
+# Shares of the joint ranges, about their middles, that are searched in this order.
+_RANGE_SHARES = (0.7, 0.9, 1.0)
+#: Elbow up, reaching forward [rad]; home is the branch nearest to it.
+_Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 
 
 def tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
-    """Joint positions (n,) [rad] of a posture with S at a place (3,) p_WS [m], and their status.
+    """Return joint positions (n,) [rad] with S at `position` [m, in W], and their status.
 
-    Args:
-        arm: one without closed form stays away from its joints' limits, if it can.
-        position: p_WS (3,) [m].
-        R_WS: how S is turned, z_S down by default.
+    Without a closed form, it avoids joint limits where possible.
     """
     if has_closed_form(arm):
-        return nearest_branch(R_WS.matrix(), position, _Q_NEAR_HOME, arm.lower, arm.upper)
+        return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
     middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
-    for share in _OF_RANGES:
+    for share in _RANGE_SHARES:
         inside = replace(arm, lower=middle - share * half, upper=middle + share * half)
         q, status = find_posture(inside, pose, middle)
         if status == IkStatus.OK:
@@ -48,16 +45,12 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Joint positions [rad] with S at `position` [m, in W], z_S down; an RX90's elbow bent upwards.
-
-    Raises:
-        DrakeTeleopError: if the arm cannot reach it.
-    """
+    """Return joint positions (n,) [rad] with S at `position` [m, in W], z_S down."""
     q, status = tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
     else:
-        remedy = "move it, or give slave.home: joint positions of a posture that the arm can take"
+        remedy = "move it, or give slave.home, the joint positions of a reachable posture"
     if status != IkStatus.OK:
         raise DrakeTeleopError(
             f"the arm cannot reach {position} with the tool down ({IkStatus(status).name})",
@@ -68,11 +61,7 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
 
 
 def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
-    """(n,) where the arm starts [rad].
-
-    Raises:
-        DrakeTeleopError: if it cannot be there.
-    """
+    """Return the start posture (n,) [rad], or raise DrakeTeleopError."""
     if not slave.home:
         return home_position(arm, slave.position)
     if len(slave.home) != arm.num_joints:
@@ -93,19 +82,14 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 
 def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Refuses a posture that the motors cannot hold, and an arm without inertia.
-
-    Raises:
-        DrakeTeleopError: naming the joint that cannot; or if a torque could move joints at once.
-    """
-    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _LEAST_INERTIA:
+    """Raise DrakeTeleopError for a joint without inertia or with too weak a motor."""
+    if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA:
         raise DrakeTeleopError(
-            "nothing resists a torque: its links have too little inertia for its joints",
+            "the mass matrix is singular: the links have too little inertia",
             where="slave.model",
-            remedy="give the links their masses and inertias, or the joints rotor inertias",
+            remedy="give masses and inertias of the links, or rotor inertias of the joints",
         )
-    still, torque = np.zeros(arm.num_joints), np.empty(arm.num_joints)
-    inverse_dynamics(arm.table, q, still, still, torque)
+    torque = holding_torque(arm, q)
     share = np.abs(torque) / arm.effort_limit
     k = int(share.argmax())
     if share[k] > 1.0:

@@ -1,10 +1,8 @@
-"""Closed-form inverse kinematics of the Staubli RX90: all eight branches, and the nearest one.
+"""Closed-form inverse kinematics of the Staubli RX90: eight branches, and the nearest one.
 
-The wrist is spherical, so position and orientation come apart (Pieper 1968): the first three joints
-put the wrist's centre, the last three turn the sensor frame. Lengths are those of models/rx90.sdf.
-
-At q = 0 the arm points straight up and S has the world's axes; then with the wrist centre at
-(x, y, z) above the shoulder and rho its signed distance from the first axis
+Joints 1-3 place the wrist centre, joints 4-6 orient the sensor frame (Pieper 1968). At q = 0 the
+arm points up and S is parallel to W. With the wrist centre at (x, y, z) above the shoulder and rho
+its signed distance from the first axis:
 
     rho = -(l2 sin q2 + l3 sin(q2 + q3)),   z = l2 cos q2 + l3 cos(q2 + q3),
     R_WS = Rz(q1) Ry(-q2 - q3) Rz(q4) Ry(-q5) Rz(q6).
@@ -35,38 +33,37 @@ FOREARM = 0.450
 FLANGE = 0.085
 """Wrist centre to the origin of S, along z_S [m]."""
 
-# Below this a direction says nothing any more: distance from the first axis [m] and sin q5.
-_SINGULAR = 1e-9
-# A limit may be passed by this much [rad]; the angle is put onto it.
-_ROUNDING = 1e-9
+# Distance from the first axis [m], or sin q5, below which the arm is singular.
+_SINGULAR_THRESHOLD = 1e-9
+# Tolerance of a limit [rad]; the angle is clipped to it.
+_LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
-    """How the inverse kinematics came by its answer; here in the words of the closed form.
+    """Result of an inverse kinematics.
 
-    The numeric one (`numeric_inverse_kinematics`) comes as near to the pose as it can, whatever
-    keeps it from it. By WRIST_SINGULAR it means that the last three axes nearly lie in a plane, by
-    SHOULDER_SINGULAR any other singularity; past either a part of the pose is met late.
+    The numeric method returns the nearest pose found. It reports WRIST_SINGULAR for nearly coplanar
+    last three axes and SHOULDER_SINGULAR at other singularities.
     """
 
     OK = 0
     """The pose is met."""
     WRIST_SINGULAR = 1
-    """The pose is met; axes 4 and 6 are aligned, q4 was kept and q6 took the rest."""
+    """The pose is met; axes 4 and 6 are aligned, q4 is kept and q6 completes the rotation."""
     SHOULDER_SINGULAR = 2
-    """The pose is met; the wrist's centre is on the first axis and q1 was kept."""
+    """The pose is met; the wrist centre is on the first axis and q1 is kept."""
     OUT_OF_REACH = 3
-    """The orientation is met; the wrist's centre was drawn towards the shoulder into reach."""
+    """The orientation is met; the wrist centre moves towards the shoulder into reach."""
     JOINT_LIMIT = 4
-    """Each branch breaks a joint limit: the reference is held, put within the limits."""
+    """Each branch violates a joint limit: the reference is held, clipped to the limits."""
     BAD_POSE = 5
-    """The pose is not finite, beyond 1e6 m, or its quaternion is zero: the reference is held,
-    within limits. Or the reference is not finite: the answer is not either."""
+    """The pose is not finite, beyond 1e6 m, or has a zero quaternion: the reference is held, within
+    limits. With an invalid reference the result is invalid."""
     SPEED_LIMIT = 6
-    """The pose is not met yet: a joint moves as fast as it may."""
+    """The pose is not met yet: a joint moves at its speed limit."""
 
 
-# Compiled code knows plain integers only.
+# Compiled code requires plain integers.
 _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _ = map(
     int, IkStatus
 )
@@ -74,35 +71,31 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 @njit(cache=True)
 def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array) -> int:
-    """Fills q (8, 6); rows are nan if out of reach and not ``clamp``. Returns an `IkStatus`.
-
-    Row 4 a + 2 b + c: shoulder a (0: rho >= 0, 1: reaching backwards over the first axis), elbow b
-    (0: q3 >= 0), wrist c (0: q5 >= 0).
-    """
+    """Fill q (8, 6) as `inverse_kinematics`; ``clamp`` moves the wrist centre into reach."""
     status = _OK
     x = p[0] - FLANGE * R[0, 2]
     y = p[1] - FLANGE * R[1, 2]
     z = p[2] - FLANGE * R[2, 2] - SHOULDER_HEIGHT
     reach = UPPER_ARM + FOREARM
-    hole = abs(UPPER_ARM - FOREARM)
+    inner_reach = abs(UPPER_ARM - FOREARM)
     distance = np.sqrt(x * x + y * y + z * z)
-    if distance > reach or distance < hole:
+    if distance > reach or distance < inner_reach:
         if not clamp:
             q[:] = np.nan
             return _OUT_OF_REACH
-        scale = (reach if distance > reach else hole) / distance
+        scale = (reach if distance > reach else inner_reach) / distance
         x, y, z = scale * x, scale * y, scale * z
         distance *= scale
         status = _OUT_OF_REACH
     rho = np.sqrt(x * x + y * y)
-    if rho < _SINGULAR:
+    if rho < _SINGULAR_THRESHOLD:
         q1_front = q1_kept
         status = max(status, _SHOULDER_SINGULAR)
     else:
         q1_front = np.arctan2(y, x)
-    # Half-angle form: keeps its digits where the arm is nearly stretched.
+    # The half-angle form is accurate where the arm is nearly stretched.
     stretched = max((reach - distance) * (reach + distance), 0.0)
-    folded = max((distance - hole) * (distance + hole), 0.0)
+    folded = max((distance - inner_reach) * (distance + inner_reach), 0.0)
     q3_up = 2.0 * np.arctan2(np.sqrt(stretched), np.sqrt(folded))
     for a in range(2):
         q1 = q1_front + a * np.pi
@@ -122,9 +115,9 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
             m00 = c * (c1 * R[0, 0] + s1 * R[1, 0]) + s * R[2, 0]
             m01 = c * (c1 * R[0, 1] + s1 * R[1, 1]) + s * R[2, 1]
             sin_q5 = np.sqrt(m02 * m02 + m12 * m12)
-            q4_up = q4_kept if sin_q5 < _SINGULAR else np.arctan2(-m12, -m02)
+            q4_up = q4_kept if sin_q5 < _SINGULAR_THRESHOLD else np.arctan2(-m12, -m02)
             q5_up = np.arctan2(sin_q5, m22)
-            # q6 from what q4 leaves over, so that an inexact q4 near the singularity costs nothing.
+            # q6 depends on q4, so that an inexact q4 near the singularity cancels.
             c4, s4 = np.cos(q4_up), np.sin(q4_up)
             q6_up = np.arctan2(c4 * m10 - s4 * m00, c4 * m11 - s4 * m01)
             for w in range(2):
@@ -137,15 +130,15 @@ def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q
 
 
 @njit(cache=True)
-def _turned(angle: float, near: float, lower: float, upper: float) -> float:
-    """angle + 2 pi k within the limits and there nearest to ``near``; nan if there is none."""
-    turn = 2.0 * np.pi
-    angle += turn * np.round((near - angle) / turn)
-    if angle > upper + _ROUNDING:
-        angle -= turn * np.ceil((angle - upper - _ROUNDING) / turn)
-    if angle < lower - _ROUNDING:
-        angle += turn * np.ceil((lower - _ROUNDING - angle) / turn)
-    if angle > upper + _ROUNDING:
+def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> float:
+    """Return angle + 2 pi k within the limits, nearest to ``near``; nan if none exists."""
+    full_turn = 2.0 * np.pi
+    angle += full_turn * np.round((near - angle) / full_turn)
+    if angle > upper + _LIMIT_TOLERANCE_RAD:
+        angle -= full_turn * np.ceil((angle - upper - _LIMIT_TOLERANCE_RAD) / full_turn)
+    if angle < lower - _LIMIT_TOLERANCE_RAD:
+        angle += full_turn * np.ceil((lower - _LIMIT_TOLERANCE_RAD - angle) / full_turn)
+    if angle > upper + _LIMIT_TOLERANCE_RAD:
         return np.nan
     return min(max(angle, lower), upper)
 
@@ -154,7 +147,7 @@ def _turned(angle: float, near: float, lower: float, upper: float) -> float:
 def _nearest_branch(
     R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """`nearest_branch` into q (6,)."""
+    """Compute `nearest_branch` into q (6,); return an `IkStatus`."""
     if not np.isfinite(reference.sum()):
         q[:] = np.nan
         return _BAD_POSE
@@ -169,9 +162,9 @@ def _nearest_branch(
     for row in range(8):
         distance = 0.0
         for i in range(6):
-            angle = _turned(branches[row, i], reference[i], lower[i], upper[i])
+            angle = _wrap_to_limits(branches[row, i], reference[i], lower[i], upper[i])
             step = abs(angle - reference[i])
-            # Also where angle is nan, outside the limits.
+            # A nan (outside the limits) also gives inf.
             distance += step * step if step <= max_step else np.inf
             branches[row, i] = angle
         if distance < best_distance:
@@ -179,7 +172,7 @@ def _nearest_branch(
     if best < 0:
         return _JOINT_LIMIT
     put(q, 0, branches[best], 0, 6)
-    if abs(np.sin(q[4])) < _SINGULAR:
+    if abs(np.sin(q[4])) < _SINGULAR_THRESHOLD:
         status = max(status, _WRIST_SINGULAR)
     return status
 
@@ -188,18 +181,9 @@ def _nearest_branch(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """`nearest_branch` for a pose of seven numbers, without making arrays for its result.
+    """Write `nearest_branch` of pose (7,) [qw, qx, qy, qz, px, py, pz] to q (6,).
 
-    Args:
-        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any length but zero.
-        reference: (6,) [rad].
-        lower: (6,) [rad].
-        upper: (6,) [rad].
-        max_step: [rad].
-        q: (6,) filled [rad].
-
-    Returns:
-        The `IkStatus` as a plain integer.
+    The quaternion has any nonzero length. Returns the `IkStatus` as a plain integer.
     """
     w, x, y, z = pose[0], pose[1], pose[2], pose[3]
     norm = w * w + x * x + y * y + z * z
@@ -212,18 +196,14 @@ def solve_pose_command(
 
 
 def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
-    """All solutions, without regard to joint limits.
+    """Return all solutions, ignoring joint limits.
 
-    Where a joint is undetermined (q1 with the wrist's centre on the first axis, q4 with axes 4 and
-    6 aligned) it is 0.
-
-    Args:
-        R_WS: (3, 3) rotation of the sensor frame in the world.
-        p_WS: (3,) its origin [m].
+    An undetermined joint is 0: q1 with the wrist centre on the first axis, q4 with axes 4 and 6
+    aligned.
 
     Returns:
-        (8, 6) joint positions in (-pi, pi] [rad], nan if out of reach. Row ``4 a + 2 b + c``:
-        a = 1 reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has q5 <= 0.
+        (8, 6) joint positions in (-pi, pi] [rad], nan if out of reach. Row ``4 a + 2 b + c``: a = 1
+        reaches backwards over the first axis, b = 1 has q3 <= 0, c = 1 has q5 <= 0.
     """
     q = np.empty((8, 6))
     _branches(np.ascontiguousarray(R_WS), p_WS, 0.0, 0.0, False, q)
@@ -238,35 +218,28 @@ def nearest_branch(
     upper: Array,
     max_step: float = np.inf,
 ) -> tuple[Array, IkStatus]:
-    """The solution within the joint limits that is nearest to a reference (Euclidean, in rad).
+    """Return the solution within the limits nearest to a reference [rad], and its status.
 
-    Joints that may turn by more than 360 degrees take the turn nearest to the reference. Of a
-    finite reference the result is always finite and within the limits, see `IkStatus`: out of
-    reach, the wrist's centre is drawn towards the shoulder onto the boundary (the arm stretches,
-    the orientation stays); singular, the undetermined joint keeps its reference; without an
-    admissible branch the reference itself is held.
+    For a finite reference the result is finite and within the limits. Out of reach, the wrist
+    centre moves towards the shoulder onto the boundary. A singular joint keeps its reference.
+    Without an admissible branch the reference is returned.
 
     Args:
-        R_WS: (3, 3) rotation of the sensor frame in the world.
-        p_WS: (3,) its origin [m].
-        q_reference: (6,) [rad], normally where the arm is.
-        lower: (6,) joint limits [rad].
-        upper: (6,) joint limits [rad].
-        max_step: branches with any joint further than this from the reference are not admitted
-            [rad].
-
-    Returns:
-        (6,) joint positions [rad], and how they were found.
+        R_WS: (3, 3).
+        p_WS: (3,) [m].
+        q_reference: (6,) [rad], normally the current positions.
+        lower, upper: (6,) joint limits [rad].
+        max_step: largest distance of a joint from the reference [rad].
     """
     q = np.empty(6)
-    # Drake's matrices run by columns: one layout, one compilation.
+    # Drake's matrices are stored by columns; one layout avoids a second compilation.
     R = np.ascontiguousarray(R_WS)
     status = _nearest_branch(R, p_WS, q_reference, lower, upper, max_step, q)
     return q, IkStatus(status)
 
 
 def has_closed_form(arm: ArmModel) -> bool:
-    """Whether this closed form is that of an arm: it leads back to joint angles of its poses."""
+    """Return True if this closed form inverts two poses of the arm."""
     if arm.num_joints != 6 or arm.table[:, SLIDES].any():
         return False
     R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
@@ -279,30 +252,25 @@ def has_closed_form(arm: ArmModel) -> bool:
 
 
 class InverseKinematics(LeafSystem):
-    """Turns a commanded pose of the sensor frame into joint positions. Stateless.
+    """Stateless conversion of a commanded pose to joint positions.
 
-    A branch that is more than `MAX_STEP` away in any joint is not taken: at a joint limit the arm
-    waits for the command to come back instead of swinging into another configuration.
+    At a joint limit the arm waits instead of changing its configuration, see `MAX_STEP`.
 
     .. pydrake_system::
 
         name: InverseKinematics
         input_ports:
         - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
-        - joint_position: (6,) where the arm is [rad]
+        - joint_position: (6,) measured positions [rad]
         output_ports:
         - joint_command: (6,) the nearest branch [rad]
         - ik_status: an `IkStatus`
-
-    Args:
-        lower: (6,) joint limits [rad].
-        upper: (6,) joint limits [rad].
     """
 
     __slots__ = ONE_DICT
 
     MAX_STEP = 2.0
-    """[rad]. More than the quarter turn by which joints 4 and 6 may have to move past q5 = 0."""
+    """Largest joint displacement [rad]; joints 4 and 6 may need 90 degrees past q5 = 0."""
 
     def __init__(self, lower: Array, upper: Array) -> None:
         super().__init__()

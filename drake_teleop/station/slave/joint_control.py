@@ -1,14 +1,13 @@
-"""Joint position control of the slave: position loop around a velocity loop, as in the paper.
+"""Joint position control of the slave: a position loop around a velocity loop (VI-A).
 
-VI-A: the joint controllers turn joint angle setpoints into joint velocities for the inverters.
-Here the velocity loop acts through the arm's computed torque, so that the joints are decoupled.
+Computed torque decouples the joints.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,16 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import (
+    ArmModel,
+    forward_dynamics,
+    holding_torque,
+    inverse_dynamics,
+    jacobian,
+)
 from drake_teleop.station.slave.position_servo import INTERFACES, PositionInterface, PositionServo
+
+Array = NDArray[np.float64]
 
 COMPUTED_TORQUE = "computed_torque"
 
@@ -30,28 +37,32 @@ COMPUTED_TORQUE = "computed_torque"
 @settings
 @dataclass
 class JointControlConfig:
-    """How the joints follow; of computed torque the loop is about as fast as the position loop."""
+    """Joint control of the slave: computed torque or a position interface."""
 
-    position_bandwidth_hz: float = quantity(12.0, "Hz", 0.1, 1e4, "of the position loop (E)")
-    velocity_bandwidth_hz: float = quantity(70.0, "Hz", 0.1, 1e4, "of the velocity loop (E)")
+    position_bandwidth_hz: float = quantity(
+        12.0, "Hz", 0.1, 1e4, "bandwidth of the position loop (E)"
+    )
+    velocity_bandwidth_hz: float = quantity(
+        70.0, "Hz", 0.1, 1e4, "bandwidth of the velocity loop (E)"
+    )
     servo: str = choice(
         COMPUTED_TORQUE,
         (COMPUTED_TORQUE, *INTERFACES, "position"),
-        "computed_torque has the bandwidths above; the others are arms that take positions, by"
-        " name or, position, by `interface` alone",
+        "computed_torque uses the bandwidths above; the others are position interfaces: by name, or"
+        " position for the fields of `interface`",
     )
     interface: PositionInterface | None = None
 
     @property
     def position_interface(self) -> PositionInterface | None:
-        """That of the servo; None of computed torque."""
+        """Position interface of the servo; None for computed torque."""
         if self.servo == COMPUTED_TORQUE:
             return None
         return self.interface or INTERFACES.get(self.servo, PositionInterface())
 
     @property
     def lag(self) -> float:
-        """By how much it is behind a steady motion, about [s]."""
+        """Approximate delay of a steady motion [s]."""
         interface = self.position_interface
         if interface is not None:
             return interface.lookahead + interface.dead_time + 1 / interface.command_hz
@@ -59,19 +70,15 @@ class JointControlConfig:
 
     @property
     def speed_gain(self) -> float:
-        """The speed that is asked of a joint, over its error [1/s]."""
+        """Commanded joint speed divided by the position error [1/s]."""
         interface = self.position_interface
         return 2 * np.pi * self.position_bandwidth_hz if interface is None else 1 / self.lag
 
     def check(self, where: str, rate: float) -> None:
-        """Checks what ranges cannot, against the rate of the joint control [Hz].
-
-        Raises:
-            DrakeTeleopError: naming `where` and the field.
-        """
+        """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         if self.servo == COMPUTED_TORQUE and self.interface is not None:
             raise DrakeTeleopError(
-                "computed torque takes the bandwidths, not an interface",
+                "computed torque uses bandwidths, not an interface",
                 where=f"{where}.interface",
                 remedy="leave it out, or choose another servo, such as position",
             )
@@ -79,18 +86,14 @@ class JointControlConfig:
         if interface is not None:
             interface.check(f"{where}.interface", rate)
 
-    def check_is_torque(self, what: str) -> None:
-        """For what knows computed torque alone.
-
-        Raises:
-            DrakeTeleopError: for another servo, saying what does not know it.
-        """
+    def check_computed_torque(self, what: str) -> None:
+        """Raise DrakeTeleopError, with subject `what`, if the servo is not computed torque."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
-                f"{what} does not know the servo {self.servo}",
+                f"{what} does not support the servo {self.servo}",
                 where="joint_control.servo",
                 remedy=f"choose {COMPUTED_TORQUE}, with a position_bandwidth_hz of"
-                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` has them all",
+                f" {1 / (2 * np.pi * self.lag):.2g} for the same lag; `run` supports every servo",
             )
 
 
@@ -98,16 +101,15 @@ class JointControlConfig:
 def joint_control_torque(
     arm, command, state, position_gain, velocity_gain, velocity_limit, effort_limit, scratch, torque
 ):  # fmt: skip
-    """tau = ID(q, v, kv (clip(kp (q_command - q)) - v)), within the motors' torque.
+    """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,), within the torque limits.
 
-    `state` is [q; v], `scratch` (3 n,), all other arrays (n,), rad, rad/s, N m; gains in 1/s.
-    `torque` is written: while the encoders give no numbers, what carries the arm at rest at the
-    command. If that gives none it stays as it is.
+    `state` is [q; v], `scratch` (3 n,); gains in 1/s. Invalid encoders: torque for rest at the
+    command. Invalid command: the last torque.
     """
     if not sound(command):
         return
     n = torque.shape[0]
-    q, v, wanted = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
+    q, v, acceleration = scratch[:n], scratch[n : 2 * n], scratch[2 * n :]
     put(scratch, 0, state, 0, 2 * n)
     if not sound(state):
         put(q, 0, command, 0, n)
@@ -115,16 +117,14 @@ def joint_control_torque(
     for i in range(n):
         setpoint = position_gain * (command[i] - q[i])
         setpoint = min(max(setpoint, -velocity_limit[i]), velocity_limit[i])
-        wanted[i] = velocity_gain * (setpoint - v[i])
-    inverse_dynamics(arm, q, v, wanted, torque)
+        acceleration[i] = velocity_gain * (setpoint - v[i])
+    inverse_dynamics(arm, q, v, acceleration, torque)
     for i in range(n):
         torque[i] = min(max(torque[i], -effort_limit[i]), effort_limit[i])
 
 
-def servo_numbers(
-    arm: ArmModel, config: JointControlConfig
-) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
-    """Gains and limits for `joint_control_torque`."""
+def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, float, Array, Array]:
+    """Return gains and limits for `joint_control_torque`."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
@@ -136,8 +136,7 @@ def servo_numbers(
 class JointControl(LeafSystem):
     """Sampled joint position controller.
 
-    While the encoders give no numbers the motors carry the arm's weight, and it drifts on, for it
-    has no brakes.
+    With invalid encoders the motors compensate gravity and the arm drifts without brakes.
 
     .. pydrake_system::
 
@@ -148,11 +147,7 @@ class JointControl(LeafSystem):
         output_ports:
         - joint_torque: (n,) [N m], held between samples
 
-    Args:
-        arm: the arm with its tool (the controller knows its own nominal load).
-        config: the bandwidths.
-        period: sampling period [s].
-        q_start: (n,) where it holds the arm before the first sample [rad].
+    `q_start` is the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT
@@ -162,7 +157,7 @@ class JointControl(LeafSystem):
         arm: ArmModel,
         config: JointControlConfig,
         period: float,
-        q_start: NDArray[np.float64],
+        q_start: Array,
     ) -> None:
         super().__init__()
         n = arm.num_joints
@@ -170,9 +165,8 @@ class JointControl(LeafSystem):
         self._constants = (*servo_numbers(arm, config), np.zeros(3 * n))
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
-        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
+        holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
+        self.DeclareStateOutputPort("joint_torque", holding)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -186,15 +180,77 @@ class JointControl(LeafSystem):
 
 
 def MakeJointControl(
-    arm: ArmModel, config: JointControlConfig, period: float, q_start: NDArray[np.float64]
+    arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
 ) -> LeafSystem:
-    """The block that a scenario asks for; arguments as of `JointControl`."""
+    """Return the block for the servo of `config`; arguments as for `JointControl`."""
     interface = config.position_interface
     if interface is None:
         return JointControl(arm, config, period, q_start)
     return PositionServo(arm, interface, period, q_start)
 
 
-def interface_of(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """The defaults for a scenario's `joint_control.interface`: those of the servo that it names."""
+def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
+    """Return the default `interface` of the servo that a `joint_control` block names."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
+
+
+def mass_matrix(arm: ArmModel, q: Array) -> Array:
+    """Return M(q) (n, n) with rotors and tool, by inverse dynamics of unit accelerations."""
+    zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
+    columns = np.empty((len(q), len(q)))
+    for unit, column in zip(np.eye(len(q)), columns, strict=True):
+        inverse_dynamics(arm.table, q, zeros, unit, column)
+        column -= weight
+    return columns.T
+
+
+def operational_inertia(arm: ArmModel, q: Array) -> Array:
+    """Return Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W; q is not singular.
+
+    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    """
+    n = arm.num_joints
+    still, J = np.zeros(n), np.empty((6, n))
+    mobility, rates = np.empty((n, n)), np.empty(n)
+    forward_dynamics(arm.table, q, still, still, np.zeros(6), rates)
+    falling = rates.copy()
+    for i, torque in enumerate(np.eye(n)):
+        forward_dynamics(arm.table, q, still, torque, np.zeros(6), rates)
+        mobility[i] = rates - falling
+    jacobian(arm.table, q, J)
+    return np.linalg.inv(J @ mobility @ J.T)
+
+
+class ServoAtTool(NamedTuple):
+    """Servo with the wrench K (x_command - x) - D v; two values each, translation and rotation.
+
+    Attributes:
+        stiffness: K [N/m, N m/rad].
+        damping: D [N s/m, N m s/rad].
+        mass: of arm and tool [kg, kg m^2].
+    """
+
+    stiffness: list[float]
+    damping: list[float]
+    mass: list[float]
+
+
+def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoAtTool:
+    """Return stiffness, damping and mass of the slave for the passivity methods.
+
+    Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
+    blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy. The joint
+    loops accelerate with kv (kp (x_command - x) - v), hence K and D.
+
+    Raises:
+        DrakeTeleopError: for a servo other than computed torque.
+    """
+    config.check_computed_torque("the servo model of the passivity methods")
+    inertia = operational_inertia(arm, q)
+    blocks = [np.linalg.eigvalsh(inertia[i : i + 3, i : i + 3])[-1] for i in (0, 3)]
+    unit = 1 / np.sqrt(np.repeat(blocks, 3))
+    mass = np.linalg.eigvalsh(unit[:, np.newaxis] * inertia * unit)[-1] * np.array(blocks)
+    kp, kv = (
+        2 * np.pi * hertz for hertz in (config.position_bandwidth_hz, config.velocity_bandwidth_hz)
+    )
+    return ServoAtTool((kp * kv * mass).tolist(), (kv * mass).tolist(), mass.tolist())

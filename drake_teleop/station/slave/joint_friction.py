@@ -1,12 +1,8 @@
-"""Dry friction in the arm's joints: Coulomb's, regularised.
+"""Regularized Coulomb friction of the arm's joints, which Drake's joints do not have.
 
-    tau = -tau_C tanh(v / v_0),  v_0 = 2 mrad/s, or mm/s where a joint slides
+    tau = -tau_C tanh(v / v_0),  v_0 = 2 mrad/s (2 mm/s for a prismatic joint)
 
-Gears, seals and brushes have it, and Drake's joints have none, whatever a model says. Below v_0 a
-joint creeps instead of sticking, as all friction of a continuous plant does; half a metre from a
-joint that is the 1 mm/s at which friction of the surroundings is complete. It takes energy only. No
-controller is told of it: as with a real arm, it is an error of the model that their computed torque
-goes by.
+Below v_0 a joint creeps instead of sticking. No controller compensates it.
 """
 
 from __future__ import annotations
@@ -24,18 +20,17 @@ from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 Array = NDArray[np.float64]
 
 FRICTION_SPEED = 2e-3
-"""v_0 [rad/s or m/s] (E)."""
+"""v_0 [rad/s, m/s] (E)."""
 
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
-    """The torque on a joint [N m] of friction `coulomb` [N m] at a speed [rad/s]."""
+    """Return the friction torque [N m] for `coulomb` [N m] at a speed [rad/s]."""
     return -coulomb * np.tanh(speed / FRICTION_SPEED)
 
 
 @njit(cache=True)
 def _friction_into(coulomb, index, state, force):
-    """Writes `dry_friction` of joints (n,) in `state` [q; v] to their places in `force`."""
     n = coulomb.shape[0]
     force[:] = 0.0
     for i in range(n):
@@ -43,11 +38,7 @@ def _friction_into(coulomb, index, state, force):
 
 
 def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
-    """(n,) of a list with a number for each joint, or one for all, or none [N m].
-
-    Raises:
-        DrakeTeleopError: for another number of numbers.
-    """
+    """Return the friction (n,) [N m] from 0, 1 or n values; raise DrakeTeleopError otherwise."""
     n = len(joints)
     if len(values) not in (0, 1, n):
         raise DrakeTeleopError(
@@ -59,7 +50,7 @@ def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
 
 
 class JointFriction(LeafSystem):
-    """`dry_friction` of the arm as a force on the plant.
+    """Dry friction of the arm as generalized force on the plant.
 
     .. pydrake_system::
 
@@ -69,24 +60,21 @@ class JointFriction(LeafSystem):
         output_ports:
         - generalized_force: of the whole plant [N m]
 
-    Args:
-        coulomb: (n,) [N m].
-        index: (n,) where the joints stand in the plant's velocities.
-        velocities: how many the plant has.
+    `index` contains the joints' indices in the plant's velocities.
     """
 
     __slots__ = ONE_DICT
 
     def __init__(self, coulomb: Array, index: NDArray[np.intp], velocities: int) -> None:
         super().__init__()
-        self._numbers = coulomb, index
+        self._constants = coulomb, index
         self._state = self.DeclareVectorInputPort("slave_state", 2 * len(coulomb))
         self.DeclareVectorOutputPort(
             "generalized_force", velocities, weak_callback(self._calc), {self._state.ticket()}
         )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        _friction_into(*self._numbers, self._state.Eval(context), output.get_mutable_value())
+        _friction_into(*self._constants, self._state.Eval(context), output.get_mutable_value())
 
 
 def AddJointFriction(
@@ -96,7 +84,7 @@ def AddJointFriction(
     coulomb: Array,
     index: NDArray[np.intp],
 ) -> None:
-    """Adds "joint_friction" and connects it to the plant, whose arm is `instance`."""
+    """Add "joint_friction" and connect it to the plant with the arm `instance`."""
     friction = builder.AddNamedSystem(
         "joint_friction", JointFriction(coulomb, index, plant.num_velocities())
     )

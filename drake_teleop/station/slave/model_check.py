@@ -1,10 +1,8 @@
-"""What cannot be true of a robot model, said before Drake reads it.
+"""Checks of a robot model before Drake parses it.
 
-Drake follows a link with two parents or a circle of joints into an abort or for ever, and replaces
-an inertia that no body has by another one without telling, even if only the last digit is wrong.
-Here each is one error with the name of joint or link; what is merely missing is an assumption, and
-what the file's rounding made wrong is made right. So is an inertia of what no joint of the arm
-moves, such as its base, on which nothing depends.
+Drake aborts on, or never finishes, joint loops, and silently replaces invalid inertias. Here each
+fault is one error that names the joint or link. Missing values become assumptions. Inertias with
+rounding errors, or of links that no joint moves, are corrected.
 """
 
 from __future__ import annotations
@@ -20,60 +18,55 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.arm import PHI, TRANSLATION, ArmModel
 
 _INERTIAS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-# What places, shapes and masses are said with, in URDF and SDF.
-_MEASURES = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
-_MEASURES |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
-_MEASURES |= {"drake:rotor_inertia", "drake:gear_ratio"}
-WORLD = "world"  # as URDF and SDF call it
+# Elements with lengths, masses or inertias in URDF and SDF.
+_QUANTITY_TAGS = {"origin", "pose", "box", "cylinder", "sphere", "capsule", "ellipsoid", "size"}
+_QUANTITY_TAGS |= {"radius", "radii", "length", "scale", "mass", "inertia", *_INERTIAS}
+_QUANTITY_TAGS |= {"drake:rotor_inertia", "drake:gear_ratio"}
+WORLD = "world"  # name in URDF and SDF
 _JOINTS = ("joint", "drake:joint")
-_SMALLEST, _LONGEST = 0.01, 50.0  # of an arm [m]
-_LARGEST = 1e6  # of these in SI; limits may be larger, where there is none
-# How far principal moments may be from those of a body, for rounding in the file.
-_ROUNDING = 1e-3
-_NONE = 1e-15  # kg m^2: a grain of dust has more
+_MIN_LENGTH_M, _MAX_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
+_MAX_VALUE = 1e6  # of `_QUANTITY_TAGS` in SI units; limits may be larger
+# Accepted violation of the triangle inequality, as a share of the largest moment.
+_INERTIA_TOLERANCE = 1e-3
+_NEGLIGIBLE_INERTIA = 1e-15  # kg m^2, accepted violation: less than a grain of dust
 
 
 def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
-    """Checks tree, limits and masses of a URDF or SDF.
+    """Check tree, limits and masses of a URDF or SDF; correct inertias in place.
 
-    Args:
-        root: of the file, in which inertias may be made right.
-        where: for messages.
-        sensor: the arm's last link, or a link fixed to it, if that is what the file is read for.
+    `sensor` is the arm's last link, or a link fixed to it, if the file is the arm's.
 
     Returns:
-        Assumptions: which links have no mass or no inertia, and what Drake leaves out.
+        Assumptions: links without mass or inertia, corrections, and elements that Drake ignores.
 
     Raises:
-        DrakeTeleopError: for a link with two parents, a second root in a URDF, joints that form a
-            circle, names that stand twice, limits that are no numbers or the wrong way round, a
-            negative mass, an inertia that no body has where something moves it, a length or a mass
-            that no arm has.
+        DrakeTeleopError: for an invalid tree, duplicate names, invalid limits, or an implausible
+            mass, inertia or length.
     """
     for scope in root.iter():
         _check_scope(scope, where)
     for element in root.iter():
-        if element.tag in _MEASURES:
+        if element.tag in _QUANTITY_TAGS:
             _check_measure(element, where)
     for joint in root.iter("joint"):
         for limit in joint.iter("limit"):
             _check_limit(limit, f"{where}: joint {joint.get('name', '')}")
     moved = {
-        _end(joint, "child")
+        _joint_end(joint, "child")
         for joint in (each for tag in _JOINTS for each in root.iter(tag))
         if joint.get("type") != "fixed"
     }
-    unmoved = _unmoved(root, sensor)
-    without, rounded, one_kg, wrong = list[str](), list[str](), list[str](), list[str]()
+    unmoved = _links_at_rest(root, sensor)
+    massless, rounded, one_kg, corrected = list[str](), list[str](), list[str](), list[str]()
     for link in root.iter("link"):
         name = link.get("name", "")
         if root.tag == "sdf" and link.find("inertial") is None:
             one_kg.append(name)
         elif _is_massless(link, where, name in moved):
-            without.append(name)
-        if _made_right(link, f"{where}: link {name}", refused=name not in unmoved):
-            (wrong if name in unmoved else rounded).append(name)
-    rough = [
+            massless.append(name)
+        if _correct_inertia(link, f"{where}: link {name}", refused=name not in unmoved):
+            (corrected if name in unmoved else rounded).append(name)
+    with_friction = [
         joint.get("name", "")
         for joint in root.iter("joint")
         for dynamics in joint.iter("dynamics")
@@ -82,28 +75,21 @@ def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
     return [
         f"{what} {', '.join(names)}"
         for what, names in (
-            ("no inertia of", without),
-            ("1 kg, as SDF has it, for", one_kg),
-            ("an inertia of rounded numbers made a body's for", rounded),
-            ("a body's inertia, which no joint of the arm moves, for", wrong),
-            ("not the model's own dry friction of", rough),
+            ("no inertia of", massless),
+            ("1 kg, the default of SDF, for", one_kg),
+            ("an inertia corrected for rounding of", rounded),
+            ("an inertia corrected, which no joint of the arm moves, of", corrected),
+            ("no dry friction, which the model has, of", with_friction),
         )
         if names
     ]
 
 
 def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
-    """Checks that joints make a tree, or several.
-
-    Args:
-        joints: name, parent and child of each.
-        where: for the message.
-
-    Returns:
-        Of each link that hangs on a joint, its parent and the joint's name.
+    """Check joints (name, parent, child); return parent and joint of each child.
 
     Raises:
-        DrakeTeleopError: for a link with two parents, a world that hangs on something, a circle.
+        DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
     """
     parents: dict[str, tuple[str, str]] = {}
     for name, parent, child in joints:
@@ -130,12 +116,12 @@ def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, 
 
 
 def _check_scope(scope: Element, where: str) -> None:
-    """Checks the tree of a robot or a model; models inside it have names of their own."""
+    """Check the tree of a robot or a model; nested models have separate names."""
     joints = [
         (joint.get("name", ""), parent, child)
         for joint in (each for tag in _JOINTS for each in scope.findall(tag))
-        for parent, child in [(_end(joint, "parent"), _end(joint, "child"))]
-        if parent and child  # or Drake says what lacks
+        for parent, child in [(_joint_end(joint, "parent"), _joint_end(joint, "child"))]
+        if parent and child  # otherwise Drake reports the missing element
     ]
     links = [link.get("name", "") for link in scope.findall("link")]
     for kind, names in (("links", links), ("joints", [name for name, _, _ in joints])):
@@ -143,16 +129,16 @@ def _check_scope(scope: Element, where: str) -> None:
             if name and names.count(name) > 1:
                 raise DrakeTeleopError(f"two {kind} are named {name}", where=where)
     parents = check_tree(joints, where)
-    loose = [name or "a link without name" for name in links if name not in parents]
-    if scope.tag == "robot" and len(loose) > 1:
+    roots = [name or "a link without name" for name in links if name not in parents]
+    if scope.tag == "robot" and len(roots) > 1:
         raise DrakeTeleopError(
-            f"{loose[0]} and {loose[1]} are both the child of no joint",
+            f"{roots[0]} and {roots[1]} are both the child of no joint",
             where=where,
-            remedy="a URDF has one root: fasten the rest to it by joints, or take it out",
+            remedy="a URDF has one root: connect the other links by joints, or remove them",
         )
 
 
-def _end(joint: Element, name: str) -> str:
+def _joint_end(joint: Element, name: str) -> str:
     element = joint.find(name)
     return "" if element is None else (element.get("link") or element.text or "").strip()
 
@@ -162,11 +148,11 @@ def _check_measure(element: Element, where: str) -> None:
         for word in text.split():
             try:
                 value = float(word)
-            except ValueError:  # a name; or Drake says that it wants a number
+            except ValueError:  # a name; Drake reports an invalid number
                 continue
-            if not abs(value) <= _LARGEST:
+            if not abs(value) <= _MAX_VALUE:
                 raise DrakeTeleopError(
-                    f"{element.tag} {word} is no finite number up to {_LARGEST:g}", where=where
+                    f"{element.tag} {word} is no finite number up to {_MAX_VALUE:g}", where=where
                 )
             if element.tag == "drake:rotor_inertia" and value < 0.0:
                 raise DrakeTeleopError(f"a rotor inertia of {word} kg m^2", where=where)
@@ -182,26 +168,20 @@ def _check_limit(limit: Element, where: str) -> None:
         raise DrakeTeleopError(f"lower limit {lower:g} is above upper limit {upper:g}", where=where)
     for name in ("velocity", "effort"):
         value = number(name)
-        # Of SDF, -1 says that there is no limit.
+        # In SDF, -1 means no limit.
         if value is not None and value < 0 and not (value == -1 and limit.get(name) is None):
             raise DrakeTeleopError(f"{name} limit {value:g} is negative", where=where)
-    for name, text in limit.attrib.items():  # of a URDF
+    for name, text in limit.attrib.items():  # URDF only
         if math.isinf(_number(text, name, where)):
             raise DrakeTeleopError(
                 f"{name} {text} is not finite",
                 where=where,
-                remedy="leave out what has no limit: what is assumed will be said",
+                remedy="leave the limit out; the assumed limit is reported",
             )
 
 
 def _is_massless(link: Element, where: str, moves: bool) -> bool:
-    """Whether a link that has shapes, or that a joint moves, has no inertia.
-
-    Without either it is a frame, such as tool0.
-
-    Raises:
-        DrakeTeleopError: for a mass or an inertia that cannot be.
-    """
+    """Return True if a link with shapes, or moved by a joint, has no inertia."""
     place = f"{where}: link {link.get('name', '')}"
     inertial = link.find("inertial")
     mass_element = None if inertial is None else inertial.find("mass")
@@ -213,53 +193,47 @@ def _is_massless(link: Element, where: str, moves: bool) -> bool:
         raise DrakeTeleopError(f"mass {mass:g} kg is negative", where=place)
     element = inertial.find("inertia")
     if element is None:
-        turns = mass_element.get("value") is None  # of SDF it is 1 kg m^2 then
+        has_inertia = mass_element.get("value") is None  # the default of SDF is 1 kg m^2
     else:
-        turns = bool(_moments(element, place)[2] > 0.0)
-    if mass == 0.0 and turns:
+        has_inertia = bool(_moments(element, place)[2] > 0.0)
+    if mass == 0.0 and has_inertia:
         raise DrakeTeleopError("an inertia, but no mass", where=place, remedy="give both or none")
-    return counts and not turns
+    return counts and not has_inertia
 
 
-def _unmoved(root: Element, sensor: str) -> set[str]:
-    """The links of a URDF or of an SDF's only model that no joint up to the sensor moves."""
+def _links_at_rest(root: Element, sensor: str) -> set[str]:
+    """Return the links that no joint up to the sensor moves."""
     joints = {
-        _end(joint, "child"): (_end(joint, "parent"), joint.get("type") != "fixed")
+        _joint_end(joint, "child"): (_joint_end(joint, "parent"), joint.get("type") != "fixed")
         for joint in (each for tag in _JOINTS for each in root.iter(tag))
     }
     links = [link.get("name", "") for link in root.iter("link")]
     if sensor not in links or len(set(links)) < len(links):
         return set()
 
-    def way(link: str) -> list[str]:
+    def path(link: str) -> list[str]:
         passed = [link]
-        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # a loop has no end
+        while passed[-1] in joints and joints[passed[-1]][0] not in passed:  # stop in a loop
             passed.append(joints[passed[-1]][0])
         return passed
 
-    moved = [link for link in way(sensor) if joints.get(link, ("", False))[1]]
-    return {link for link in links if moved and moved[-1] not in way(link)}
+    moved = [link for link in path(sensor) if joints.get(link, ("", False))[1]]
+    return {link for link in links if moved and moved[-1] not in path(link)}
 
 
-def _made_right(link: Element, where: str, *, refused: bool) -> bool:
-    """Makes a body's inertia of one that no body has, by the same addition to each of its moments.
+def _correct_inertia(link: Element, where: str, *, refused: bool) -> bool:
+    """Correct an invalid inertia by equal additions to its diagonal; return True if changed.
 
-    Args:
-        link: of which it is.
-        where: for the message.
-        refused: whether more than rounding is an error: `_ROUNDING` of the largest moment, `_NONE`.
-
-    Raises:
-        DrakeTeleopError: if it is one.
+    If `refused`, a correction beyond rounding raises a DrakeTeleopError.
     """
     element = link.find("inertial/inertia")
     if element is None:
         return False
     moments = _moments(element, where)
-    lacking = max(-moments[0], moments[2] - moments[1] - moments[0])
-    if lacking <= 0.0:
+    violation = max(-moments[0], moments[2] - moments[1] - moments[0])
+    if violation <= 0.0:
         return False
-    if refused and lacking > max(_ROUNDING * abs(moments[2]), _NONE):
+    if refused and violation > max(_INERTIA_TOLERANCE * abs(moments[2]), _NEGLIGIBLE_INERTIA):
         raise DrakeTeleopError(
             "no body has this inertia: its principal moments are "
             f"{moments[0]:.3g}, {moments[1]:.3g}, {moments[2]:.3g} kg m^2",
@@ -267,7 +241,7 @@ def _made_right(link: Element, where: str, *, refused: bool) -> bool:
             remedy="all are positive, and none is more than the sum of the other two",
         )
     for name in ("ixx", "iyy", "izz"):
-        value = f"{float(_entry(element, name)) + 1.001 * lacking:.17g}"
+        value = f"{float(_entry(element, name)) + 1.001 * violation:.17g}"
         child = element.find(name)
         if child is None:
             element.set(name, value)
@@ -281,7 +255,7 @@ def _entry(inertia: Element, name: str) -> str:
 
 
 def _moments(inertia: Element, where: str) -> NDArray[np.float64]:
-    """(3,) principal moments, the smallest first."""
+    """Return the principal moments (3,), ascending."""
     xx, xy, xz, yy, yz, zz = (_number(_entry(inertia, name), name, where) for name in _INERTIAS)
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
@@ -298,19 +272,15 @@ def _number(text: str, name: str, where: str) -> float:
 
 
 def check_size(arm: ArmModel, where: str) -> None:
-    """Refuses an arm that is too large or too small for its lengths to be metres.
-
-    Raises:
-        DrakeTeleopError: for its length, or a link whose mass is far from its joint.
-    """
+    """Raise DrakeTeleopError for an implausible length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
-    if 0.0 < length < _SMALLEST or length > _LONGEST:
+    if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:
         what = f"from its first joint to the sensor it is {length:.3g} m long"
         raise DrakeTeleopError(what, where=where, remedy=remedy)
     for name, phi in zip((*arm.joint_names, "the sensor"), arm.table[:, PHI:], strict=True):
-        # The root mean square of the distance of its mass from the joint's origin.
-        away = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
-        if away > _LONGEST:
-            what = f"what {name} moves is {away:.3g} m away from it"
+        # Root mean square distance of the mass from the joint's origin.
+        distance = np.sqrt((phi[4] + phi[7] + phi[9]) / (2.0 * phi[0])) if phi[0] > 0.0 else 0.0
+        if distance > _MAX_LENGTH_M:
+            what = f"the mass moved by {name} is {distance:.3g} m away from it"
             raise DrakeTeleopError(what, where=where, remedy=remedy)

@@ -1,4 +1,4 @@
-"""What a robot model's files say beside what Drake reads of them."""
+"""Information in model files that Drake's parser does not return."""
 
 from __future__ import annotations
 
@@ -14,16 +14,12 @@ XACRO = "run it through xacro first, and give the URDF that comes out"
 
 
 def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
-    """Roots of the XML that is a model, by file: of itself, or of what model directives add.
-
-    Raises:
-        DrakeTeleopError: for what is no XML, no YAML, or still a macro.
-    """
+    """Return XML roots by file: of the model, or of the models that directives add."""
     kind = path.suffix.lower()
     if kind == ".yaml":
-        data = read_yaml(path, tagged=True)  # Drake's parser overflows its stack over many brackets
+        data = read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
         added = [file for address in added_models(data) if (file := files.file(address))]
-        # What is not there, and what they include, is said by Drake, or not at all.
+        # Drake reports missing files and reads nested includes.
         roots = {file: read_xml(file) for file in added if file.suffix in (".urdf", ".sdf")}
     else:
         roots = {path: read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
@@ -33,16 +29,13 @@ def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
     return roots
 
 
-def peculiar_joints(root: Element) -> dict[str, str]:
-    """Joints that do not move by themselves, and links that float on another link.
-
-    Drake ignores both. By the name of joint or link, what it does.
-    """
+def unsupported_joints(root: Element) -> dict[str, str]:
+    """Return properties that Drake ignores: dependent joints and links that float on a link."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
             found[joint.get("name", "")] = "moves with another joint (mimic)"
-        if joint.get("stiffness", "0").strip("0. "):  # of MJCF
+        if joint.get("stiffness", "0").strip("0. "):  # MJCF
             found[joint.get("name", "")] = "has a spring (stiffness)"
         for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=False):
             if joint.get("type") == "floating" and parent.get("link") != WORLD:
@@ -56,7 +49,7 @@ def peculiar_joints(root: Element) -> dict[str, str]:
 
 
 def floating_links(root: Element) -> list[str]:
-    """Links that the file lets float in the world."""
+    """Return links that float in the world."""
     joints = [joint for joint in root.iter("joint") if joint.get("type") == "floating"]
     ends = [(joint.find("parent"), joint.find("child")) for joint in joints]
     urdf = [c.get("link", "") for p, c in ends if p is not None and c is not None]
@@ -69,8 +62,8 @@ def _is_free(joint: Element | None) -> bool:
     return joint is not None and joint.get("type") == "free"
 
 
-def efforts(root: Element) -> dict[str, float]:
-    """Torque limits of URDF joints, which Drake drops where there is no transmission."""
+def effort_limits(root: Element) -> dict[str, float]:
+    """Return torque limits of URDF joints; Drake drops them without a transmission."""
     limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
     return {
         name: float(limit.get("effort", "0"))
@@ -79,11 +72,8 @@ def efforts(root: Element) -> dict[str, float]:
     }
 
 
-def without_idle(root: Element) -> list[str]:
-    """Takes out what moves nothing, which Drake takes for an error; says so of motors.
-
-    A joint that is fixed moves with none, and a joint that is not there has no motor.
-    """
+def remove_idle_elements(root: Element) -> list[str]:
+    """Remove `mimic` tags of fixed joints and transmissions of missing joints; return notes."""
     for joint in root.iter("joint"):
         for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
             joint.remove(mimic)

@@ -1,9 +1,8 @@
-"""The files that a robot model names, and those that these name: where they are, which may be read.
+"""Files that a robot model references, and access rules for them.
 
-A model may come from anybody, and what it names goes into pages and films. So only files inside its
-folder and its packages are read, after symbolic links are resolved: packages are `package_paths`,
-and ROS packages (package.xml) around the model. Includes form no cycle; number and size of all
-files are bounded.
+Models may be untrusted. Only files inside the model's folder and its packages are read, after
+resolving symbolic links. Packages are `package_paths` and ROS packages (package.xml) around the
+model. Include cycles are errors; number and size of files are limited.
 """
 
 from __future__ import annotations
@@ -23,29 +22,21 @@ from pydrake.multibody.parsing import PackageMap
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.texts import read_yaml
 
-# Of all files, each counted as often as it is included; and bytes of each text.
+# Limits for all files together (repeated includes count again), and bytes of one text file.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
-_LONGEST_NAME = 4096
-_MAX_DEPTH = 20  # of files that include each other
+_MAX_NAME_LENGTH = 4096
+_MAX_DEPTH = 20  # of nested includes
 _BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
 _PACKAGE = "package.xml"
 _ATTRIBUTE = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
 _ELEMENT = re.compile(r"(\{.*\}|drake:)?(file|filename|uri|url|\w*_map|sdf)\Z")
-_FOLDERS = ("meshdir", "texturedir", "assetdir")  # of MJCF, in which files are looked for
+_FOLDERS = ("meshdir", "texturedir", "assetdir")  # search folders of MJCF
 _MTL = re.compile(rb"^[ \t]*(?:map_\w+|bump|disp|decal|norm|refl)[ \t]+(.*)$", re.M)
 _OBJ = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
 
 
 class ModelFiles:
-    """What a model may read.
-
-    Args:
-        model: its file.
-        package_paths: folders that are packages, or contain some.
-
-    Attributes:
-        packages: folders by the name of the package.
-    """
+    """Files that a model may read; `packages` contains folders by package name."""
 
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._model, self._folder = model, model.resolve().parent
@@ -64,27 +55,26 @@ class ModelFiles:
             inside = [self._folder] if os.path.isdir(self._folder / name) else []
             named = [each for each in own if each.name == name]
             for folder in (*(each / name for each in inside), *named, *(e / name for e in beside)):
-                if folder.resolve() == folder:  # no link, and not ".."
+                if folder.resolve() == folder:  # neither a link nor ".."
                     self.packages.setdefault(name, folder)
         self._roots = {self._folder, *own, *(folder.resolve() for folder in package_paths)}
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._bases = {""}
 
     def share_packages(self, known: PackageMap) -> None:
-        """Merge the packages with Drake's; the one that Drake would download is removed."""
+        """Merge packages with Drake's map; remove the one that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
-            if known.Contains(name):  # Drake's own, which theirs takes the place of
+            if known.Contains(name):  # the model's package replaces Drake's
                 known.Remove(name)
             known.Add(name, str(folder))
         self.packages = {n: Path(known.GetPath(n)).resolve() for n in known.GetPackageNames()}
 
     def file(self, address: str, folder: Path | None = None) -> Path | None:
-        """Return the file or folder at an address; None if there is none.
+        """Return the existing file or folder at an address, or None.
 
-        Args:
-            address: package://, model://, file:// or a path.
-            folder: that the path is relative to; None: the model's.
+        The address is package://, model://, file:// or a path relative to `folder`, by default the
+        model's.
         """
         match = re.match(r"(?:package|model)://([^/]+)/?(.*)", address, re.S)
         if match:
@@ -92,18 +82,16 @@ class ModelFiles:
             path = None if base is None else base / match[2]
         else:
             path = (folder or self._folder) / address.removeprefix("file://")
-        return next(iter(_existing(path)), None)
+        return next(iter(_existing_paths(path)), None)
 
     def check(self, path: Path) -> None:
-        """Check the model, or a file that it names, with all that is named in there.
-
-        Of a model in URDF or SDF the meshes of its own links are left out.
+        """Check a file and all files that it references, except meshes of the model's own links.
 
         Raises:
             DrakeTeleopError: for a file outside, a cycle, or too many or too large files.
         """
         folders = 0
-        while folders < len(self._bases):  # those of MJCF hold for files that were seen before
+        while folders < len(self._bases):  # MJCF folders also apply to files seen before
             folders = len(self._bases)
             self._sizes.clear()
             files, size = self._size(path, ())
@@ -111,7 +99,7 @@ class ModelFiles:
         _check_size(*self._total, self._model)
 
     def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
-        """The number of files and bytes that reading a file takes."""
+        """Return the number of files and bytes that reading a file takes."""
         real, where = path.resolve(), str(including[-1] if including else self._model)
         roots = (*self._roots, *self.packages.values())
         if not any(real.is_relative_to(root) for root in roots):
@@ -128,56 +116,58 @@ class ModelFiles:
                 raise DrakeTeleopError(f"names {path}, which is no file", where=where)
             files, size = 1, real.stat().st_size
             _check_size(files, size, path)
-            for named in list(self._named(real)):
+            for named in list(self._referenced_files(real)):
                 more = self._size(named, (*including, real))
                 files, size = files + more[0], size + more[1]
                 _check_size(files, size, path)
             self._sizes[real] = files, size
         return self._sizes[real]
 
-    def _named(self, path: Path) -> Iterator[Path]:
-        """The files and folders that a file names, as far as they exist."""
+    def _referenced_files(self, path: Path) -> Iterator[Path]:
+        """Yield the existing files and folders that a file references."""
         tops = [path.parent, self._folder]
         if path.suffix.lower() == ".sdf" and path != self._model.resolve():
-            tops.append(Path.cwd())  # from where Drake takes includes of includes
+            tops.append(Path.cwd())  # Drake resolves nested includes from here
         folders = {top / base for top in tops for base in self._bases}
         try:
             for address in self._addresses(path):
-                if len(address) > _LONGEST_NAME and path.suffix.lower() not in (".obj", ".mtl"):
-                    what = f"names a file by {len(address)} characters"  # which ends Drake
+                if len(address) > _MAX_NAME_LENGTH and path.suffix.lower() not in (".obj", ".mtl"):
+                    what = f"names a file by {len(address)} characters"  # Drake aborts on it
                     raise DrakeTeleopError(what, where=str(path), remedy="give a shorter name")
                 named = {self.file(address, folder) for folder in folders}
-                found = {file for each in named for file in _existing(each)}
+                found = {file for each in named for file in _existing_paths(each)}
                 yield from (each for each in found if each != path.parent)
         except OSError as error:
             raise DrakeTeleopError(f"cannot be read ({error.strerror})", where=str(path)) from None
 
     def _addresses(self, path: Path) -> Iterator[str]:
         kind = path.suffix.lower()
-        if path.is_dir():  # of a model in Gazebo's form
+        if path.is_dir():  # Gazebo model folder
             yield from (
                 name for name in ("model.config", "manifest.xml") if (path / name).is_file()
             )
         elif kind in (".urdf", ".sdf", ".xml", ".config"):
             root = read_xml(path)
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
-            yield from _of_xml(root, meshes=path != self._model.resolve() or kind == ".xml")
+            yield from _addresses_in_xml(
+                root, meshes=path != self._model.resolve() or kind == ".xml"
+            )
         elif kind in (".yaml", ".yml"):
             yield from added_models(read_yaml(path, tagged=True))
         elif kind in (".gltf", ".glb"):
-            yield from _of_gltf(path)
+            yield from _addresses_in_gltf(path)
         elif kind in (".obj", ".mtl"):
             for line in (_OBJ if kind == ".obj" else _MTL).findall(path.read_bytes()):
                 words = line.decode("utf-8", errors="surrogateescape").split()
                 yield from {*words, *(" ".join(words[k:]) for k in range(len(words)))}
 
 
-def _existing(path: Path | None) -> list[Path]:
-    """The path if it exists, and what it is to Drake, to which a/../b is b whatever a is."""
+def _existing_paths(path: Path | None) -> list[Path]:
+    """Return the path if it exists, and as Drake normalizes it (a/../b is b)."""
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]
-    except ValueError:  # no name that a file can have
+    except ValueError:  # invalid file name
         return []
 
 
@@ -189,9 +179,9 @@ def _check_size(files: int, size: int, path: Path) -> None:
 
 
 def read_xml(path: Path) -> Element:
-    """Return the root of an XML file, with names as they are: Drake's own begin with `drake:`.
+    """Return the root of an XML file, with `drake:` prefixes unchanged.
 
-    Drake's parser reads what is no XML too. That would be checked by nobody, so it is an error.
+    Drake also reads malformed XML, which these checks cannot; here it is an error.
     """
     builder, parser = TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
@@ -204,12 +194,12 @@ def read_xml(path: Path) -> Element:
     try:
         parser.Parse(path.read_bytes(), True)
         return builder.close()
-    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two of its encoding
+    except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"
         raise DrakeTeleopError(f"is not XML ({error})", where=str(path), remedy=remedy) from None
 
 
-def _of_xml(root: Element, *, meshes: bool) -> Iterator[str]:
+def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
     for element in root.iter():
         if element.tag in ("plugin", "script"):
             continue
@@ -220,7 +210,7 @@ def _of_xml(root: Element, *, meshes: bool) -> Iterator[str]:
 
 
 def added_models(data: Any) -> Iterator[str]:
-    """Return the addresses of the files that model directives add."""
+    """Yield the addresses of the files that model directives add."""
     directives = data.get("directives") if isinstance(data, dict) else None
     for each in directives if isinstance(directives, list) else []:
         for kind in ("add_model", "add_directives"):
@@ -229,11 +219,11 @@ def added_models(data: Any) -> Iterator[str]:
                 yield added["file"]
 
 
-def _of_gltf(path: Path) -> list[str]:
+def _addresses_in_gltf(path: Path) -> list[str]:
     found: list[str] = []
 
     def keep(fields: list[tuple[str, Any]]) -> None:
-        for name, value in fields:  # each of a name that is there twice
+        for name, value in fields:  # includes duplicate names
             if name == "uri" and isinstance(value, str) and not value.startswith("data:"):
                 found.extend({value, unquote(value)})
 

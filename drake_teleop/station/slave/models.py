@@ -1,4 +1,4 @@
-"""Reading robot models as they are found: meshes missing, base hanging free, packages elsewhere."""
+"""Reading of robot models: missing meshes, free bases, packages in other folders."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from pydrake.multibody.tree import (
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.silence import silent_stderr
 from drake_teleop.common.texts import read_text
-from drake_teleop.station.slave.meshes import without_lost_meshes
+from drake_teleop.station.slave.meshes import remove_unusable_meshes
 from drake_teleop.station.slave.model_check import WORLD, check_model, check_tree
 from drake_teleop.station.slave.model_files import (
     XACRO,
-    efforts,
+    effort_limits,
     floating_links,
-    peculiar_joints,
     read_roots,
-    without_idle,
+    remove_idle_elements,
+    unsupported_joints,
 )
 from drake_teleop.station.slave.model_references import ModelFiles
 
-# What ties links to each other besides joints: Drake's tags in URDF and SDF, MJCF's.
+# Elements that close kinematic loops: Drake's tags in URDF and SDF, and MJCF's.
 _LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
-# How what is said of lost meshes begins.
-_MISSING = "shapes are missing of"
-# What a file should be, and where its packages are looked for.
-_Said: TypeAlias = tuple[str, str]
+# Prefix of assumptions about removed shapes.
+_REMOVED_SHAPES = "shapes are missing of"
+# Expected kind of file, and the remedy for missing packages.
+_Description: TypeAlias = tuple[str, str]
 _Found = TypeVar("_Found")
 _ROBOT = ("robot", "with --package-path for package://")
 _SCENE = ("scene", "its package:// addresses in folders around it")
@@ -57,14 +57,7 @@ _SCENE = ("scene", "its package:// addresses in folders around it")
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """What `ParseModel` found.
-
-    Attributes:
-        instance: the arm's, of the joints from the world to S.
-        sensor_frame: S.
-        assumptions: on what is missing, and what is held.
-        folder: of converted meshes; Drake reads them when it needs them.
-    """
+    """Result of `ParseModel`; `folder` has converted meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -74,7 +67,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """What `ParseTool` found: as of `ParsedModel`, and the body on the sensor frame."""
+    """Result of `ParseTool`; `body` is the body on the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -88,46 +81,39 @@ def ParseModel(
     package_paths: tuple[Path, ...] = (),
     X_WBase: RigidTransform | None = None,
 ) -> ParsedModel:
-    """Parses the model of an arm, so that nothing of it moves but the joints that lead to S.
+    """Parse an arm, in which only the joints up to S move, each with one actuator.
 
-    A base that hangs on nothing is welded to the world, and joints beside the way from there to S,
-    such as a gripper's, where they are by default. Each joint on the way has one actuator.
-
-    Args:
-        plant: not finalized.
-        path: a URDF or SDF, or anything else that Drake reads by its suffix.
-        sensor_frame: name of the frame or link at which the sensor measures.
-        package_paths: folders in which `package://` addresses are looked up.
-        X_WBase: where the base is welded to the world.
+    A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
+    at their default positions. `package_paths` are folders of `package://` addresses.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, has no such frame, says what cannot be true of
-            an arm, see `check_model`, or fastens the base elsewhere than at `X_WBase`.
+        DrakeTeleopError: if the file cannot be read, has no such frame, fails `check_model`, or
+            fixes the base although `X_WBase` is not the identity.
     """
     before = set(plant.GetJointIndices())
-    read = _read(plant, path, package_paths, sensor=sensor_frame)
-    having = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
-    if len(having) != 1:
+    read = _parse(plant, path, package_paths, sensor=sensor_frame)
+    with_frame = [i for i in read.instances if plant.HasFrameNamed(sensor_frame, i)]
+    if len(with_frame) != 1:
         frames = [
             plant.get_frame(index).name()
             for instance in read.instances
             for index in plant.GetFrameIndices(instance)
         ]
-        # Drake's own, of joints.
+        # Names that Drake creates for joints.
         frames = [name for name in frames if not name.endswith(("_parent", "_child", "__model__"))]
         known = ", ".join(sorted(set(frames)))
         raise DrakeTeleopError(
-            f"{len(having) or 'no'} frames are named {sensor_frame!r}",
+            f"{len(with_frame) or 'no'} frames are named {sensor_frame!r}",
             where=str(path),
             remedy=f"name one of {known}" if known else "give a model that has links",
         )
-    frame = plant.GetFrameByName(sensor_frame, having[0])
-    chain = _weld_base(plant, frame, read.of_all(peculiar_joints), X_WBase, str(path))
-    _check_loose(plant, read.instances, str(path))
+    frame = plant.GetFrameByName(sensor_frame, with_frame[0])
+    chain = _weld_base(plant, frame, read.collect(unsupported_joints), X_WBase, str(path))
+    _check_free_bodies(plant, read.instances, str(path))
     _check_chain(plant, chain, str(path))
-    with drakes_errors_said(path):
-        held = _hold_others(plant, before, chain)
-        _actuate(plant, chain, read.of_all(efforts))
+    with translate_drake_errors(path):
+        held = _weld_other_joints(plant, before, chain)
+        _actuate(plant, chain, read.collect(effort_limits))
     instances = {plant.get_joint(k).model_instance() for k in chain if _moves(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
@@ -136,98 +122,85 @@ def ParseModel(
             where=str(path),
             remedy="write the chain up to the sensor as one model",
         )
-    instance = next(iter(instances), having[0])
-    afloat = [name for root in read.roots for name in floating_links(root)]
-    welded = [f"welded to the world, where it may float: {', '.join(afloat)}"] if afloat else []
+    instance = next(iter(instances), with_frame[0])
+    floating = [name for root in read.roots for name in floating_links(root)]
+    welded = [f"welded to the world, where it may float: {', '.join(floating)}"] if floating else []
     return ParsedModel(instance, frame, [*read.assumptions, *welded, *held], read.folder)
 
 
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parses what hangs on the sensor: its root is welded to S by the joint "sensor_weld".
-
-    Joints inside it are held where they are by default.
-
-    Args:
-        plant: not finalized, with the arm.
-        path: as for `ParseModel`.
-        sensor_frame: S.
-        package_paths: as for `ParseModel`.
+    """Parse a tool with one root and weld it to S by the joint "sensor_weld"; hold its joints.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, or holds several things that do not hang on
-            each other.
+        DrakeTeleopError: if the file cannot be read or has another number of roots.
     """
     before = set(plant.GetJointIndices())
-    read = _read(plant, path, package_paths)
+    read = _parse(plant, path, package_paths)
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     bodies = [index for instance in read.instances for index in plant.GetBodyIndices(instance)]
     roots = [plant.get_body(index) for index in bodies if index not in held]
     if len(roots) != 1:
-        names = ", ".join(body.name() for body in roots)
+        names = ", ".join(body.name() for body in roots) or "none"
         raise DrakeTeleopError(
-            f"{names or 'nothing'} can be put on the sensor",
+            f"the tool has {len(roots)} roots: {names}",
             where=str(path),
-            remedy="a tool is one tree of links, whose root is put on the sensor frame",
+            remedy="give one tree of links; its root is welded to the sensor frame",
         )
-    with drakes_errors_said(path):
-        assumptions = [*read.assumptions, *_hold_others(plant, before, [])]
+    with translate_drake_errors(path):
+        assumptions = [*read.assumptions, *_weld_other_joints(plant, before, [])]
     weld = WeldJoint("sensor_weld", sensor_frame, roots[0].body_frame(), RigidTransform.Identity())
     plant.AddJoint(weld)
     return ParsedTool(roots[0], assumptions, read.folder)
 
 
 def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
-    """Parses what stands around an arm: nothing of it is held, and nothing assumed.
-
-    Args:
-        plant: not finalized.
-        path: as for `ParseModel`.
-
-    Returns:
-        The folder of converted meshes, to be kept as long as shapes are looked at.
+    """Parse the surroundings of an arm; return the folder of their converted meshes.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, or has what Drake would leave out.
+        DrakeTeleopError: if the file cannot be read, or contains elements that Drake ignores.
     """
-    read = _read(plant, path, (), _SCENE)
-    missing = [text for text in read.assumptions if text.startswith(_MISSING)]
-    missing += [f"{name} {what}" for name, what in read.of_all(peculiar_joints).items()]
+    read = _parse(plant, path, (), _SCENE)
+    missing = [text for text in read.assumptions if text.startswith(_REMOVED_SHAPES)]
+    missing += [f"{name} {what}" for name, what in read.collect(unsupported_joints).items()]
     if missing:
         raise DrakeTeleopError(
-            missing[0], where=str(path), remedy="nothing may be left out that the tool could touch"
+            missing[0],
+            where=str(path),
+            remedy="correct it; every object that the tool could touch must be readable",
         )
     return read.folder
 
 
-class _Read(NamedTuple):
-    """What stands in a file; the roots of the XML that it is made of."""
+class _ModelContent(NamedTuple):
+    """Content of a model file, and the roots of its XML files."""
 
     instances: list[ModelInstanceIndex]
     roots: list[ElementTree.Element]
     assumptions: list[str]
     folder: TemporaryDirectory[str]
 
-    def of_all(self, find: Callable[[ElementTree.Element], dict[str, _Found]]) -> dict[str, _Found]:
-        """What `find` finds in any of the roots."""
+    def collect(
+        self, find: Callable[[ElementTree.Element], dict[str, _Found]]
+    ) -> dict[str, _Found]:
         return {name: what for root in self.roots for name, what in find(root).items()}
 
 
-def _read(
+def _parse(
     plant: MultibodyPlant,
     path: Path,
     package_paths: tuple[Path, ...],
-    said: _Said = _ROBOT,
+    expected: _Description = _ROBOT,
     sensor: str = "",
-) -> _Read:
+) -> _ModelContent:
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
     if path.suffix.lower() == ".xacro":
         raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
     kind = path.suffix.lower().removeprefix(".")
     if kind == "xml":
-        read_text(path)  # or names cannot be said
+        read_text(path)  # raises an error for invalid encoding
     files = ModelFiles(path, package_paths)
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
@@ -238,34 +211,36 @@ def _read(
     forces = plant.num_force_elements()
     roots = read_roots(path, files)
     _check_no_loop(path, kind)
-    with drakes_errors_said(path, said):
+    with translate_drake_errors(path, expected):
         for file, root in roots.items():
             assumptions += check_model(root, str(file), sensor)
         if kind in ("urdf", "sdf"):
             root = roots[path]
-            assumptions += without_idle(root)
-            lost = without_lost_meshes(root, files, Path(converted.name))
-            assumptions += [f"{_MISSING} {', '.join(ls)}: {what}" for what, ls in lost.items()]
-            for uri in root.iterfind(".//include/uri"):  # relative to the file, not to the process
+            assumptions += remove_idle_elements(root)
+            lost = remove_unusable_meshes(root, files, Path(converted.name))
+            assumptions += [
+                f"{_REMOVED_SHAPES} {', '.join(ls)}: {what}" for what, ls in lost.items()
+            ]
+            for uri in root.iterfind(".//include/uri"):  # or Drake uses the working folder
                 if (included := files.file((uri.text or "").strip())) is not None:
                     uri.text = f"file://{included.resolve()}"
             text = ElementTree.tostring(root, encoding="unicode")
-            with _drakes_errors_raised():
+            with _raise_logged_errors():
                 instances = parser.AddModelsFromString(text, kind)
         else:
-            with _drakes_errors_raised():
+            with _raise_logged_errors():
                 instances = parser.AddModels(str(path))
-    if said is _ROBOT and plant.num_force_elements() > forces:
+    if expected is _ROBOT and plant.num_force_elements() > forces:
         raise DrakeTeleopError(
-            "has springs, or other forces of its own",
+            "has springs or other force elements",
             where=str(path),
-            remedy="take them out: what moves the arm are its motors, gravity and what it touches",
+            remedy="remove them; only motors, gravity and contact move the arm",
         )
-    return _Read(instances, list(roots.values()), assumptions, converted)
+    return _ModelContent(instances, list(roots.values()), assumptions, converted)
 
 
 def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> None:
-    """Refuses what moves otherwise than about or along one axis."""
+    """Raise an error for joints that are neither revolute nor prismatic."""
     for joint in (plant.get_joint(index) for index in chain if _moves(plant, index)):
         if not isinstance(joint, (RevoluteJoint, PrismaticJoint)):
             raise DrakeTeleopError(
@@ -275,22 +250,21 @@ def _check_chain(plant: MultibodyPlant, chain: list[JointIndex], where: str) -> 
             )
 
 
-def _check_loose(plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str) -> None:
+def _check_free_bodies(
+    plant: MultibodyPlant, instances: list[ModelInstanceIndex], where: str
+) -> None:
     held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
     for index in (k for instance in instances for k in plant.GetBodyIndices(instance)):
         if index not in held:
             raise DrakeTeleopError(
-                f"{plant.get_body(index).name()} hangs on nothing, beside the arm",
+                f"{plant.get_body(index).name()} is not connected to the arm",
                 where=where,
-                remedy="take it out, and put what there is to touch into the environment",
+                remedy="remove it; list objects that the tool touches in environment",
             )
 
 
 def _check_no_loop(path: Path, kind: str) -> None:
-    """Refuses what closes loops in a tree of links: Drake would drop it, or the chain be another.
-
-    Of joints that move together, `peculiar_joints` tells.
-    """
+    """Raise an error for loop constraints (`unsupported_joints` finds dependent joints)."""
     found = None if kind == "yaml" else _LOOP.search(path.read_bytes())
     if found:
         raise DrakeTeleopError(
@@ -304,11 +278,11 @@ def _moves(plant: MultibodyPlant, index: JointIndex) -> bool:
     return plant.get_joint(index).num_velocities() > 0
 
 
-def _hold_others(
+def _weld_other_joints(
     plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
 ) -> list[str]:
-    """Welds what moves and is not on the chain, where it is by default; says so."""
-    for constraint in plant.GetConstraintIds():  # such as of fingers that move together
+    """Weld moving joints outside the chain at their default positions; return a note."""
+    for constraint in plant.GetConstraintIds():  # for example of coupled fingers
         plant.RemoveConstraint(constraint)
     names = []
     for index in set(plant.GetJointIndices()) - before - set(chain):
@@ -327,7 +301,7 @@ def _hold_others(
 
 
 def _default_pose(joint: Joint) -> RigidTransform:
-    """X_FM where the joint is by default; Drake has it for few kinds."""
+    """Return the default X_FM of a joint; Drake provides it for few kinds."""
     q = joint.default_positions()
     if isinstance(joint, RevoluteJoint):
         return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
@@ -336,8 +310,8 @@ def _default_pose(joint: Joint) -> RigidTransform:
     return joint.GetDefaultPose() if np.any(q) else RigidTransform()
 
 
-def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, float]) -> None:
-    """One actuator for each moving joint of the chain, in its order, as a state has them."""
+def _actuate(plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float]) -> None:
+    """Give each moving joint of the chain one actuator, in the order of the chain."""
     moving = [index for index in chain if _moves(plant, index)]
     actuators = [plant.get_joint_actuator(k) for k in plant.GetJointActuatorIndices()]
     own = [each for each in actuators if each.joint().index() in chain]
@@ -355,7 +329,7 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
         plant.RemoveJointActuator(each)
     for index in moving:
         joint = plant.get_joint(index)
-        effort, rotor, gear = known.get(index, (efforts.get(joint.name(), 0.0), 0.0, 1.0))
+        effort, rotor, gear = known.get(index, (limits.get(joint.name(), 0.0), 0.0, 1.0))
         effort = effort if effort > 0.0 else np.inf
         actuator = plant.AddJointActuator(joint.name(), joint, effort)
         actuator.set_default_rotor_inertia(rotor)
@@ -363,29 +337,25 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], efforts: dict[str, 
 
 
 @contextmanager
-def drakes_errors_said(path: Path, said: _Said = _ROBOT) -> Iterator[None]:
-    """Makes one error, with the file, of what Drake raises over a model: at parsing or later."""
+def translate_drake_errors(path: Path, expected: _Description = _ROBOT) -> Iterator[None]:
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with its file."""
     try:
         yield
     except DrakeTeleopError:
         raise
-    # SystemExit: a condition of Drake's; LookupError: of the containers of C++.
+    # SystemExit: failed condition in Drake; LookupError: from C++ containers.
     except (RuntimeError, SystemExit, ValueError, LookupError) as error:
         reason = str(error).replace("<literal-string>", "").replace(f"{path.parent}/", "")
         raise DrakeTeleopError(
-            f"cannot be read as a {said[0]} ({reason.strip()})",
+            f"cannot be read as a {expected[0]} ({reason.strip()})",
             where=str(path),
-            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {said[1]}",
+            remedy=f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}",
         ) from None
 
 
 @contextmanager
-def _drakes_errors_raised() -> Iterator[None]:
-    """Raises RuntimeError for an error that Drake only logs, going on without what it cannot read.
-
-    And for an inertia in whose place it takes another one. Its other warnings are of elements that
-    it does not know; they are not said.
-    """
+def _raise_logged_errors() -> Iterator[None]:
+    """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
     errors: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:
@@ -397,7 +367,7 @@ def _drakes_errors_raised() -> Iterator[None]:
     log = logging.getLogger("drake")
     log.addFilter(keep)
     try:
-        with silent_stderr():  # where the parsers below it write some more
+        with silent_stderr():  # the underlying parsers write to it
             yield
     finally:
         log.removeFilter(keep)
@@ -412,14 +382,14 @@ def _weld_base(
     X_WBase: RigidTransform | None,
     where: str,
 ) -> list[JointIndex]:
-    """Welds the base to the world if it hangs on nothing; returns the joints to S, outwards."""
+    """Weld a free base to the world; return the joints to S, from the base outwards."""
 
     def name_of(body: RigidBody) -> str:
         is_world = body.index() == plant.world_body().index()
         return WORLD if is_world else body.scoped_name().get_full()
 
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-    # Once more, because `check_model` looks neither into other files nor beyond URDF and SDF.
+    # `check_model` covers neither included files nor other formats than URDF and SDF.
     check_tree(
         ((each.name(), name_of(each.parent_body()), name_of(each.child_body())) for each in joints),
         where,
@@ -441,8 +411,8 @@ def _weld_base(
         plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
     elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
         raise DrakeTeleopError(
-            f"the model fastens {chain[-1].child_body().name()} to the world itself",
+            f"the model welds {chain[-1].child_body().name()} to the world itself",
             where=where,
-            remedy="leave the base pose out, or take that joint out of the model",
+            remedy="leave slave.base_pose out, or remove that joint from the model",
         )
     return [joint.index() for joint in reversed(chain)]

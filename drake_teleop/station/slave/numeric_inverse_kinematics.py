@@ -1,20 +1,10 @@
-"""Inverse kinematics of any serial arm: damped least squares within limits of position and speed.
+"""Numeric inverse kinematics of any serial arm within limits of position and speed.
 
-Each call makes the pose's error ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]`` small, with a length L
-of the arm, in Levenberg and Marquardt's steps. A joint that the error pushes against a limit stays
-there, and the others do what they can without it (active set). Two uses of the same steps:
-
-`follow_pose` goes on from the last command, as a station does sample by sample, and moves no joint
-further than its speed allows. Where the smallest singular value sigma of the Jacobian (turns times
-L) is below ``s = SINGULAR``, the motion is damped with ``lambda^2 = s^2 - sigma^2`` (Chiaverini,
-Siciliano, Egeland 1994): past a singularity there is an error for a moment, and no leap. Elsewhere
-the pose is met to rounding. What a redundant arm has left over takes it towards a posture.
-
-`find_posture` finds joint positions from afar: undamped, from one start after the other.
-
-The last command is what a station goes on from, not where the arm is: else nothing would hold what
-the pose leaves open of a redundant arm. Drake's `DifferentialInverseKinematicsIntegrator` warns of
-the same with its port `robot_state`.
+Levenberg-Marquardt steps minimize ``e = [p_WS* - p_WS; L log(R_WS* R_SW)]``. Joints that the error
+pushes against a limit are fixed (active set). `follow_pose` starts from the last command. If the
+smallest singular value sigma of the Jacobian (rotations times L) is below ``s = SINGULAR``, it adds
+damping ``lambda^2 = s^2 - sigma^2`` (Chiaverini, Siciliano, Egeland 1994). `find_posture` searches
+without damping, from many starts.
 """
 
 from __future__ import annotations
@@ -47,28 +37,28 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 Array = NDArray[np.float64]
 
 MET = 1e-8
-"""A pose is met if neither its origin [m] nor its turn [rad] is further off than this."""
+"""Tolerance of position [m] and orientation [rad] for a pose that is met."""
 
-# The error at which there is nothing left but rounding [m].
-_EXACT = 1e-14
+# Error that is rounding only [m].
+_ROUNDING_ERROR_M = 1e-14
 SINGULAR = 5e-3
-"""Singular value of the Jacobian below which a station's motion is damped [m]."""
+"""Singular value of the Jacobian below which motion is damped [m]."""
 STEPS = 10
-"""How many a station takes for each command, at most; two or three are the rule."""
-# Least damping of a step [m^2]: what the pose leaves open stays where it is.
-_LEAST = 1e-14
-# Damping of a step for the error squared, at first; from afar, steps of a start and starts.
-_CAUTION, _STEPS_FROM_AFAR, _STARTS = 1e-3, 100, 100
-# What the error pulls along J^T, of itself, below which it pulls at nothing [m].
-_STUCK = 1e-3
-# An error that nobody can tell out of reach from singular by [m].
-_NEAR = 5e-6
-# The same from afar, where the search comes to an end early.
-_NEARLY = 1e-3
-# How far a joint is moved to find a way out of a singularity, at most [rad, m].
-_NUDGE, _NUDGE_FROM_AFAR = 0.05, 0.3
-# Triple product of the last three axes below which it is the wrist that is singular.
-_ALIGNED = 0.1
+"""Maximum number of steps per command; two or three are typical."""
+# Minimum damping of a step [m^2], which keeps redundant joints at rest.
+_MIN_DAMPING = 1e-14
+# Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
+_INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
+# Ratio |J^T e| / |e| below which the gradient counts as zero [m].
+_ZERO_GRADIENT = 1e-3
+# Error below which out of reach and singular are indistinguishable [m].
+_REACH_TOLERANCE_M = 5e-6
+# The same for `find_posture`, whose search ends early [m].
+_SEARCH_TOLERANCE_M = 1e-3
+# Largest joint displacement to escape from a singularity [rad, m].
+_ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
+# Triple product of the last three axes below which the wrist is singular.
+_COPLANAR_AXES = 0.1
 
 _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE, _SPEED_LIMIT = (
     map(int, IkStatus)
@@ -76,8 +66,8 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 
 @njit(cache=True)
-def _look(table, L, pose, q, x, J, e):
-    """The Jacobian J (6, n) and the error e (6,) at q, turns times L; returns e^2."""
+def _jacobian_and_error(table, L, pose, q, x, J, e):
+    """Compute J (6, n) and error e (6,) at q, rotations times L; return e^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized((pose[0], pose[1], pose[2], pose[3]))
     R = np.empty((3, 3))
@@ -96,8 +86,8 @@ def _look(table, L, pose, q, x, J, e):
 
 
 @njit(cache=True)
-def _normal(J, H):
-    """H := J^T J, or J J^T if H is too small for that."""
+def _normal_matrix(J, H):
+    """Set H to J^T J, or to J J^T if H has another size."""
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -113,8 +103,8 @@ def _normal(J, H):
 
 
 @njit(cache=True)
-def _weakest(H, u):
-    """The least eigenvalue of H (m, m) and its vector u (m,), by inverse iteration."""
+def _smallest_eigenvalue(H, u):
+    """Return the smallest eigenvalue of H (m, m), its vector in u (inverse iteration)."""
     m = H.shape[0]
     M = np.empty((m, m))
     for i in range(m):
@@ -124,7 +114,7 @@ def _weakest(H, u):
         for i in range(m):
             for k in range(m):
                 M[i, k] = H[i, k]
-            M[i, i] += _LEAST
+            M[i, i] += _MIN_DAMPING
         solve_spd(M, u)
         growth = 0.0
         for i in range(m):
@@ -132,7 +122,7 @@ def _weakest(H, u):
         growth = np.sqrt(growth)
         for i in range(m):
             u[i] /= growth
-    return max(1.0 / growth - _LEAST, 0.0)
+    return max(1.0 / growth - _MIN_DAMPING, 0.0)
 
 
 @njit(cache=True)
@@ -141,11 +131,10 @@ def _is_held(q, lower, upper, i, push):
 
 
 @njit(cache=True)
-def _step(H, g, damping, q, lower, upper, trial):
-    """The damped step from q, within the box, to trial (n,); returns its largest part.
+def _damped_step(H, g, damping, q, lower, upper, trial):
+    """Write the damped step from q, within the box, to trial (n,); return its largest component.
 
-    Of the joints, those that g pushes out of the box stay, and those that the step would take
-    there go as far as they may: what the others do is solved again without them.
+    Joints at, or driven beyond, a limit are fixed there and the others solved again.
     """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
@@ -174,33 +163,31 @@ def _step(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
-def _singular_part(L, J):
-    """Whether the last three axes are nearly in a plane, or what is before them is singular."""
+def _singularity_status(L, J):
+    """Return WRIST_SINGULAR for nearly coplanar last axes, else SHOULDER_SINGULAR."""
     n = J.shape[1]
     a, b, c = three(J[3:, n - 3], 0), three(J[3:, n - 2], 0), three(J[3:, n - 1], 0)
-    return _WRIST_SINGULAR if abs(dot(a, cross(b, c))) < _ALIGNED * L**3 else _SHOULDER_SINGULAR
+    coplanar = abs(dot(a, cross(b, c))) < _COPLANAR_AXES * L**3
+    return _WRIST_SINGULAR if coplanar else _SHOULDER_SINGULAR
 
 
 @njit(cache=True)
 def follow_pose(
     table, L, pose, reference, lower, upper, max_step, posture, pull, singular, steps, q
 ):
-    """The joint positions next to a reference that meet a pose, or come near it without a leap.
+    """Write joint positions q (n,) near a reference that meet a pose or approach it smoothly.
 
     Args:
         table: `ArmModel.table`.
-        L: of `turn_length` [m].
-        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any length but zero.
-        reference: (n,) normally the last command [rad, or m of a joint that slides].
-        lower: (n,) limits.
-        upper: (n,) limits.
-        max_step: (n,) how far a joint may go from the reference, its speed limit times the time
-            since then; inf for any distance.
-        posture: (n,) that an arm of more than six joints is drawn towards.
-        pull: by which part of the way, from 0 to 1.
+        L: `orientation_length` [m].
+        pose: (7,) X_WS ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any nonzero length.
+        reference: (n,) normally the last command.
+        lower, upper: (n,) limits.
+        max_step: (n,) largest distance from the reference.
+        posture: (n,) target of a redundant arm.
+        pull: fraction of the way to the posture.
         singular: singular value below which the motion is damped [m].
-        steps: of the search, at most.
-        q: (n,) filled.
+        steps: maximum number.
 
     Returns:
         The `IkStatus` as a plain integer.
@@ -215,59 +202,63 @@ def follow_pose(
         for i in range(n):
             q[i] = q[i] if sound(reference) else np.nan
         return _BAD_POSE
-    start, drawn = q.copy(), n > 6 and pull > 0.0
-    if drawn:
+    start, towards_posture = q.copy(), n > 6 and pull > 0.0
+    if towards_posture:
         for i in range(n):
             q[i] = min(max(q[i] + pull * (posture[i] - q[i]), low[i]), high[i])
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
-    squared = _look(table, L, pose, q, x, J, e)
-    _normal(J, B)
-    damping = max(singular * singular - _weakest(B, u), 0.0)
-    before, still_to_win = np.inf, 0.0
+    squared = _jacobian_and_error(table, L, pose, q, x, J, e)
+    _normal_matrix(J, B)
+    damping = max(singular * singular - _smallest_eigenvalue(B, u), 0.0)
+    before, expected_gain = np.inf, 0.0
     while True:
         put(anchor, 0, q, 0, n)
-        cost, caution, idle, better = squared, _CAUTION, 0, True
+        cost, relative_damping, stalled_steps, better = squared, _INITIAL_DAMPING, 0, True
         for _ in range(steps):
-            if squared < _EXACT * _EXACT or idle > 3 or caution > 1e9:
+            if (
+                squared < _ROUNDING_ERROR_M * _ROUNDING_ERROR_M
+                or stalled_steps > 3
+                or relative_damping > 1e9
+            ):
                 break
             if better:
-                _normal(J, H)
+                _normal_matrix(J, H)
                 for i in range(n):
                     g[i] = damping * (anchor[i] - q[i])
                     for k in range(6):
                         g[i] += J[k, i] * e[k]
-            stiff = damping + max(_LEAST, caution * squared)
-            if _step(H, g, stiff, q, low, high, trial) < _EXACT:
+            stiff = damping + max(_MIN_DAMPING, relative_damping * squared)
+            if _damped_step(H, g, stiff, q, low, high, trial) < _ROUNDING_ERROR_M:
                 break
-            found = _look(table, L, pose, trial, x, J, e)
+            found = _jacobian_and_error(table, L, pose, trial, x, J, e)
             total = found
             for i in range(n):
                 total += damping * (trial[i] - anchor[i]) ** 2
             better = total < cost
             if better:
-                idle = idle + 1 if total > 0.99 * cost else 0
-                squared, cost, caution = found, total, 0.2 * caution
+                stalled_steps = stalled_steps + 1 if total > 0.99 * cost else 0
+                squared, cost, relative_damping = found, total, 0.2 * relative_damping
                 put(q, 0, trial, 0, n)
             else:
-                caution = 10.0 * max(caution, _CAUTION)
-        _look(table, L, pose, q, x, J, e)
-        p, turned = three(e, 0), three(e, 3)
-        if dot(p, p) <= MET * MET and dot(turned, turned) <= L * L * MET * MET:
+                relative_damping = 10.0 * max(relative_damping, _INITIAL_DAMPING)
+        _jacobian_and_error(table, L, pose, q, x, J, e)
+        p, rotation = three(e, 0), three(e, 3)
+        if dot(p, p) <= MET * MET and dot(rotation, rotation) <= L * L * MET * MET:
             return _OK
-        if drawn:
-            # The pose comes first: once more, without the posture.
-            drawn = False
+        if towards_posture:
+            # The pose has priority: repeat without the posture.
+            towards_posture = False
             put(q, 0, start, 0, n)
-            squared = _look(table, L, pose, q, x, J, e)
+            squared = _jacobian_and_error(table, L, pose, q, x, J, e)
             continue
         if before < np.inf:
-            if squared < (1.0 - 1e-7) * before - still_to_win:
-                return _singular_part(L, J)
+            if squared < (1.0 - 1e-7) * before - expected_gain:
+                return _singularity_status(L, J)
             put(q, 0, kept, 0, n)
-            far = before > _NEAR * _NEAR and still_to_win < 1e-3 * before
-            return _OUT_OF_REACH if far else _singular_part(L, J)
+            far = before > _REACH_TOLERANCE_M * _REACH_TOLERANCE_M and expected_gain < 1e-3 * before
+            return _OUT_OF_REACH if far else _singularity_status(L, J)
         held, free = -1, 0.0
         for i in range(n):
             push = 0.0
@@ -279,73 +270,66 @@ def follow_pose(
                 held = i
         if held >= 0:
             return _SPEED_LIMIT if lower[held] < q[held] < upper[held] else _JOINT_LIMIT
-        if singular > 0.0 and free > _STUCK * _STUCK * squared:
-            return _singular_part(L, J) if damping > 0.0 else _SPEED_LIMIT
+        if singular > 0.0 and free > _ZERO_GRADIENT * _ZERO_GRADIENT * squared:
+            return _singularity_status(L, J) if damping > 0.0 else _SPEED_LIMIT
         before = squared
-        # What the next samples would win without being moved, or nothing would be out of reach.
-        still_to_win = 4.0 * free / max(damping, _LEAST)
+        # Gain expected from later samples; without it, every pose would count as reachable.
+        expected_gain = 4.0 * free / max(damping, _MIN_DAMPING)
         put(kept, 0, q, 0, n)
-        # A little along what the pose does not notice. No further than the error is worth, or noise
-        # would set the arm in motion.
-        _weakest(H, g)
-        size = min(_NUDGE, 10.0 * np.sqrt(squared) / L) if singular > 0.0 else _NUDGE_FROM_AFAR
-        way = 0.0
+        # Displace along the weakest direction, in proportion to the error, so that noise does not
+        # move the arm.
+        _smallest_eigenvalue(H, g)
+        size = _SEARCH_ESCAPE_STEP
+        if singular > 0.0:
+            size = min(_ESCAPE_STEP, 10.0 * np.sqrt(squared) / L)
+        slope = 0.0
         for i in range(n):
             for k in range(6):
-                way += g[i] * J[k, i] * e[k]
+                slope += g[i] * J[k, i] * e[k]
         for i in range(n):
-            q[i] = min(max(q[i] + (size if way >= 0.0 else -size) * g[i], low[i]), high[i])
-        squared = _look(table, L, pose, q, x, J, e)
+            q[i] = min(max(q[i] + (size if slope >= 0.0 else -size) * g[i], low[i]), high[i])
+        squared = _jacobian_and_error(table, L, pose, q, x, J, e)
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
-    """Joint positions that meet a pose, from a reference or, if that fails, from elsewhere.
+    """Return joint positions (n,) that meet a pose (7,), and the status.
 
-    The first that is found, which need not be the one nearest to the reference. A joint that turns
-    by more than 360 degrees takes the turn nearest to it.
-
-    Args:
-        arm: the arm; a joint without limits counts as one of half a turn, or pi metres, either way.
-        pose: (7,) X_WS as ``[qw, qx, qy, qz, px, py, pz]``.
-        reference: (n,) where to begin [rad, or m of a joint that slides].
-
-    Returns:
-        (n,) joint positions, and how they were found. If none meet the pose: the nearest to it that
-        were found, and JOINT_LIMIT if a joint cannot go on from there, WRIST_SINGULAR or
-        SHOULDER_SINGULAR if they are within 1 mm and nearly singular, else OUT_OF_REACH.
+    The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
+    joints take the full rotation nearest to the reference. Without a solution, the nearest
+    positions are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
     """
     n = arm.num_joints
     lower = np.where(np.isfinite(arm.lower), arm.lower, reference - np.pi)
     upper = np.where(np.isfinite(arm.upper), arm.upper, reference + np.pi)
     far, q, nearest = np.full(n, np.inf), np.empty(n), np.empty(n)
-    # Starts as even as they can be, each irrational in each joint (Roberts's R sequence).
+    # Quasi-random starts (Roberts's R sequence).
     ratio = 2.0
     for _ in range(30):
         ratio = (1.0 + ratio) ** (1.0 / (n + 1))
-    start, status, L, least = reference, _OUT_OF_REACH, turn_length(arm), np.inf
+    start, status, L, smallest = reference, _OUT_OF_REACH, orientation_length(arm), np.inf
     x, e, J = np.empty(21), np.empty(6), np.empty((6, n))
-    for k in range(_STARTS):
+    for k in range(_SEARCH_STARTS):
         found = follow_pose(
             arm.table, L, pose, start, lower, upper, far, start, 0.0, 0.0,
-            _STEPS_FROM_AFAR, q,
+            _SEARCH_STEPS, q,
         )  # fmt: skip
         if found in (_OK, _BAD_POSE):
             turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
             nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
             return np.where((lower <= nearer) & (nearer <= upper), nearer, q), IkStatus(found)
-        squared = _look(arm.table, L, pose, q, x, J, e)
-        if squared < least:
-            least, nearest = squared, q.copy()
+        squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
+        if squared < smallest:
+            smallest, nearest = squared, q.copy()
             status = _JOINT_LIMIT if found == _JOINT_LIMIT else _OUT_OF_REACH
-            if squared < _NEARLY**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
-                status = _singular_part(L, J)
+            if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
+                status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
         start = lower + part * (upper - lower)
     return nearest, IkStatus(status)
 
 
-def turn_length(arm: ArmModel) -> float:
-    """By what a turn [rad] is multiplied to count as a way [m]: a fifth of the stretched arm."""
+def orientation_length(arm: ArmModel) -> float:
+    """Return the length [m] that weights orientation against position error: reach / 5."""
     return float(np.linalg.norm(arm.table[:, TRANSLATION:PHI], axis=1).sum()) / 5.0
 
 
@@ -353,74 +337,61 @@ def turn_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """`follow_pose` from the last command, as far as the time since then allows.
+    """Run `follow_pose` from the last command, within the elapsed time; return the `IkStatus`.
 
-    Args:
-        table, L, lower, upper, posture, pose: as of `follow_pose`.
-        speed: (n,) of the joints, at most [rad/s, m/s]; inf for any.
-        pull: `NumericInverseKinematics.PULL` [1/s].
-        position: (n,) of the encoders; only whether it is one counts.
-        last: (n + 1,) the last command [rad, m], and when it was [s].
-        time: now [s].
-        q: (n,) filled; the last command if `position` is none.
-
-    Returns:
-        The `IkStatus` as a plain integer.
+    `speed` (n,) contains limits, `last` (n + 1,) the last command and its time [s]. An invalid
+    `position` (n,) of the encoders holds the last command.
     """
     n = q.shape[0]
     put(q, 0, last, 0, n)
     if not sound(position):
         return _BAD_POSE
-    reference, max_step, since = q.copy(), np.zeros(n), max(time - last[n], 0.0)
-    if since > 0.0:  # nothing moves in no time, not even a joint without a limit
+    reference, max_step, elapsed = q.copy(), np.zeros(n), max(time - last[n], 0.0)
+    if elapsed > 0.0:  # inf * 0 is nan
         for i in range(n):
-            max_step[i] = speed[i] * since
-    steps = np.int64(STEPS)  # for the constant itself `follow_pose` would be compiled once more
+            max_step[i] = speed[i] * elapsed
+    steps = np.int64(STEPS)  # a literal would compile `follow_pose` again
     return follow_pose(
-        table, L, pose, reference, lower, upper, max_step, posture, min(pull * since, 1.0),
+        table, L, pose, reference, lower, upper, max_step, posture, min(pull * elapsed, 1.0),
         SINGULAR, steps, q,
     )  # fmt: skip
 
 
 class NumericInverseKinematics(LeafSystem):
-    """Turns a commanded pose of the sensor frame into joint positions, for any serial arm.
+    """Conversion of a commanded pose to joint positions, for any serial arm.
 
-    The joints go on from the last command, no faster than they may; without numbers from the
-    encoders the command is held.
+    Joints continue from the last command, not from the measured position, so that a redundant arm
+    does not drift. Invalid encoders hold the command.
 
     .. pydrake_system::
 
         name: NumericInverseKinematics
         input_ports:
         - pose_command: X_WS as [qw, qx, qy, qz, px, py, pz] [-, m]
-        - joint_position: (n,) where the arm is [rad]
+        - joint_position: (n,) measured positions [rad]
         output_ports:
         - joint_command: (n,) [rad]
         - ik_status: an `IkStatus`
 
-    Args:
-        arm: kinematics and limits.
-        q_start: (n,) the command before the first one, and the posture that an arm of more than
-            six joints is drawn towards [rad].
-        period: in which commands are taken [s].
+    `q_start` is the first command, and the posture of a redundant arm.
     """
 
     __slots__ = ONE_DICT
 
     PULL = 1.0
-    """By what a redundant arm nears its posture in a second, of the way left over [1/s]."""
+    """Rate at which a redundant arm approaches its posture [1/s]."""
 
     def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
         super().__init__()
         n = arm.num_joints
         self._joints, posture = n, np.array(q_start, dtype=np.float64)
-        #: (n,) of the joints; its numbers may be changed [rad/s, m/s].
+        #: Joint speed limits (n,) [rad/s, m/s]; values may be changed in place.
         self.speed_limit = arm.velocity_limit.copy()
         limits = arm.lower, arm.upper, self.speed_limit
-        self._fixed = (arm.table, turn_length(arm), *limits, posture)
+        self._fixed = (arm.table, orientation_length(arm), *limits, posture)
         self._pose = self.DeclareVectorInputPort("pose_command", 7)
         self._position = self.DeclareVectorInputPort("joint_position", n)
-        self.DeclareDiscreteState(np.append(posture, 0.0))  # and of when it is
+        self.DeclareDiscreteState(np.append(posture, 0.0))  # last command and its time
         self._command = self.DeclareVectorOutputPort(
             "joint_command", n, weak_callback(self._calc_command)
         )
@@ -443,5 +414,5 @@ class NumericInverseKinematics(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         next_state = discrete_state.get_mutable_value(0)
-        next_state[:-1] = self._command.Eval(context)  # which the joint control has asked for too
+        next_state[:-1] = self._command.Eval(context)  # cached for the joint control
         next_state[-1] = context.get_time()

@@ -1,4 +1,4 @@
-"""The slave's rigid bodies: arm, tool and what the scenario has to touch."""
+"""The slave's plant: arm, tool and environment."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -17,44 +18,40 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
+from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.read.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
-from drake_teleop.station.slave.arm import FRICTION, ArmModel
-from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.assumed_limits import with_all_limits
-from drake_teleop.station.slave.forward_kinematics import pose_into
+from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
 from drake_teleop.station.slave.home import R_WS_HOME, check_strength, start_posture
 from drake_teleop.station.slave.joint_friction import AddJointFriction, friction_of_joints
 from drake_teleop.station.slave.model_check import check_size
-from drake_teleop.station.slave.models import ParseModel, drakes_errors_said
-from drake_teleop.station.slave.payload import AddPayload
-from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
+from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.station.slave.tool import AddTool, shapes_reach
 
-# Shapes that reach as far as others to so much make contact with them, as two fingers do [m].
-_ABREAST = 1e-3
-#: What the arm's model instance is called in a plant, whatever its file says.
+# Shapes within this distance of the farthest one share the contact, as two fingers do [m].
+_SAME_REACH_M = 1e-3
+#: Name of the arm's model instance in every plant.
 ARM = "arm"
 
 
 @dataclass(frozen=True)
 class SlavePlant:
-    """The plant and what the blocks around it need to know.
+    """The plant, and data for the blocks around it.
 
-    Args:
+    Attributes:
         plant: continuous MultibodyPlant, finalized.
-        instance: the arm's joints.
-        sensor_frame: S.
-        tool: the body on the sensor.
-        arm: kinematics and dynamics up to S, with all that hangs there as its load.
-        start: (n,) joint positions at the start [rad].
+        instance: of the arm's joints.
+        tool: body on the sensor.
+        arm: chain up to S, with all bodies beyond S as its load.
+        start: (n,) joint positions [rad].
         X_WS_start: (7,) see `start_pose`.
-        tip: (3,) p_STip, where the tool makes contact [m].
-        contact: with what there is to touch.
-        assumptions: what the models do not say.
-        config: what was asked for.
-        environment: what there is to touch, or None.
+        tip: (3,) p_STip, contact point of the tool [m].
+        assumptions: data missing in the models.
+        environment: objects that the tool can touch, or None.
     """
 
     plant: MultibodyPlant
@@ -72,15 +69,15 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """(k, 28) what may touch by the compiled contact law, see `Pairs`."""
+        """Pairs (k, 28) of the compiled contact law, see `Pairs`."""
         return self.contact.pairs
 
     @cached_property
     def physics(self) -> tuple[NDArray[np.float64], ...]:
-        """For `plant_rates`: the arm's table, phi in it, pairs, leaf, joints; nothing is told.
+        """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
 
-        A copy, because of what the joint control does not know: something may be grasped, and dry
-        friction.
+        The table is a copy with dry friction, and a grasp may change its load. Joint control uses
+        neither.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION] = self.friction
@@ -89,17 +86,15 @@ class SlavePlant:
 
     @property
     def friction(self) -> NDArray[np.float64]:
-        """(n,) of the joints, dry [N m]."""
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
     def sheet(self) -> ModelInstanceIndex | None:
-        """Model instance of the leaf, or another `moving_part`, if there is one."""
+        """Model instance of the leaf, or of another `moving_part`, if any."""
         return self.contact.sheet
 
     @property
     def can_touch(self) -> bool:
-        """Whether there is something to touch."""
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property
@@ -109,35 +104,27 @@ class SlavePlant:
 
     @property
     def start_tip(self) -> NDArray[np.float64]:
-        """(3,) p_WTip at the start [m]."""
+        """p_WTip (3,) at the start [m]."""
         start = self.X_WS_start
         R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
         return start[4:] + R_WS.matrix() @ self.tip
 
 
 def start_pose(slave: Slave) -> NDArray[np.float64]:
-    """(7,) X_WS [qw qx qy qz px py pz] at the start; without `home` as it was asked for.
-
-    Raises:
-        DrakeTeleopError: as `NominalSlave`, if `home` is given.
-    """
+    """Return X_WS (7,) [qw qx qy qz px py pz] at the start: at `home`, or as configured."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
     return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    """The slave by itself, with nothing to touch, for its numbers: arm, start and tip.
-
-    Raises:
-        DrakeTeleopError: as `AddSlavePlant`.
-    """
+    """Return the slave without environment, from a cache; raises as `AddSlavePlant`."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
-    return _nominal_slave(_Known(slave), written)
+    return _nominal_slave(_HashableSlave(slave), written)
 
 
-class _Known:
-    """A slave that can be looked up: by all of its values."""
+class _HashableSlave:
+    """Hashable slave, compared by all values."""
 
     def __init__(self, slave: Slave) -> None:
         self.slave, self._values = copy.deepcopy(slave), repr(slave)
@@ -146,12 +133,12 @@ class _Known:
         return hash(self._values)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self._values == other._values
+        return isinstance(other, _HashableSlave) and self._values == other._values
 
 
-@lru_cache(maxsize=4)  # to parse the models takes longer than to build a station of them
-def _nominal_slave(known: _Known, _: tuple[int, ...]) -> SlavePlant:
-    return AddSlavePlant(DiagramBuilder(), known.slave, None)
+@lru_cache(maxsize=4)  # parsing takes longer than building a station
+def _nominal_slave(key: _HashableSlave, _: tuple[int, ...]) -> SlavePlant:
+    return AddSlavePlant(DiagramBuilder(), key.slave, None)
 
 
 def AddSlavePlant(
@@ -160,20 +147,14 @@ def AddSlavePlant(
     environment: Environment | None,
     q_start: NDArray[np.float64] | None = None,
 ) -> SlavePlant:
-    """Adds the slave's plant, at rest.
+    """Add the slave's plant, at rest at `q_start` (n,) [rad], by default the configured start.
 
-    A scene graph, which costs time at every step, comes only with something to touch. Of the slave
-    itself only the tool touches, not the arm.
-
-    Args:
-        builder: the diagram.
-        slave: arm, tool, payload and where they start.
-        environment: what there is to touch, or None.
-        q_start: (n,) joint positions to start at instead [rad].
+    A scene graph slows every step and is added only with an environment. Only the tool makes
+    contact.
 
     Raises:
-        DrakeTeleopError: if a model cannot be read, the arm cannot reach the start or not hold the
-            tool there.
+        DrakeTeleopError: if a model cannot be read, or the arm cannot reach the start or hold its
+            load.
     """
     if environment is None:
         plant = builder.AddNamedSystem("slave_plant", MultibodyPlant(time_step=0.0))
@@ -185,15 +166,15 @@ def AddSlavePlant(
         plant.set_stiction_tolerance(environment.slip)
     parsed = ParseSlave(plant, slave)
     instance, tool = parsed.instance, parsed.tool
-    touched = None if environment is None else AddEnvironment(plant, environment)
-    with drakes_errors_said(slave.path):
+    surroundings = None if environment is None else AddEnvironment(plant, environment)
+    with translate_drake_errors(slave.path):
         finalize(plant)
     contact = no_contact()
-    if environment is not None and touched is not None:
+    if environment is not None and surroundings is not None:
         _remove_visuals(plant, scene_graph)
         frame = parsed.sensor_frame
         _remove_shapes(plant, scene_graph, instance, bodies_beyond(plant, frame.body()))
-        contact = ContactWith(plant, scene_graph, frame, tool, environment, touched)
+        contact = ContactWith(plant, scene_graph, frame, tool, environment, surroundings)
     arm, assumptions = parsed.arm()
     start = start_posture(slave, arm) if q_start is None else q_start
     if q_start is None:
@@ -223,17 +204,7 @@ def AddSlavePlant(
 
 @dataclass(frozen=True)
 class ParsedSlave:
-    """Arm and tool in a plant that is not finalized.
-
-    Attributes:
-        slave: what was asked for.
-        plant: where they are.
-        instance: the arm's joints.
-        sensor_frame: S.
-        tool: the body on the sensor.
-        assumptions: what the models do not say, but for limits.
-        folders: of converted meshes, to be kept as long as shapes are looked at.
-    """
+    """Arm and tool in a plant that is not finalized; attributes as of `SlavePlant`."""
 
     slave: Slave
     plant: MultibodyPlant
@@ -244,10 +215,10 @@ class ParsedSlave:
     folders: list[TemporaryDirectory[str]]
 
     def arm(self) -> tuple[ArmModel, list[str]]:
-        """Its numbers once the plant is finalized, and what is assumed of its limits.
+        """Return the arm of the finalized plant, and the assumptions about its limits.
 
         Raises:
-            DrakeTeleopError: if it is no arm, or nothing hangs on its sensor.
+            DrakeTeleopError: if the sensor carries no mass, or as `ArmModelFromPlant`.
         """
         frame = self.sensor_frame
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
@@ -260,39 +231,29 @@ class ParsedSlave:
         check_size(arm, str(self.slave.path))
         arm, assumed = with_all_limits(arm, str(self.slave.path))
         if arm.num_joints < 6:
-            assumed.append(f"with {arm.num_joints} joints the tool follows as far as it can")
+            assumed.append(f"with {arm.num_joints} joints the tool follows part of the pose")
         return arm, assumed
 
 
 def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave:
-    """Parses arm and tool and adds the payload; the tool hangs on S by the joint "sensor_weld".
-
-    Whatever its file says, the arm's model instance is called "arm".
-
-    Args:
-        plant: not finalized.
-        slave: which; by default the paper's.
-
-    Raises:
-        DrakeTeleopError: as `ParseModel` and `AddTool`.
-    """
+    """Parse arm, tool and payload into a plant; rename the arm's model instance to "arm"."""
     slave = Slave() if slave is None else slave
     model = ParseModel(plant, slave.path, slave.sensor_frame, slave.packages, slave.X_WBase)
     if plant.HasModelInstanceNamed(ARM):
         plant.RenameModelInstance(plant.GetModelInstanceByName(ARM), f"{ARM}_of_model")
     plant.RenameModelInstance(model.instance, ARM)
-    frame, own = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
+    frame, model_bodies = model.sensor_frame, bodies_beyond(plant, model.sensor_frame.body())
     assumptions, folders = [*model.assumptions], [model.folder]
     if slave.tool is not None:
         tool = AddTool(plant, slave.tool, frame, slave.packages)
         assumptions += tool.assumptions
         folders += [tool.folder] if tool.folder is not None else []
-        if own:
-            names = ", ".join(body.name() for body in own)
+        if model_bodies:
+            names = ", ".join(body.name() for body in model_bodies)
             assumptions.append(f"{names} of the model on the sensor beside the tool")
         on_sensor, holder = tool.body, tool.body.body_frame()
     else:
-        on_sensor, holder = own[0] if own else frame.body(), frame
+        on_sensor, holder = model_bodies[0] if model_bodies else frame.body(), frame
     AddPayload(plant, holder, slave.payload)
     return ParsedSlave(
         slave, plant, model.instance, frame, on_sensor.index(), tuple(assumptions), folders
@@ -300,18 +261,16 @@ def ParseSlave(plant: MultibodyPlant, slave: Slave | None = None) -> ParsedSlave
 
 
 def bodies_beyond(plant: MultibodyPlant, body: RigidBody) -> list[RigidBody]:
-    """What hangs on a body, from the nearest outwards."""
+    """Return the bodies outboard of a body, the nearest first."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     near = [j.child_body() for j in joints if j.parent_body().index() == body.index()]
     return near + [far for each in near for far in bodies_beyond(plant, each)]
 
 
 def finalize(plant: MultibodyPlant) -> None:
-    """Finalizes a continuous plant whose joint limits somebody else watches.
+    """Finalize a continuous plant without Drake's warnings about ignored joint limits.
 
-    Continuous plants ignore limits, and Drake warns of it, even in the middle of a run. It does
-    not for limits that are given after finalizing; the station's monitor and the inverse
-    kinematics keep them.
+    Limits set after finalizing cause no warning. Monitor and inverse kinematics enforce them.
     """
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     limits = [(joint.position_lower_limits(), joint.position_upper_limits()) for joint in joints]
@@ -323,7 +282,6 @@ def finalize(plant: MultibodyPlant) -> None:
 
 
 def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Every shape costs time at every step, and nobody looks at these: a replay has its own."""
     for index in range(plant.num_bodies()):
         for shape in plant.GetVisualGeometriesForBody(plant.get_body(BodyIndex(index))):
             scene_graph.RemoveGeometry(plant.get_source_id(), shape)
@@ -332,7 +290,6 @@ def _remove_visuals(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
 def _remove_shapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, arm: ModelInstanceIndex, load: list[RigidBody]
 ) -> None:
-    """Of the arm itself nothing touches: a model's hulls overlap, and would push it about."""
     carried = {body.index() for body in load}
     for index in plant.GetBodyIndices(arm):
         for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
@@ -341,10 +298,7 @@ def _remove_shapes(
 
 
 def lowest_point(slave: Slave) -> NDArray[np.float64]:
-    """p_W (3,) of the lowest point of what hangs on the sensor, at the start [m].
-
-    By the hulls of its meshes and boxes around other shapes; without shapes, of its tip.
-    """
+    """Return p_W (3,) [m] of the load's lowest hull corner at the start, or of the tip."""
     nominal = NominalSlave(slave)
     X_WS = nominal.X_WS_start
     R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
@@ -354,7 +308,7 @@ def lowest_point(slave: Slave) -> NDArray[np.float64]:
 
 
 def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """(k, 3) corners in S of each shape that hangs on the sensor, or of a box around it [m]."""
+    """Return corners (k, 3) in S [m] of each shape on the sensor, or of its box."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize(plant)
@@ -367,7 +321,7 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
             mesh, box = inspector.GetConvexHull(shape), inspector.GetObbInGeometryFrame(shape)
             if mesh is not None:
                 corners = np.array([mesh.vertex(k) for k in range(mesh.num_vertices())])
-            elif box is not None:  # as of a half space
+            elif box is not None:  # a half space has none
                 corners = (box.pose() @ (signs * box.half_width()).T).T
             else:
                 continue
@@ -375,11 +329,11 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
     return hulls
 
 
-def _farthest(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """p_S (3,) in the middle of the shapes that reach farthest along z_S, as far as they reach."""
+def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return p_S (3,) in the middle of the shapes that reach farthest along z_S."""
     reach = max(float(hull[:, 2].max()) for hull in hulls)
-    abreast = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _ABREAST]
-    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in abreast]
+    farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
+    middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
     return np.array([*np.mean(middles, axis=0), reach])
 
 
@@ -391,7 +345,7 @@ def _tip(
     instance = plant.get_body(parsed.tool).model_instance()
     if plant.HasFrameNamed("tip", instance):
         tip = plant.GetFrameByName("tip", instance)
-        if slave.tool is not None and tip.body().index() == parsed.tool:  # whose frame is S
+        if slave.tool is not None and tip.body().index() == parsed.tool:  # its frame is S
             return tip.GetFixedPoseInBodyFrame().translation()
         X_WS, X_WTip = (
             frame.CalcPoseInWorld(plant.CreateDefaultContext())
@@ -400,5 +354,35 @@ def _tip(
         return X_WS.InvertAndCompose(X_WTip).translation()
     reach = None if slave.tool is None else shapes_reach(slave.tool)
     if slave.tool is None and (hulls := _hulls_on_sensor(slave)):
-        return _farthest(hulls)
+        return _end_of_hulls(hulls)
     return np.array(arm.phi_load[1:4] / arm.phi_load[0] if reach is None else reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """Joint names from the base outwards, and `ArmModel.table`."""
+
+    joint_names: tuple[str, ...]
+    table: Array
+
+    def pose(self, q: Array) -> Array:
+        """Return X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
+        R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+        forward_kinematics(self.table, q, R_WS, p_WS)
+        return np.concatenate([quaternions(R_WS[None])[0], p_WS])
+
+
+def arm_of(model: Path, sensor_frame: str, package_paths: tuple[Path, ...] = ()) -> Arm:
+    """Return the kinematics of the arm in a model file.
+
+    Raises:
+        DrakeTeleopError: if the model cannot be read or is no serial arm.
+    """
+    plant = MultibodyPlant(0.0)
+    with translate_drake_errors(model):
+        parsed = ParseModel(plant, model, sensor_frame, package_paths)
+        finalize(plant)
+        found = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    arm = Arm(found.joint_names, found.table)
+    arm.pose(np.zeros(found.num_joints))  # Load the compiled function before the first reading.
+    return arm

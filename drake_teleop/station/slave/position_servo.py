@@ -1,27 +1,12 @@
-"""An arm as it is sold: it takes joint positions at its own rate, and follows them in its own way.
+"""Commercial arm with a position interface.
 
     command --[dead time, held]--> target --[generator]--> r, dr/dt --[drives]--> torque
-
-The generator is what the makers call gain and lookahead, within the joints' limits, and the drives
-follow it by computed torque, critically damped:
 
     d2r/dt2 = gain (target - (r + lookahead dr/dt))
     d2q/dt2 = d2r/dt2 + 2 w (dr/dt - dq/dt) + w^2 (r - q),  w = 2 pi drive_bandwidth_hz
 
-So a steady motion is followed by `lookahead` and the dead time later. Towards a target that is far
-away it goes no faster than it can still brake. How sure each number is: D from the manufacturer's
-documents, E an engineering estimate.
-
-- `ur_servoj`: the URScript manual on servoj has 500 Hz, lookahead_time 0.1 s and gain 300 by
-  default, a P gain on the target against the position projected ahead by lookahead_time (D), and
-  the e-Series 180 degrees/s (D). That the gain is one of acceleration, dead time, acceleration and
-  drives are E.
-- `franka_position`: joint positions of libfranka have 1 kHz, a low-pass of 100 Hz (here a
-  critically damped one), 2.175 rad/s and 7.5 rad/s^2, the least of the seven joints (D). Dead time
-  and drives are E.
-
-Left out: gears' friction and elasticity, limits of jerk, and the stops by which such arms protect
-themselves. The drives have no integral: in contact a joint gives way by torque / (inertia w^2).
+The generator respects speed and acceleration limits and brakes in time. Without integral action, a
+joint yields in contact by torque / (inertia w^2). See docs/station.md for sources and omissions.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -39,38 +24,38 @@ from drake_teleop.common.fields import settings
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quantities import quantity
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import ArmModel, inverse_dynamics
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
-# In memory: periods since the target was taken, where in the queue of commands is the oldest; then
-# the target, r and dr/dt (n each), and the queue.
+# Memory: periods since the last command, index of the oldest command in the queue; then target, r
+# and dr/dt (n each), and the queue.
 _COUNT, _OLDEST = 0, 1
-# Twice the share of the largest acceleration with which it means to brake.
-_BRAKES = 2 * 0.8
+# v^2 = 2 a d with 80 % of the largest acceleration.
+_BRAKING_FACTOR = 2 * 0.8
 
 
 @settings
 @dataclass
 class PositionInterface:
-    """What an arm makes of joint positions, see `position_servo`; speeds in m/s where it slides."""
+    """Position interface of an arm, see `position_servo`; m/s for prismatic joints."""
 
-    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "how often it takes a command")
+    command_hz: float = quantity(500.0, "Hz", 1.0, 1e4, "rate of the commands")
     dead_time: float = quantity(
-        0.004, "s", 0.0, 1.0, "until it acts on one; whole periods of command_hz"
+        0.004, "s", 0.0, 1.0, "dead time of a command; whole periods of command_hz"
     )
-    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "from an error to acceleration")
-    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "by which it lags behind a steady motion")
-    max_speed: float = quantity(math.pi, "rad/s", 1e-3, 100.0, "of a joint, or its own limit")
-    max_acceleration: float = quantity(40.0, "rad/s^2", 1e-2, 1e4, "of a joint")
+    gain: float = quantity(300.0, "1/s^2", 1.0, 1e7, "acceleration per position error")
+    lookahead: float = quantity(0.1, "s", 1e-4, 2.0, "lag behind a steady motion")
+    max_speed: float = quantity(
+        math.pi, "rad/s", 1e-3, 100.0, "speed limit of each joint, unless the model's is lower"
+    )
+    max_acceleration: float = quantity(
+        40.0, "rad/s^2", 1e-2, 1e4, "limit of each joint, unless the model's is lower"
+    )
     drive_bandwidth_hz: float = quantity(
-        30.0, "Hz", 0.1, 1e3, "of the drives, which follow what is generated: how stiff it is"
+        30.0, "Hz", 0.1, 1e3, "bandwidth of the drives; sets the joint stiffness"
     )
 
     def check(self, where: str, rate: float) -> None:
-        """Checks it against the rate of the joint control [Hz].
-
-        Raises:
-            DrakeTeleopError: naming `where` and the field.
-        """
+        """Raise DrakeTeleopError if a setting does not fit the control rate [Hz]."""
         periods = rate / self.command_hz
         if periods < 1.0 or abs(periods - round(periods)) > 1e-6 * periods:
             raise DrakeTeleopError(
@@ -79,7 +64,7 @@ class PositionInterface:
                 remedy="choose a rate of the joint control that is a multiple of it",
             )
         damping = self.gain * self.lookahead / rate
-        if damping + 0.5 * self.gain / rate**2 > 1.5:  # from 2 on it is unstable
+        if damping + 0.5 * self.gain / rate**2 > 1.5:  # unstable from 2
             raise DrakeTeleopError(
                 f"a gain of {self.gain:g} 1/s^2 is too fast for steps of {1e3 / rate:g} ms",
                 where=f"{where}.gain",
@@ -93,7 +78,7 @@ class PositionInterface:
             )
 
 
-#: Arms by the name of their interface.
+#: Interfaces by name; docs/station.md lists the sources.
 INTERFACES: dict[str, PositionInterface] = {
     "ur_servoj": PositionInterface(),
     "franka_position": PositionInterface(
@@ -110,14 +95,13 @@ INTERFACES: dict[str, PositionInterface] = {
 
 @njit(cache=True)
 def _generate(command, interface, limits, memory, reference):
-    """Takes the command if it is time, and moves r on by a period.
+    """Take the command (n,) [rad] if due, and advance r by one period.
 
     Args:
-        command: (n,) [rad].
-        interface: (6,) period [s], gain, lookahead, w, periods of a command, length of the queue.
-        limits: (2, n) of speed and acceleration.
-        memory: see the module; changed.
-        reference: (3, n) filled with r and its two derivatives.
+        interface: (6,) period [s], gain, lookahead, w, periods per command, length of the queue.
+        limits: (2, n) speed and acceleration.
+        memory: see `_COUNT`; updated.
+        reference: (3, n) output: r and its two derivatives.
     """
     period, gain, lookahead, _, every, queued = interface
     n = command.shape[0]
@@ -133,7 +117,7 @@ def _generate(command, interface, limits, memory, reference):
     memory[_COUNT] = (memory[_COUNT] + 1.0) % every
     for i in range(n):
         away = target[i] - r[i]
-        fastest = min(limits[0, i], math.sqrt(_BRAKES * limits[1, i] * abs(away)))
+        fastest = min(limits[0, i], math.sqrt(_BRAKING_FACTOR * limits[1, i] * abs(away)))
         towards = min(max(away / lookahead, -fastest), fastest)
         wanted = gain * lookahead * (towards - speed[i])
         wanted = min(max(wanted, -limits[1, i]), limits[1, i])
@@ -148,10 +132,10 @@ def _generate(command, interface, limits, memory, reference):
 def position_servo_torque(
     arm, command, state, interface, limits, effort_limit, scratch, memory, torque
 ):  # fmt: skip
-    """The motors' torque (n,) for the coming period, within `effort_limit` (n,) [N m].
+    """Write the motors' torque (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n), the others as of `_generate`; rad, rad/s. While a command
-    is none the last one holds, and while the encoders give no numbers the arm is carried.
+    `state` is [q; v], `scratch` (6, n), the others as for `_generate`. Invalid command: the last
+    one. Invalid encoders: gravity compensation.
     """
     n = torque.shape[0]
     _generate(command, interface, limits, memory, scratch)
@@ -172,7 +156,7 @@ def position_servo_torque(
 
 
 class PositionServo(LeafSystem):
-    """The position interface of an arm, in the place of `JointControl`.
+    """Position interface of an arm, in place of `JointControl`.
 
     .. pydrake_system::
 
@@ -183,11 +167,7 @@ class PositionServo(LeafSystem):
         output_ports:
         - joint_torque: (n,) [N m], held between samples
 
-    Args:
-        arm: the arm with its tool (the drives know its nominal load).
-        interface: its numbers.
-        period: of the drives [s]; `PositionInterface.check` says which fit.
-        q_start: (n,) where it holds the arm before the first command [rad].
+    `period` is that of the drives [s], `q_start` the posture held before the first command.
     """
 
     __slots__ = ONE_DICT
@@ -221,10 +201,9 @@ class PositionServo(LeafSystem):
         )
         self._command = self.DeclareVectorInputPort("joint_command", n)
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
-        self.DeclareStateOutputPort("joint_torque", self.DeclareDiscreteState(holding))
-        memory = np.concatenate([[0.0, 0.0], q_start, q_start, still, *(queued * [q_start])])
+        holding = self.DeclareDiscreteState(holding_torque(arm, q_start))
+        self.DeclareStateOutputPort("joint_torque", holding)
+        memory = np.concatenate([[0.0, 0.0], q_start, q_start, np.zeros(n), *(queued * [q_start])])
         self.DeclareDiscreteState(memory)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 

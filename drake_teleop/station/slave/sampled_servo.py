@@ -1,19 +1,11 @@
-"""Joint control that samples faster than the simulation stops for it.
+"""Joint control that samples faster than the simulation's events.
 
-The paper's runs at 10 kHz, while everything else that drives the arm changes at 2 kHz. An event for
-each sample cuts the plant's steps five times shorter, and costs four times as much. Here the
-samples lie inside the step, as the wrist sensor's do: at each event the motion until the next one
-is foreseen with the plant's own dynamics (`plant_rates`), one midpoint step for each sample, and
-the controller is called for each:
+Each event predicts the motion with `plant_rates`, one midpoint step per sample of the controller:
 
     tau_k = servo(x_k),  x_k+1 = x_k + T f(x_k + T/2 f(x_k, tau_k), tau_k),  k = 0 .. m - 1
 
-The plant gets the line a + b (t - h/2) over h = m T with the area and the first moment of these
-steps, so that arms of constant inertia arrive where they would have; b = 0 if m = 1. The next event
-begins from where the plant really is. The hand's command is that of the event for all m samples.
-
-Of what pushes the tool besides contacts nothing is foreseen. The steps of the torque themselves,
-at 10 kHz, are not in the wrench; the wrench is that of the line, to rounding.
+The plant receives the line a + b (t - h/2) over h = m T with the area and first moment of these
+steps. The prediction includes contacts, but no other force on the tool.
 """
 
 from __future__ import annotations
@@ -25,77 +17,76 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import put
-from drake_teleop.station.slave.arm import inverse_dynamics
+from drake_teleop.station.slave.arm import holding_torque
 from drake_teleop.station.slave.joint_control import (
     JointControlConfig,
     joint_control_torque,
     servo_numbers,
 )
 from drake_teleop.station.slave.plant import SlavePlant
-from drake_teleop.station.slave.plant_rates import joined, plant_rates
+from drake_teleop.station.slave.plant_dynamics import assemble_state, plant_rates
 
 Array = NDArray[np.float64]
 
-#: Events need come no oftener [Hz]: over a longer time a line is too far from the servo's samples.
-_EVENTS = 2000.0
+#: Event rate [Hz]; over longer intervals a line differs too much from the servo's samples.
+_EVENT_HZ = 2000.0
 
 
-def samples_within(control_hz: float, hand_hz: float) -> int:
-    """How many samples of the servo one event takes: the most with events at 2 kHz or more.
+def samples_per_event(control_hz: float, hand_hz: float) -> int:
+    """Return the largest number of servo samples per event with events at 2 kHz or more.
 
-    Each sample of the hand stays an event.
+    Each operator-side sample remains an event.
     """
-    for_each_hand = control_hz / hand_hz
-    whole = round(for_each_hand)
-    if whole < 1 or abs(for_each_hand - whole) > 1e-9 * whole:
+    ratio = control_hz / hand_hz
+    whole = round(ratio)
+    if whole < 1 or abs(ratio - whole) > 1e-9 * whole:
         return 1
-    most = max(int(control_hz / _EVENTS), 1)
+    most = max(int(control_hz / _EVENT_HZ), 1)
     return next(m for m in range(min(most, whole), 0, -1) if whole % m == 0)
 
 
 @njit(cache=True)
 def torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """The torque of the coming samples as a line in time.
+    """Write the torque of the next samples as a line in time.
 
     Args:
         arm: `ArmModel.table` of the controller.
         command: (n,) [rad].
-        state: (2 n,) [q; v] now.
+        state: (2 n,) [q; v].
         sheet: (2,) of the leaf.
         servo: `servo_numbers`.
-        physics: `SlavePlant.physics`, what the plant really is.
+        physics: `SlavePlant.physics`.
         samples: m.
         period: T [s].
         scratch: (3 n,).
-        line: (3 n,) torque now [N m], its rate [N m/s], the last sample [N m], which stays where
-            a command is none; changed.
+        line: (3 n,) torque [N m], its rate [N m/s], last sample [N m].
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
     x, half, xdot = np.empty(2 * n + 2), np.empty(2 * n + 2), np.empty(2 * n + 2)
-    seen, wrench_W, nothing = np.empty(2 * n), np.empty(6), np.zeros(6)
-    joined(state, sheet, x)
+    predicted, wrench_W, no_wrench = np.empty(2 * n), np.empty(6), np.zeros(6)
+    assemble_state(state, sheet, x)
     now[:] = 0.0
     rate[:] = 0.0
     for k in range(samples):
-        put(seen, 0, x, 0, n)
-        put(seen, n, x, n + 1, n)
+        put(predicted, 0, x, 0, n)
+        put(predicted, n, x, n + 1, n)
         joint_control_torque(
-            arm, command, seen, servo[0], servo[1], servo[2], servo[3], scratch, torque
+            arm, command, predicted, servo[0], servo[1], servo[2], servo[3], scratch, torque
         )
         for i in range(n):
             now[i] += torque[i]
             rate[i] += (k - 0.5 * (samples - 1)) * torque[i]
         if k == samples - 1:
             break
-        plant_rates(physics, x, torque, nothing, wrench_W, xdot)
+        plant_rates(physics, x, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             half[i] = x[i] + 0.5 * period * xdot[i]
-        plant_rates(physics, half, torque, nothing, wrench_W, xdot)
+        plant_rates(physics, half, torque, no_wrench, wrench_W, xdot)
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):
-        # Half of the way that the line takes, and no motor beyond what it can at either end.
+        # Half the rise of the line; clip both ends to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
         start = min(max(mean - away, -servo[3][i]), servo[3][i])
         end = min(max(mean + away, -servo[3][i]), servo[3][i])
@@ -103,15 +94,15 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
 
 
 @njit(cache=True)
-def _on_line(state, time, torque):
-    """The torque (n,) on the line in `state`: `line` of `torque_line`, and its beginning [s]."""
+def _evaluate_line(state, time, torque):
+    """Write the torque (n,) at `time`; `state` is `line` and its start time [s]."""
     n = torque.shape[0]
     for i in range(n):
         torque[i] = state[i] + (time - state[-1]) * state[n + i]
 
 
 class SampledServo(LeafSystem):
-    """`JointControl` with several samples for each event, see the module.
+    """`JointControl` with several samples per event, see the module.
 
     .. pydrake_system::
 
@@ -122,14 +113,9 @@ class SampledServo(LeafSystem):
         - sheet_state: [z; v_z] of the leaf (only if there is one)
         output_ports:
         - joint_torque: (n,) now, on the line [N m]
-        - torque_rate: (n,) the line's, held between events [N m/s]
+        - torque_rate: (n,) slope of the line, held between events [N m/s]
 
-    Args:
-        slave: the plant.
-        config: the bandwidths.
-        period: of the servo [s].
-        samples: for each event.
-        q_start: (n,) where it holds the arm before the first sample [rad].
+    `period` is that of the servo [s], `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT
@@ -154,9 +140,8 @@ class SampledServo(LeafSystem):
         self._at_rest, self._sheet = np.zeros(2), None
         if slave.sensed_sheet is not None:
             self._sheet = self.DeclareVectorInputPort("sheet_state", 2)
-        still, holding = np.zeros(n), np.zeros(n)
-        inverse_dynamics(arm.table, q_start, still, still, holding)
-        self.DeclareDiscreteState(np.concatenate([holding, still, holding, [0.0]]))
+        holding = holding_torque(arm, q_start)
+        self.DeclareDiscreteState(np.concatenate([holding, np.zeros(n), holding, [0.0]]))
         when = {self.time_ticket(), self.xd_ticket()}
         torque, rate = weak_callback(self._calc_torque), weak_callback(self._calc_rate)
         self.DeclareVectorOutputPort("joint_torque", n, torque, when)
@@ -165,7 +150,7 @@ class SampledServo(LeafSystem):
 
     def _calc_torque(self, context: Context, output: BasicVector) -> None:
         line = context.get_discrete_state_vector().value()
-        _on_line(line, context.get_time(), output.get_mutable_value())
+        _evaluate_line(line, context.get_time(), output.get_mutable_value())
 
     def _calc_rate(self, context: Context, output: BasicVector) -> None:
         n = self._n

@@ -1,7 +1,6 @@
-"""Something to touch out of a file: SDF, URDF or Drake's model directives, as Drake reads them.
+"""Environment from a file: SDF, URDF or Drake model directives.
 
-Its bodies may hang on joints, with springs and damping of the file, and have any shape. What an SDF
-or URDF hangs on nothing is welded to the world, or left to fall and to be pushed.
+Bodies may hang on joints with springs and damping. Free roots are welded to the world, or float.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -27,83 +26,80 @@ from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
-from drake_teleop.station.slave.moving_pose import can_be_told
+from drake_teleop.station.slave.surroundings import supports_pose
 
-#: Meshes that were converted, for as long as this process looks at them.
-_CONVERTED: list[TemporaryDirectory[str]] = []
-_OWN = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_RESOLUTION = 0.005  # m, of the mesh that the tool's ball becomes
+#: Folders of converted meshes, kept while the process runs.
+_MESH_FOLDERS: list[TemporaryDirectory[str]] = []
+_RESERVED_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
+_MESH_RESOLUTION_M = 0.005  # m, of the mesh of the tool's ball
 
 
 @settings
 @dataclass
 class Scene(Environment):
-    """Of which file, where it stands, and whether contacts have points or areas."""
+    """File of the surroundings, its pose, and point or hydroelastic contact."""
 
     file: str = plain(
         "door.sdf",
         ".sdf, .urdf or .dmd.yaml, from the scenario's folder; door.sdf comes with this",
     )
     position: list[float] = quantity(
-        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of what hangs on nothing in the file, in W"
+        [0.0, 0.0, 0.0], "m", -3.0, 3.0, "of free roots of the file, in W"
     )
     rotation: list[float] = quantity(
-        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch and yaw of it"
+        [0.0, 0.0, 0.0], "rad", -3.15, 3.15, "roll, pitch, yaw of free roots of the file"
     )
-    fixed: bool = plain(True, "what hangs on nothing is welded there; false: it can be pushed")
+    fixed: bool = plain(True, "weld free roots of the file there; false: they float")
     contact: str = choice(
-        "point", ("point", "hydroelastic"), "Drake's model; what cannot be hydroelastic has points"
+        "point",
+        ("point", "hydroelastic"),
+        "Drake's contact model; shapes that are not hydroelastic use point",
     )
     tool_modulus: float = quantity(
         1e7, "Pa", 1e4, 1e11, "hydroelastic modulus of the tool's shapes (E)"
     )
-    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "at which friction is complete (E)")
+    slip: float = quantity(1e-3, "m/s", 1e-6, 1.0, "sliding speed of full friction (E)")
 
     @property
     def path(self) -> Path:
-        """The file, or the model of that name that comes with the package."""
+        """The given file, or the model of that name in the package."""
         given, shipped = Path(self.file), models_dir() / self.file
         return shipped if not given.is_file() and shipped.is_file() else given
 
     @property
     def hydroelastic(self) -> bool:
-        """Whether the file's and the tool's shapes may have a pressure over an area."""
+        """True if contacts may have a pressure over an area."""
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
-        """The same with its file found from a folder, if it is there."""
+        """Return a copy with the file resolved from a folder, if it exists there."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Parses the file and puts what hangs on nothing where it shall be.
-
-        Raises:
-            DrakeTeleopError: if there is no such file, or Drake cannot read it.
-        """
+        """Parse the file and place its free roots; raises DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
-            _CONVERTED.append(folder)
+            _MESH_FOLDERS.append(folder)
         added = range(before, plant.num_bodies())
         for body in map(plant.get_body, map(BodyIndex, added)):
-            if body.name() in _OWN:
+            if body.name() in _RESERVED_NAMES:
                 raise DrakeTeleopError(
-                    f"a body is called {body.name()}, as one of the station's frames",
+                    f"the body name {body.name()} is reserved for the station",
                     where=str(path),
                     remedy="give it another name in the file",
                 )
         joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
         for joint in joints:
-            if not can_be_told(joint):
+            if not supports_pose(joint):
                 raise DrakeTeleopError(
-                    f"{joint.name()} is of the kind {joint.type_name()}",
+                    f"{joint.name()} has the unsupported type {joint.type_name()}",
                     where=str(path),
-                    remedy="let it turn about an axis (several, for more), slide along one, or be"
-                    " free",
+                    remedy="use revolute, prismatic, fixed or free joints",
                 )
-        hung = {joint.child_body().index() for joint in joints}
-        bases = [index for index in map(BodyIndex, added) if index not in hung]
+        attached = {joint.child_body().index() for joint in joints}
+        bases = [index for index in map(BodyIndex, added) if index not in attached]
         X_WBase = RigidTransform(RollPitchYaw(self.rotation), self.position)
         for body in map(plant.get_body, bases):
             if self.fixed:
@@ -114,11 +110,7 @@ class Scene(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Gives the tool's shapes a pressure, if that is wanted.
-
-        Raises:
-            DrakeTeleopError: if no shape of the file could have one.
-        """
+        """Make the tool's shapes hydroelastic, if configured; raises DrakeTeleopError."""
         if not self.hydroelastic:
             return
         inspector = scene_graph.model_inspector()
@@ -134,12 +126,14 @@ class Scene(Environment):
         for shape in own:
             properties = ProximityProperties(inspector.GetProximityProperties(shape))
             if not is_hydroelastic(properties):
-                AddCompliantHydroelasticProperties(_RESOLUTION, self.tool_modulus, properties)
+                AddCompliantHydroelasticProperties(
+                    _MESH_RESOLUTION_M, self.tool_modulus, properties
+                )
                 scene_graph.AssignRole(
                     plant.get_source_id(), shape, properties, RoleAssign.kReplace
                 )
 
 
 def is_hydroelastic(properties: ProximityProperties) -> bool:
-    """Whether a shape may have a pressure over an area of contact."""
+    """Return True if a shape has hydroelastic properties."""
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

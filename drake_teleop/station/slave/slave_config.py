@@ -1,4 +1,4 @@
-"""What a scenario says of the slave: which arm, where it stands and starts, what it carries."""
+"""Settings of the slave in a scenario: arm, base pose, start, tool and payload."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -7,14 +7,24 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.resources import models_dir
-from drake_teleop.station.slave.ik_methods import AUTOMATIC, METHODS
-from drake_teleop.station.slave.payload import Payload
-from drake_teleop.station.slave.tool import Tool
+from drake_teleop.station.slave.joint_commands import AUTOMATIC, IK_METHODS
+from drake_teleop.station.slave.tool import Tool, steel_ball_radius
+
+
+@settings
+@dataclass
+class Payload:
+    """A ball of steel, welded to the tool, without a collision shape; part of the load."""
+
+    mass: float = quantity(0.0, "kg", 0.0, 10.0, "mass of the payload; 0: none")
+    com: list[float] = quantity([0.0, 0.0, 0.15], "m", -0.5, 0.5, "centre of mass, p_SoBcm_S")
 
 
 @settings
@@ -28,83 +38,79 @@ class Slave:
     payload: Payload = field(default_factory=Payload)
     inverse_kinematics: str = choice(
         AUTOMATIC,
-        (AUTOMATIC, *METHODS),
-        "how a pose becomes joint angles: closed_form is that of arms like the RX90; numeric, for"
-        " any arm, keeps their speeds; automatic takes the first where it can",
+        (AUTOMATIC, *IK_METHODS),
+        "closed_form: for arms with the geometry of the RX90; numeric: for any arm, within joint"
+        " speeds; automatic: closed_form where possible",
     )
     model: str = plain(
-        "", "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; else an RX90"
+        "",
+        "file of an arm: URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder; default: RX90",
     )
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in model and tool, from the scenario's folder"
     )
     base_pose: list[float] = quantity(
-        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: its place; roll, pitch, yaw"
+        [0.0] * 6, "m, rad", -10.0, 10.0, "X_WBase of the arm: position; roll, pitch, yaw"
     )
     sensor_frame: str = plain(
         "sensor", "frame or link of the model at which the sensor measures: S; z_S towards the tool"
     )
     home: list[float] = plain(
-        [], "joint positions to start at [rad, m]; by default found for position"
+        [], "joint positions at the start [rad, m]; default: computed from position"
     )
     friction: list[float] = plain(
         [],
-        "dry friction of the joints [N m, N], one for all or each, which joint control does not"
-        " know; by default none",
+        "dry friction of the joints [N m, N], one for all or each, not compensated by joint"
+        " control; default: none",
     )
     tool: Tool | None = field(
         default_factory=Tool,
-        metadata={"doc": "what hangs on the sensor; null: what the model has beyond its frame"},
+        metadata={"doc": "tool on the sensor; null: the model's bodies beyond its sensor frame"},
     )
 
     tip: list[float] = plain(
         [],
-        "p_STip [m], where contact is made; by default the tool's frame of that name, or how far"
-        " its shapes reach along z_S",
+        "contact point p_STip [m]; default: the tool's frame `tip`, or the end of its shapes along"
+        " z_S",
     )
 
     @property
     def path(self) -> Path:
-        """The file of the arm."""
+        """File of the arm."""
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
     def packages(self) -> tuple[Path, ...]:
-        """Where package:// addresses are looked up."""
+        """Folders of package:// addresses."""
         return tuple(Path(folder) for folder in self.package_paths)
 
     @property
     def X_WBase(self) -> RigidTransform:
-        """Where the arm stands."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
-        """What its models are read from, as far as it is there."""
+        """Return the existing model files."""
         paths = [self.path] if self.tool is None else [self.path, self.tool.path]
         return [path for path in paths if path.is_file()]
 
     def check(self, where: str) -> None:
-        """Checks what ranges cannot.
-
-        Raises:
-            DrakeTeleopError: for numbers that are none, or a tool that cannot be.
-        """
+        """Raise DrakeTeleopError for invalid numbers, lengths or tool."""
         if not np.isfinite(self.friction).all() or min(self.friction, default=0.0) < 0.0:
             raise DrakeTeleopError(
-                "has to be a list of finite numbers from 0 on", where=f"{where}.friction"
+                "must be a list of finite numbers >= 0", where=f"{where}.friction"
             )
         for name, length in (("home", len(self.home)), ("tip", 3)):
             values = getattr(self, name)
             if values and (len(values) != length or not all(np.isfinite(values))):
                 raise DrakeTeleopError(
-                    "has to be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
+                    "must be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
                     where=f"{where}.{name}",
                 )
         if self.tool is not None:
             self.tool.check(f"{where}.tool")
 
     def found_from(self, folder: Path) -> "Slave":
-        """The same with its files found from a folder, wherever the program runs."""
+        """Return a copy with its files resolved from a folder."""
 
         def found(name: str) -> str:
             return str((folder / name).resolve()) if name else ""
@@ -118,3 +124,13 @@ class Slave:
             package_paths=[found(path) for path in self.package_paths],
             tool=tool,
         )
+
+
+def AddPayload(plant: MultibodyPlant, holder: Frame, payload: Payload) -> None:
+    """Weld the payload to a frame that coincides with S, if it has mass."""
+    if payload.mass == 0.0:
+        return
+    inertia = SpatialInertia.SolidSphereWithMass(payload.mass, steel_ball_radius(payload.mass))
+    body = plant.AddRigidBody("payload", holder.model_instance(), inertia)
+    weld = WeldJoint("payload_weld", holder, body.body_frame(), RigidTransform(payload.com))
+    plant.AddJoint(weld)

@@ -1,4 +1,4 @@
-"""What there is to touch in the slave's plant: what of it moves, which law tells its contact."""
+"""Environment in the slave's plant: moving bodies, and the law that computes contact."""
 
 from __future__ import annotations
 
@@ -8,44 +8,57 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex
-from pydrake.systems.framework import Context
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    Joint,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    QuaternionFloatingJoint,
+    RevoluteJoint,
+)
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.station.environment.environment import Environment, ToolShapes
-from drake_teleop.station.environment.moving_bodies import JOINT_WIDTH, JointTable
+from drake_teleop.station.environment.moving_bodies import (
+    JOINT_WIDTH,
+    POSE_AND_TWIST,
+    JointTable,
+    bodies_into,
+)
 from drake_teleop.station.environment.point_contact import WATCHED_WIDTH, WIDTH, ContactPairs
 
-_SAME = 1e-12  # of frames: rounding
-_NO_INERTIA = 1e-12  # kg or kg m^2: nothing that is moved has less
+_FRAME_TOLERANCE = 1e-12  # rounding of frames
+_MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matrix
 
 
 class Touched(NamedTuple):
-    """What there is to touch in a plant: model instances, and that of the leaf, if there is one."""
+    """Model instances of the environment, and the leaf's if there is one."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
 
 
 class Contact(NamedTuple):
-    """What may touch the tool, and how it is told.
+    """Contact of the tool with the environment.
 
     Attributes:
-        pairs: (k, 28) `Pairs.known`; none if `beyond` says something.
-        watched: (l, 40) `Pairs.watched`: what is left to Drake where it comes near.
-        joints: (m, 21) of `JointTable`, by which the boxes of `pairs` move.
-        plant_size: of the plant's state, if there are joints, or 0.
-        beyond: what the compiled contact law does not know, so that Drake's contact results are
-            used; empty if it knows enough.
-        bodies: the tool's, and what is welded to it, as numbers.
-        shapes: identifiers of their shapes, as numbers.
-        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] of the leaf, and its acceleration by
-            gravity [m/s^2]; without one, a mass that nothing moves.
-        sheet: model instance of the leaf, or another `moving_part`, if there is one.
-        moving: everything else that moves, by name.
+        pairs: (k, 28) `Pairs.known`; empty if `beyond` is set.
+        watched: (l, 40) `Pairs.watched`, left to Drake at close range.
+        joints: (m, 21) of `JointTable`, which move the boxes of `pairs`.
+        plant_size: size of the plant's state, 0 without joints.
+        beyond: reason for using Drake's contact results instead of the compiled law, or empty.
+        bodies: indices of the tool's bodies.
+        shapes: identifiers of their shapes.
+        leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
+        sheet: model instance of the leaf, or of another `moving_part`, if any.
+        moving: other moving bodies, by name.
     """
 
     pairs: NDArray[np.float64]
@@ -61,12 +74,12 @@ class Contact(NamedTuple):
 
     @property
     def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pairs and joints, as `environment_wrench` takes them."""
+        """Pairs and joints for `environment_wrench`."""
         return self.pairs, self.joints
 
 
 def no_contact() -> Contact:
-    """With nothing to touch."""
+    """Return the `Contact` without environment."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
     watched = np.zeros((0, WATCHED_WIDTH))
@@ -74,11 +87,7 @@ def no_contact() -> Contact:
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
-    """Adds what there is to touch to a plant that has the tool and is not finalized.
-
-    Raises:
-        DrakeTeleopError: if a file of it cannot be read.
-    """
+    """Add the environment to a plant with the tool, before finalizing."""
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
@@ -96,23 +105,18 @@ def ContactWith(
     environment: Environment,
     touched: Touched,
 ) -> Contact:
-    """Prepares the contact of the tool with what was added, once the plant is finalized.
+    """Return the contact of the tool with the environment, after finalizing the plant.
 
-    Args:
-        plant: finalized.
-        scene_graph: with the shapes of tool and environment, and of nothing else.
-        sensor_frame: S.
-        tool: the body on it.
-        environment: what there is to touch.
-        touched: the same, as `AddEnvironment` returned it.
+    `scene_graph` contains the shapes of tool and environment only.
 
     Raises:
-        DrakeTeleopError: if a scene's contact is not what was asked for, or what moves has no mass.
+        DrakeTeleopError: if the requested contact model is impossible, or a moving body has no
+            mass.
     """
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
     contact = no_contact()._replace(
-        # Numbers: the identifiers themselves would hold the plant.
+        # Identifiers themselves would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
         sheet=touched.sheet,
@@ -124,7 +128,7 @@ def ContactWith(
             contact = contact._replace(leaf=np.array([*part.moving_part, gravity]))
     context = plant.CreateDefaultContext()
     _check_masses(plant, context, contact)
-    if beyond := _beyond(environment, contact):
+    if beyond := _unmodelled_contact(environment, contact):
         return contact._replace(beyond=beyond)
     joints, order = contact.joints, list[int]()
     if contact.moving:
@@ -137,8 +141,8 @@ def ContactWith(
     inspector, slip = scene_graph.model_inspector(), environment.slip
     try:
         found = ContactPairs(plant, inspector, from_S, touched.instances, slip, order)
-    except DrakeTeleopError as endless:
-        return contact._replace(beyond=str(endless))
+    except DrakeTeleopError as error:
+        return contact._replace(beyond=str(error))
     known, watched, unknown = found
     if not len(known):
         return contact._replace(beyond=unknown or "nothing has a shape")
@@ -151,14 +155,14 @@ def _X_SBody(
 ) -> RigidTransform:
     frame = plant.get_body(index).body_frame()
     X_SBody = plant.CalcRelativeTransform(context, sensor_frame, frame)
-    return RigidTransform() if X_SBody.IsNearlyIdentity(_SAME) else X_SBody
+    return RigidTransform() if X_SBody.IsNearlyIdentity(_FRAME_TOLERANCE) else X_SBody
 
 
 def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> None:
     if not contact.moving:
         return
     inertia = np.linalg.eigvalsh(plant.CalcMassMatrix(context))
-    if not inertia.min() > _NO_INERTIA:
+    if not inertia.min() > _MIN_INERTIA:
         bodies = {name: plant.get_body(index) for name, index in contact.moving.items()}
         names = [name for name, body in bodies.items() if not body.default_mass() > 0.0]
         raise DrakeTeleopError(
@@ -168,7 +172,7 @@ def _check_masses(plant: MultibodyPlant, context: Context, contact: Contact) -> 
         )
 
 
-def _beyond(environment: Environment, contact: Contact) -> str:
+def _unmodelled_contact(environment: Environment, contact: Contact) -> str:
     if environment.hydroelastic:
         return "contacts have areas"
     if contact.sheet is not None and len(environment.parts) > 1:
@@ -177,10 +181,7 @@ def _beyond(environment: Environment, contact: Contact) -> str:
 
 
 def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
-    """What moves of it, besides the leaf, in a finalized plant, by the names of the bodies.
-
-    Of several of one name each has that of its model instance before its own.
-    """
+    """Return moving bodies except the leaf by unique name, in a finalized plant."""
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
@@ -190,13 +191,55 @@ def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex
     moving = [body for body in bodies if not plant.IsAnchored(body)]
     names = [body.name() for body in moving]
     return {
-        _plain(body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()): (
-            body.index()
-        )
+        _signal_name(
+            body.name() if names.count(body.name()) == 1 else body.scoped_name().get_full()
+        ): (body.index())
         for body in moving
     }
 
 
-def _plain(name: str) -> str:
-    """For the name of a signal: a full stop would end it."""
+def _signal_name(name: str) -> str:
     return re.sub(r"\W+", "_", name)
+
+
+def supports_pose(joint: Joint) -> bool:
+    """Return True if the joint's positions follow from a pose, see `positions_of`."""
+    kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
+    return joint.num_positions() == 0 or isinstance(joint, kinds)
+
+
+def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
+    """Return the joint positions for the pose X_FM of its child frame."""
+    if isinstance(joint, RevoluteJoint):
+        turn = AngleAxis(X_FM.rotation().matrix())
+        return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
+    if isinstance(joint, PrismaticJoint):
+        return np.array([X_FM.translation() @ joint.translation_axis()])
+    turned = X_FM.rotation().ToQuaternion().wxyz()
+    return np.concatenate([turned, X_FM.translation()])[: joint.num_positions()]
+
+
+class MovingPose(LeafSystem):
+    """Pose of a body.
+
+    .. pydrake_system::
+
+        name: MovingPose
+        input_ports:
+        - plant_state: [q; v] of the whole plant
+        output_ports:
+        - pose: (7,) [qw, qx, qy, qz, px, py, pz] in W [1, m]
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, plant: MultibodyPlant, body: BodyIndex) -> None:
+        super().__init__()
+        self._joints, order = JointTable(plant, [body])
+        self._bodies = np.empty((len(order), POSE_AND_TWIST))
+        self._state = self.DeclareVectorInputPort("plant_state", plant.num_multibody_states())
+        self.DeclareVectorOutputPort("pose", 7, weak_callback(self._calc))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        bodies_into(self._joints, self._state.Eval(context), self._bodies)
+        output.SetFromVector(self._bodies[-1, :7])  # the body is last in its chain

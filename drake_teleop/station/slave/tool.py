@@ -1,4 +1,4 @@
-"""What hangs on the wrist sensor: the paper's tool, one of a file, or one of a few numbers."""
+"""Tool on the wrist sensor: the paper's, from a file, or from a few numbers."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from drake_teleop.common.quantities import plain, quantity
 from drake_teleop.common.resources import models_dir
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
-_STEEL = 7850.0  # kg/m^3
-# Of the shapes' surface, as of the ball of tool.sdf.
+_STEEL_DENSITY = 7850.0  # kg/m^3
+# Contact material of the shapes, as for the ball of tool.sdf.
 _STIFFNESS, _DISSIPATION, _FRICTION = 4e5, 1.0, 0.2
 _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
@@ -25,26 +25,24 @@ _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 @settings
 @dataclass
 class Ball:
-    """A ball that may touch."""
+    """A ball that can make contact."""
 
-    radius: float = quantity(0.012, "m", 1e-4, 1.0, "of the ball")
+    radius: float = quantity(0.012, "m", 1e-4, 1.0, "radius")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
 
     @property
     def shape(self) -> Shape:
-        """For Drake."""
         return Sphere(self.radius)
 
     @property
     def pose(self) -> RigidTransform:
-        """X_SShape."""
         return RigidTransform(self.position)
 
 
 @settings
 @dataclass
 class Block:
-    """A box that may touch."""
+    """A box that can make contact."""
 
     edges: list[float] = quantity([0.04, 0.04, 0.04], "m", 1e-4, 2.0, "lengths along x, y, z")
     position: list[float] = quantity([0.0, 0.0, 0.1], "m", -2.0, 2.0, "of its centre, in S")
@@ -52,59 +50,50 @@ class Block:
 
     @property
     def shape(self) -> Shape:
-        """For Drake."""
         return Box(*self.edges)
 
     @property
     def half_height(self) -> float:
-        """From its centre to its farthest corner along z_S [m]."""
+        """Distance from the centre to the farthest corner along z_S [m]."""
         return float(np.abs(self.pose.rotation().matrix()[2]) @ self.edges) / 2
 
     @property
     def pose(self) -> RigidTransform:
-        """X_SShape."""
         return RigidTransform(RollPitchYaw(self.rpy), self.position)
 
 
 @settings
 @dataclass
 class Tool:
-    """By default the paper's. A file, or a mass, is another one in its place."""
+    """The tool, by default the paper's; a file or a mass replaces it."""
 
     model: str = plain("", "file of a tool: its root link is put on S")
     mass: float = quantity(0.0, "kg", 0.0, 100.0, "of a tool without a file")
-    com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "its centre, p_SoBcm_S")
+    com: list[float] = quantity([0.0, 0.0, 0.05], "m", -1.0, 1.0, "centre of mass, p_SoBcm_S")
     inertia: list[float] = quantity(
         [0.0] * 6,
         "kg m^2",
         -10.0,
         10.0,
-        "about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel's",
+        "about the centre of mass: Ixx, Ixy, Ixz, Iyy, Iyz, Izz; zeros: a ball of steel",
     )
-    shapes: list[Ball | Block] = plain([], "what of it may touch: !Ball, !Block")
+    shapes: list[Ball | Block] = plain([], "collision shapes: !Ball, !Block")
 
     @property
     def path(self) -> Path:
-        """The file, of the paper's tool if no other is named."""
+        """File of the tool, by default the paper's."""
         return Path(self.model) if self.model else models_dir() / "tool.sdf"
 
     def check(self, where: str) -> None:
-        """Checks what ranges cannot.
-
-        Raises:
-            DrakeTeleopError: if file and mass are both given, or there are shapes without either,
-                or no body has this inertia.
-        """
+        """Raise DrakeTeleopError for file and mass, shapes without mass, or an invalid inertia."""
         if self.model and self.mass:
             raise DrakeTeleopError(
-                "both a file and a mass say what the tool is",
+                "both a file and a mass define the tool",
                 where=f"{where}.mass",
                 remedy="leave one of them out",
             )
         if self.mass == 0.0 and (self.shapes or any(self.inertia)):
-            raise DrakeTeleopError(
-                "a tool of its own shapes or inertia needs a mass", where=f"{where}.mass"
-            )
+            raise DrakeTeleopError("shapes and inertia require a mass", where=f"{where}.mass")
         if not _inertia(self).IsPhysicallyValid():
             raise DrakeTeleopError(
                 "no body has this inertia",
@@ -114,7 +103,7 @@ class Tool:
 
 
 def shapes_reach(tool: Tool) -> list[float] | None:
-    """p_STip (3,) of the shape that reaches farthest along z_S [m]; None if there is none."""
+    """Return p_STip (3,) [m] of the shape that reaches farthest along z_S, if any."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
@@ -126,17 +115,7 @@ def shapes_reach(tool: Tool) -> list[float] | None:
 def AddTool(
     plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Puts the tool on the sensor frame, through the joint "sensor_weld".
-
-    Args:
-        plant: with the arm, not finalized.
-        tool: which.
-        sensor_frame: S.
-        package_paths: as for `ParseModel`.
-
-    Raises:
-        DrakeTeleopError: as `ParseTool`.
-    """
+    """Weld the tool to the sensor frame by the joint "sensor_weld"."""
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
     body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _inertia(tool))
@@ -151,8 +130,8 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
     friction = CoulombFriction(_FRICTION, _FRICTION)
     AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
-    if not tool.shapes:  # or nothing would be seen of it
-        seen = RigidTransform(tool.com), Sphere(_radius(tool))
+    if not tool.shapes:  # for the 3D replay
+        seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
     for k, each in enumerate(tool.shapes):
         name = f"tool_{k}"
@@ -164,13 +143,13 @@ def _inertia(tool: Tool) -> SpatialInertia:
     if tool.mass == 0.0:
         return SpatialInertia.Zero()
     if not any(tool.inertia):
-        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, _radius(tool))
+        about_com = SpatialInertia.SolidSphereWithMass(tool.mass, steel_ball_radius(tool.mass))
         return about_com.Shift(np.negative(tool.com))
     xx, xy, xz, yy, yz, zz = np.array(tool.inertia) / tool.mass
     about_S = UnitInertia(xx, yy, zz, xy, xz, yz).ShiftFromCenterOfMass(np.negative(tool.com))
     return SpatialInertia(tool.mass, tool.com, about_S, skip_validity_check=True)
 
 
-def _radius(tool: Tool) -> float:
-    """Of a ball of steel of its mass [m]."""
-    return float((tool.mass / _STEEL * 3 / (4 * np.pi)) ** (1 / 3))
+def steel_ball_radius(mass: float) -> float:
+    """Return the radius [m] of a steel ball with a mass [kg]."""
+    return float((mass / _STEEL_DENSITY * 3 / (4 * np.pi)) ** (1 / 3))

@@ -1,4 +1,8 @@
-"""What the environment exerts on the tool: contacts of balls with boxes, and what is applied."""
+"""Compiled dynamics of the plant inside one step, with the wrench of the environment on the tool.
+
+Covers arm, tool, balls on boxes and one leaf (otherwise see `Contact.beyond`). The state is x = [q,
+leaf deflection, v, its rate], then the plant's [q; v] if other bodies move.
+"""
 
 from __future__ import annotations
 
@@ -17,34 +21,34 @@ from drake_teleop.station.environment.point_contact import (
     indentation,
     separation,
 )
-from drake_teleop.station.slave.arm import ArmModel, forward_kinematics, jacobian
+from drake_teleop.station.slave.arm import ArmModel, forward_dynamics, forward_kinematics, jacobian
 from drake_teleop.station.slave.surroundings import Contact
 
-#: Of the tool: nothing touches it, what the compiled law knows may, what it does not know may.
+#: Proximity of the tool: no contact, contact by the compiled law, other contact possible.
 FAR, TOUCHING, WATCHED = range(3)
-_WATCHED_FROM = 0.02  # m, farther than anything moves between two looks
-_ROUNDING = 1e-9  # m
+_WATCHED_DISTANCE_M = 0.02  # m, larger than any motion between two checks
+_TOUCH_TOLERANCE_M = 1e-9  # m
 
 
 @njit(cache=True)
 def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench_W):
-    """What acts on the tool besides the sensor and gravity, about the world's origin, in W.
+    """Write the environment's wrench on the tool, about the world's origin, in W.
 
     Args:
         arm: `ArmModel.table`.
         pairs: (k, 28) `Pairs.known`.
         joints: (m, 21) of `JointTable`.
-        applied_W: (6,) [f; tau] about So, in W, on top of the contacts [N, N m].
-        q, v: (n,) of the arm.
-        sheet: (2,) deflection and its rate [m, m/s], of a leaf.
-        state: [q; v] of the whole plant, for `joints`; not read if there are none.
-        wrench_W: (6,) filled [N, N m].
+        applied_W: (6,) additional [f; tau] about So, in W [N, N m].
+        q, v: (n,).
+        sheet: (2,) deflection of the leaf and its rate [m, m/s].
+        state: the plant's [q; v], unused without joints.
+        wrench_W: (6,) output [N, N m].
     """
-    acts = pairs.shape[0] > 0
+    has_wrench = pairs.shape[0] > 0
     for i in range(6):
         wrench_W[i] = applied_W[i]
-        acts = acts or applied_W[i] != 0.0
-    if not acts:
+        has_wrench = has_wrench or applied_W[i] != 0.0
+    if not has_wrench:
         return
     R_WS, p_WS, normal, force = np.empty((3, 3)), np.empty(3), np.empty(6), np.empty(3)
     twist, velocity, has_twist = np.empty(6), np.empty(3), False
@@ -53,7 +57,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
     forward_kinematics(arm, q, R_WS, p_WS)
     add_into(wrench_W, 3, cross(p_WS, applied_W))
     for pair in pairs:
-        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
         depth = indentation(box, p_WS, R_WS, sheet[0], normal)
         if depth <= 0.0:
             continue
@@ -63,22 +67,22 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
             put(twist, 0, J @ v, 0, 6)
             has_twist = True
         lever = minus(three(normal, 3), p_WS)
-        moving = plus(three(twist, 0), cross(three(twist, 3), lever))
+        point_velocity = plus(three(twist, 0), cross(three(twist, 3), lever))
         for i in range(3):
-            velocity[i] = moving[i] - pair[19 + i] * sheet[1]
+            velocity[i] = point_velocity[i] - pair[19 + i] * sheet[1]
         if pair[BODY] >= 0.0:
             body = bodies[int(pair[BODY])]
             lever = minus(three(normal, 3), three(body, 4))
-            moving = plus(three(body, 10), cross(three(body, 7), lever))
+            point_velocity = plus(three(body, 10), cross(three(body, 7), lever))
             for i in range(3):
-                velocity[i] -= moving[i]
+                velocity[i] -= point_velocity[i]
         contact_force(pair, depth, normal[:3], velocity, force)
         add_force(wrench_W, normal[3:], force)
 
 
 @njit(cache=True)
-def _place(pair, bodies, placed):
-    """The pair with its box where its body has it, in `placed` (28,)."""
+def _place_box(pair, bodies, placed):
+    """Return `placed` (28,): the pair with its box at its body's pose."""
     body = bodies[int(pair[BODY])]
     put(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])
@@ -91,39 +95,34 @@ def _place(pair, bodies, placed):
 
 @njit(cache=True)
 def nearness(arm, pairs, watched, joints, q, sheet, state):
-    """How near the tool is to anything: `FAR`, `TOUCHING` or `WATCHED`.
-
-    Args:
-        arm, pairs, joints, q, sheet, state: as above.
-        watched: (l, 40) `Pairs.watched`.
-    """
+    """Return `FAR`, `TOUCHING` or `WATCHED`, for (l, 40) `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
     bodies_into(joints, state, bodies)
     forward_kinematics(arm, q, R_WS, p_WS)
     for pair in watched:
         if pair[BODY] >= 0.0:
-            _place(pair, bodies, placed)
+            _place_box(pair, bodies, placed)
         else:
             put(placed, 0, pair, 0, WIDTH)
-        if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_FROM:
+        if separation(pair, placed, p_WS, R_WS, sheet[0]) < _WATCHED_DISTANCE_M:
             return WATCHED
     for pair in pairs:
-        box = _place(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
-        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_ROUNDING:
+        box = _place_box(pair, bodies, placed) if pair[BODY] >= 0.0 else pair
+        if indentation(box, p_WS, R_WS, sheet[0], normal) > -_TOUCH_TOLERANCE_M:
             return TOUCHING
     return FAR
 
 
 @njit(cache=True)
 def add_force(wrench_W, p_WC, force_W):
-    """Adds a force (3,) at C [N] to a wrench (6,) about the world's origin, all in W."""
+    """Add a force (3,) at C [N] to a wrench (6,) about the world's origin, in W."""
     add_into(wrench_W, 0, force_W)
     add_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):
-    """The true contact wrench for the log; no controller sees it.
+    """True contact wrench for the log, see `environment_wrench`.
 
     .. pydrake_system::
 
@@ -134,10 +133,6 @@ class ToolContact(LeafSystem):
         - plant_state: [q; v] of the whole plant (only if other bodies move)
         output_ports:
         - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
-
-    Args:
-        arm: kinematics up to the tool.
-        contact: what it may touch.
     """
 
     __slots__ = ONE_DICT
@@ -165,3 +160,70 @@ class ToolContact(LeafSystem):
             self._nothing if self._plant is None else self._plant.Eval(context),
             output.get_mutable_value(),
         )
+
+
+@njit(cache=True)
+def assemble_state(state, around, x):
+    """Write x from [q; v] and [deflection, rate, the plant's state]."""
+    n = state.shape[0] // 2
+    put(x, 0, state, 0, n)
+    put(x, n + 1, state, n, n)
+    x[n], x[2 * n + 1] = around[0], around[1]
+    put(x, 2 * n + 2, around, 2, around.shape[0] - 2)
+
+
+@njit(cache=True)
+def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
+    """Write the time derivative xdot (2 n + 2,) and the environment's wrench.
+
+    `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
+    `wrench_W` are those of `environment_wrench`.
+    """
+    arm, _, pairs, _, joints, given = physics
+    half = tau.shape[0] + 1
+    q, v, sheet, plant = (
+        x[: half - 1],
+        x[half : 2 * half - 1],
+        x[half - 1 : 2 * half : half],
+        x[2 * half :],
+    )
+    if not _take_given_wrench(given, x, wrench_W):
+        environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, plant, wrench_W)
+    else:
+        applied = np.empty(6)
+        environment_wrench(arm, pairs[:0], joints, applied_W, q, v, sheet, plant, applied)
+        wrench_W += applied
+    rates_under(physics, x, tau, applied_W, wrench_W, xdot)
+
+
+@njit(cache=True)
+def _take_given_wrench(given, x, wrench_W):
+    """Copy the next given contact wrench to `wrench_W` and return True; if missing, request it.
+
+    `given` is empty, or has row 0 [number given, number used, x of the request] and then wrenches.
+    """
+    if given.shape[0] == 0:
+        return False
+    number = int(given[0, 1])
+    given[0, 1] += 1.0
+    if number < given[0, 0]:
+        put(wrench_W, 0, given[1 + number], 0, 6)
+        return True
+    if number == given[0, 0]:
+        put(given[0], 2, x, 0, x.shape[0])
+    return False
+
+
+@njit(cache=True)
+def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
+    """Write the time derivative of x under a given environment wrench."""
+    arm, _, pairs, leaf, _, _ = physics
+    half = tau.shape[0] + 1
+    q, v = x[: half - 1], x[half : 2 * half - 1]
+    forward_dynamics(arm, q, v, tau, wrench_W, xdot[half:-1])
+    put(xdot, 0, x, half, half)
+    push = 0.0
+    if pairs.shape[0] > 0:  # all belong to the leaf, or none does
+        for i in range(3):
+            push -= pairs[0, 19 + i] * (wrench_W[i] - applied_W[i])
+    xdot[-1] = (push - leaf[1] * x[half - 1] - leaf[2] * x[2 * half - 1]) / leaf[0] + leaf[3]

@@ -1,0 +1,165 @@
+"""Sources of joint commands by name, and the monitor of joint limits and inverse kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.fault import sound
+from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.load.trajectory import FourierTrajectory
+from drake_teleop.station.slave.arm import SLIDES, ArmModel
+from drake_teleop.station.slave.inverse_kinematics import (
+    IkStatus,
+    InverseKinematics,
+    has_closed_form,
+)
+from drake_teleop.station.slave.numeric_inverse_kinematics import NumericInverseKinematics
+
+Array = NDArray[np.float64]
+
+AUTOMATIC = "automatic"
+"""Name that selects the closed form where it exists, otherwise the numeric method."""
+
+IK_METHODS: dict[str, Callable[[ArmModel, Array, float], LeafSystem]] = {
+    "closed_form": lambda arm, q_start, period: InverseKinematics(arm.lower, arm.upper),
+    "numeric": NumericInverseKinematics,
+}
+"""Constructors by name, called with the arm, its start (n,) [rad] and the period [s]; the systems
+have the ports of `InverseKinematics`."""
+
+# Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
+# mechanical stops of commercial arms are farther out.
+_RANGE_TOLERANCE = 0.01
+
+
+def ik_method_name(name: str, arm: ArmModel) -> str:
+    """Return the key in `IK_METHODS` for `name`; raise DrakeTeleopError without a closed form."""
+    if name == AUTOMATIC:
+        return "closed_form" if has_closed_form(arm) else "numeric"
+    if name == "closed_form" and not has_closed_form(arm):
+        raise DrakeTeleopError(
+            "the closed form is that of an RX90 whose base stands at the world's origin",
+            where="slave.inverse_kinematics",
+            remedy=f"set it to {AUTOMATIC} or numeric",
+        )
+    return name
+
+
+class JointFollower(LeafSystem):
+    """Limits of position and speed for the leader's joints; invalid input holds the command.
+
+    .. pydrake_system::
+
+        name: JointFollower
+        input_ports:
+        - leader_joints: (n,) requested positions [rad]
+        output_ports:
+        - joint_command: (n,) [rad]
+        - ik_status: an `IkStatus`: OK, JOINT_LIMIT or BAD_POSE
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel, q_start: Array, period: float) -> None:
+        super().__init__()
+        self._lower, self._upper = arm.lower, arm.upper
+        self._step = arm.velocity_limit * period
+        n = arm.num_joints
+        self._leader = self.DeclareVectorInputPort("leader_joints", n)
+        self.DeclareDiscreteState(np.array(q_start, dtype=np.float64))
+        self.DeclareVectorOutputPort("joint_command", n, weak_callback(self._calc_command))
+        self.DeclareVectorOutputPort("ik_status", 1, weak_callback(self._calc_status))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _next(self, context: Context) -> tuple[Array, IkStatus]:
+        last, leader = context.get_discrete_state(0).value(), self._leader.Eval(context)
+        if not sound(leader):
+            return last, IkStatus.BAD_POSE
+        within = np.clip(leader, self._lower, self._upper)
+        status = IkStatus.OK if (within == leader).all() else IkStatus.JOINT_LIMIT
+        return np.clip(within, last - self._step, last + self._step), status
+
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._next(context)[0])
+
+    def _calc_status(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._next(context)[1]
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(0, self._next(context)[0])
+
+
+class JointTrajectory(LeafSystem):
+    """One period of an excitation trajectory from `start` [s], at rest before and after.
+
+    .. pydrake_system::
+
+        name: JointTrajectory
+        output_ports:
+        - joint_command: (n,) [rad]
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, trajectory: FourierTrajectory, start: float) -> None:
+        super().__init__()
+        self._trajectory, self._start = trajectory, start
+        self.DeclareVectorOutputPort("joint_command", len(trajectory.q0), weak_callback(self._calc))
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        time = np.clip(context.get_time() - self._start, 0.0, self._trajectory.period)
+        output.SetFromVector(self._trajectory.evaluate(time)[0])
+
+
+class SlaveMonitor(LeafSystem):
+    """Periodic check that joints stay within their range plus 1 % of it.
+
+    .. pydrake_system::
+
+        name: SlaveMonitor
+        input_ports:
+        - slave_state: [q; v] of the arm [rad, rad/s]
+        - ik_status: of the inverse kinematics (optional)
+        output_ports:
+        - ik_status: last value, for the log
+
+    Raises:
+        DrakeTeleopError: from the simulation, when a joint is outside or not finite.
+    """
+
+    __slots__ = ONE_DICT
+
+    def __init__(self, arm: ArmModel, period: float) -> None:
+        super().__init__()
+        self._arm = arm
+        tolerance = _RANGE_TOLERANCE * (arm.upper - arm.lower)
+        self._lower, self._upper = arm.lower - tolerance, arm.upper + tolerance
+        self._state = self.DeclareVectorInputPort("slave_state", 2 * arm.num_joints)
+        self._status = self.DeclareVectorInputPort("ik_status", 1)
+        self.DeclareStateOutputPort("ik_status", self.DeclareDiscreteState(1))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._check)
+
+    def _check(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._status.HasValue(context):
+            discrete_state.set_value(0, self._status.Eval(context))
+        q = self._state.Eval(context)[: self._arm.num_joints]
+        # A comparison with NaN is false, so NaN counts as outside.
+        inside = (q >= self._lower) & (q <= self._upper)
+        if inside.all():
+            return
+        joint = int(inside.argmin())
+        unit = "m" if self._arm.table[joint, SLIDES] else "rad"
+        # Returning EventStatus.Failed crashes for systems written in Python.
+        raise DrakeTeleopError(
+            f"joint {joint + 1} of the slave left its range at {context.get_time():.3f} s: "
+            f"{q[joint]:.3f} {unit} is outside {self._arm.lower[joint]:.3f} to "
+            f"{self._arm.upper[joint]:.3f} {unit}",
+            where="simulation",
+            remedy="ask for a smaller or slower motion, start elsewhere (slave.position or home)"
+            ", or speed joints up no faster than they can (joint_control.servo: position)",
+        )
