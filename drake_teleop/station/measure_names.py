@@ -1,6 +1,6 @@
-"""Names of what is measured of a task, for whoever needs neither Drake nor compiled code for it.
+"""Names of the task measures, importable without Drake and compiled code.
 
-`task_measures.py` explains them.
+`task_measures.py` defines the measures.
 """
 
 from __future__ import annotations
@@ -15,4 +15,4 @@ TASK_MEASURES = (
     "false_notices",
     "press_error_N",
 )
-"""Names of the measures, in the order of `task_measures`."""
+"""Measures in the order of `task_measures`."""

@@ -1,23 +1,18 @@
-"""What was not as it should be in a run, and when, from its recorded signals.
+"""Warnings about a run from its recorded signals.
 
-============== =================================================================================
-saturated      the wrist sensor says so
-fault          numbers in the loop that cannot be, see `drake_teleop.common.fault`
-unreachable    the inverse kinematics say so
-clipped        a joint asks for its largest speed, or its motor gives its largest torque; the device
-               displays its largest force or torque
-leaf           it bends further than its model goes
-safe state     an end of the channel has heard nothing for longer than the channel's timeout
-behind         the command that leaves the channel, or a joint, is not within the range of what it
-               was asked for within the time that delay and bandwidth explain
-reserve        the command that leaves a `ledger` is behind a hand that is faster than the ledger's
-               reserve pays for
-hunting        the hand, the command that leaves the channel or a joint goes to and fro, while what
-               it was asked for does not
-============== =================================================================================
+============== ===================================================================================
+saturated      the wrist sensor is saturated
+fault          invalid numbers in the loop, see `drake_teleop.common.fault`
+unreachable    the inverse kinematics have no solution
+clipped        a joint speed or motor torque, or the displayed force or torque, is at its limit
+leaf           the deflection is outside the validity of its model
+safe state     an end of the channel receives no packets for longer than the channel's timeout
+behind         a pose or joint lags its command by more than delay and bandwidth explain
+reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
+hunting        hand, command or joint oscillates (limit cycle) while its command does not
+============== ===================================================================================
 
-The first five are said however short they were, the others if they last for longer than 0.2 s; the
-reserve's in all, because a hand that swings overtakes what is behind it.
+The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total).
 """
 
 from __future__ import annotations
@@ -45,35 +40,35 @@ Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
 
 LASTING = 0.2
-"""What is over sooner [s] may be a movement's own."""
-# What comes again sooner than this has not been away [s].
+"""Shortest reported duration [s]; a normal motion may cause shorter ones."""
+# Shorter gaps are closed [s].
 _GAP = 0.05
-# As good as at a limit, which is reached by a product that rounds.
+# Tolerance for rounding at a limit.
 _AT_LIMIT = 1 - 1e-9
-# How far behind is behind: command [m], its turn [rad], joint [rad], 3 mm at a reach of 1 m.
+# Smallest reported lag: command [m], its orientation [rad], joint [rad] (3 mm at 1 m).
 _FAR, _TURNED, _JOINT_FAR = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
-# After so long a ledger's command is where it was told to be [s], if energy is not short.
+# Settling time of a ledger's command with sufficient energy [s].
 _GENERATOR = 0.05
 _DEGREES = 180 / np.pi
-# To and fro by more than this is hunting: hand and command [m], their turn [rad], joint [rad].
+# Smallest reported amplitude: hand and command [m], their orientation [rad], joint [rad].
 _SWING, _TURN_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.5), np.deg2rad(0.1)
 NEAR = 0.25
-"""So near to a turn of the command [s] a turn is that one's."""
-# So many turns make it hunting, each within this time of the one before [s].
+"""A reversal within this time of a command's reversal is explained by it [s]."""
+# Reversals of an oscillation, and longest time between two of them [s].
 _TURNS, _SLOWEST = 4, 0.5
-# After so many time constants of the position loop a command has been met to 0.3 %.
+# Time constants of the position loop until the error is 0.3 %.
 _TIME_CONSTANTS = 6.0
-# More times than this are counted, not listed.
+# Further times are only counted.
 _LISTED = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """One sentence for each thing of the table above that happened, with its times.
+    """Return one sentence for each condition of the table above that occurred, with times.
 
     Args:
-        result: of a run; what was not recorded is not looked at.
-        scenario: that was run.
-        arm: the slave's, with its limits.
+        result: result of a run; checks whose signals were not recorded are skipped.
+        scenario: scenario of the run.
+        arm: model of the slave's arm, with limits.
     """
     return [
         f"{what} {_when(spans)}"
@@ -85,12 +80,12 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
 
 def spans_of(t: Array, happened: Flags, least: float = 0.0) -> Spans:
-    """From when to when something was so, if for at least so long; short gaps are closed.
+    """Return start and stop times of a condition; gaps shorter than 50 ms are closed.
 
     Args:
         t: (N,) [s].
-        happened: (N,).
-        least: [s].
+        happened: (N,) condition.
+        least: shortest interval to return [s].
     """
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
@@ -101,15 +96,15 @@ def spans_of(t: Array, happened: Flags, least: float = 0.0) -> Spans:
 
 
 def behind(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """(N,) how far the actual motion is from all that was commanded within the last time `window`.
+    """Return (N,) distance of the actual motion from the range of recent commands.
 
-    A delay gives what was commanded earlier, and a loop that does not overshoot a weighted mean of
-    it: both are in the range of those commands. What is outside it is explained by neither.
+    A delay reproduces earlier commands; a loop without overshoot returns a weighted mean of them.
+    Both stay inside the range of the commands in `window`.
 
     Args:
-        t: (N,) [s], evenly.
+        t: (N,) evenly spaced [s].
         command, actual: (N, k) in one unit.
-        window: [s].
+        window: time before now whose commands count [s].
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _largest_of_last(command, rows)
@@ -118,17 +113,17 @@ def behind(t: Array, command: Array, actual: Array, window: float) -> Array:
 
 
 def turns(x: Array, swing: float) -> NDArray[np.intp]:
-    """Where a signal turns: its extremes, each further than `swing` from the one before.
+    """Return the indices of local extremes that differ by more than `swing` from the previous one.
 
     Args:
         x: (N,).
-        swing: in its unit.
+        swing: in the unit of `x`.
     """
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
     high = low = 0
-    rising = 0  # unknown, until it has gone far enough from its start
+    rising = 0  # 0: unknown
     for k in [*near, len(x) - 1]:
         high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
         if rising >= 0 and x[high] - x[k] > swing:
@@ -141,15 +136,15 @@ def turns(x: Array, swing: float) -> NDArray[np.intp]:
 
 
 def hunts(t: Array, command: Array, actual: Array, swing: float, near: float = NEAR) -> Flags:
-    """(N,) whether the actual motion goes to and fro while the commanded one does not.
+    """Return (N,) whether the actual motion oscillates while the commanded one does not.
 
-    Four turns or more, each within 0.5 s of the one before. A turn that is near one of the command
-    is its answer; but only one for each.
+    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
+    of the command explains one reversal of the motion within `near`.
 
     Args:
         t: (N,) [s].
-        command, actual: (N, k) in one unit; a turn of any component of the command counts.
-        swing: in that unit.
+        command, actual: (N, k) in one unit.
+        swing: smallest amplitude, in that unit.
         near: [s].
     """
     asked = np.sort(np.concatenate([t[turns(x, swing)] for x in command.T]))
@@ -166,7 +161,7 @@ def hunts(t: Array, command: Array, actual: Array, swing: float, near: float = N
 
 
 def _faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
-    """Of the slave; and of the hand what does not come from there."""
+    """Yield slave faults, and operator-side faults that no slave fault explains."""
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -232,7 +227,7 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
             f"the {end}'s end is in its safe state, as nothing comes from the {other},",
             spans_of(t, silent, LASTING),
         )
-    # An end that hears nothing goes by the last packet until `timeout`.
+    # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.lines()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
     far = behind(t, sent[:, 4:], received[:, 4:], window)
@@ -254,7 +249,7 @@ def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
 
 
 def _reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
-    """Where `ledger` lets the slave go slower than the hand, for lack of energy."""
+    """Yield the times when lack of energy in `ledger` makes the slave slower than the hand."""
     if scenario.passivity.method != "ledger" or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
@@ -287,7 +282,7 @@ def _reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str
 
 
 def _ages(t: Array, scenario: Scenario) -> Array:
-    """(N,) how old the newest packet was at the slave's end, for this network is the run's [s]."""
+    """Return (N,) age of the newest packet at the slave's end [s], from the run's network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     line, seed = scenario.channel.lines()[0], scenario.simulation.seed
@@ -324,16 +319,16 @@ def _hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
 
 
 def _sways(t: Array, command: Array, actual: Array, near: float) -> Flags:
-    """(N,) whether a pose (N, 7) hunts, by its place or its orientation."""
+    """Return (N,) whether a pose (N, 7) oscillates in position or orientation."""
     turned, wanted = (_turned(pose, command) for pose in (actual, command))
     swaying = hunts(t, command[:, 4:], actual[:, 4:], _SWING, near)
     return swaying | hunts(t, wanted, turned, _TURN_SWING, near)
 
 
 def _turned(pose: Array, reference: Array) -> Array:
-    """(N, 4) of which a small change is as large as the turn [rad]: twice the quaternion.
+    """Return (N, 4) twice the quaternion: its small changes equal the rotation [rad].
 
-    Its sign is that of the first pose of the reference.
+    The sign is that of the first pose of `reference`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
@@ -347,9 +342,9 @@ def _joint_error(result: SimulationResult) -> Array:
 
 
 def _full_torque(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    """(N,) whether a wrist motor of the device gives its largest torque."""
+    """Return (N,) whether a wrist motor of the device gives its largest torque."""
     full, peak = np.zeros(len(torque), dtype=bool), _AT_LIMIT * device.peak_torque
-    # A motor's torque is the component about its axis: no larger than the torque.
+    # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])
         full[k] = (turned >= peak).any()
@@ -357,7 +352,7 @@ def _full_torque(torque: Array, master_state: Array, device: HapticDevice) -> Fl
 
 
 def _largest_of_last(x: Array, rows: int) -> Array:
-    """(N, k) the largest of the last so many rows, by doubling."""
+    """Return (N, k) running maximum over the last `rows` rows, by doubling."""
     largest, done = x.copy(), 1
     while done < min(rows, len(x)):
         step = min(done, rows - done)

@@ -1,7 +1,7 @@
-"""What a scenario can say, for people and for editors, made from the dataclasses themselves.
+"""Reference, JSON schema and commented YAML of a scenario, generated from the dataclasses.
 
-`reference` is docs/scenario.md, `json_schema` docs/scenario.schema.json (python
-docs/make_reference.py writes both), `commented` what `drake-teleop scenario NAME` prints.
+docs/make_reference.py writes docs/scenario.md (`reference`) and docs/scenario.schema.json
+(`json_schema`); `drake-teleop scenario NAME` prints `commented`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-_COLUMN = 34  # at which the comments of a block begin, if its values leave them that place
+_COLUMN = 34  # column of the comments, unless a value is longer
 
 _HEAD = """\
 # Every field: its value, [what it may be] and what it means. What you leave out has its default.
@@ -51,12 +51,12 @@ and sections are those of the paper; (E) marks an estimate of ours, where the pa
 
 
 def commented(scenario: Scenario) -> str:
-    """The scenario as YAML with every field and its meaning; it loads back to the same scenario."""
+    """Return the scenario as YAML with every field and its meaning."""
     return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
 def _words(value: Any) -> list[str]:
-    """Return all texts in a scenario: what a wrong emitter would change."""
+    """Return all texts in a scenario, which an incorrect YAML writer would change."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
@@ -70,11 +70,11 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
     """Write every field of a scenario to a YAML file, for `LoadScenario`.
 
     Raises:
-        DrakeTeleopError: if the text would be read as another scenario, or cannot be written.
+        DrakeTeleopError: if the file would be read as another scenario, or cannot be written.
     """
     text, where = commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
-    if scenario.master.figures is None:  # which are read from the data sheet then
+    if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
     if found != scenario and _words(found) != _words(scenario):
         raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
@@ -82,18 +82,18 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
 
 
 def reference() -> str:
-    """Markdown with a table for each block: field, default, range and meaning."""
+    """Return Markdown with a table per block: field, default, range and meaning."""
     return _REFERENCE + "".join(_sections(Scenario(), ""))
 
 
 def json_schema() -> str:
-    """The JSON schema of a scenario file, as text."""
+    """Return the JSON schema of a scenario file as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"}
     return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
 
 
 def _takes(entry: FieldInfo) -> str:
-    """What may stand there, for people."""
+    """Return the allowed values as text."""
     words = entry.range if entry.unit or entry.choices else entry.kind
     if entry.lists:
         words = f"{entry.length or 'any number'} of {words}"
@@ -105,7 +105,7 @@ def _comment(entry: FieldInfo) -> str:
 
 
 def _block_lines(config: Any) -> list[str]:
-    """The fields of a block and of what is in it, each on a line, not indented."""
+    """Return the lines of a block and its inner blocks, without indentation."""
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
@@ -123,7 +123,7 @@ def _block_lines(config: Any) -> list[str]:
 
 
 def _inner_lines(entry: FieldInfo) -> list[str]:
-    """A block or a list of blocks; if there is none, all that could be there, behind #."""
+    """Return the lines of inner blocks; blocks that are not set are commented out."""
     if entry.default:
         return _named_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
@@ -133,7 +133,7 @@ def _inner_lines(entry: FieldInfo) -> list[str]:
 
 
 def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
-    """`name:` and, indented, what is in it."""
+    """Return `name:` and the indented contents."""
     if not entry.lists:
         head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
         return [head, *_indented(_block_lines(value))]
@@ -156,7 +156,7 @@ def _out(lines: list[str]) -> list[str]:
 
 
 def _sections(config: Any, path: str) -> Iterator[str]:
-    """The table of a block, then those of the blocks in it."""
+    """Yield the table of a block, then those of its inner blocks."""
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
@@ -173,7 +173,7 @@ def _sections(config: Any, path: str) -> Iterator[str]:
 
 
 def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
-    """Of the sections of the blocks that may stand there."""
+    """Return title and type of the sections of an entry's blocks."""
     several = len(entry.blocks) > 1
     return [
         (f"{path}{entry.name}{f': !{block.__name__}' if several else ''}", block)
@@ -182,7 +182,7 @@ def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
 
 
 def _links(entry: FieldInfo, path: str) -> str:
-    """To these sections, in a table."""
+    """Return links to these sections, for a table cell."""
     several = len(entry.blocks) > 1
     links = [
         f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor(title)})"

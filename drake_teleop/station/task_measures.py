@@ -1,22 +1,19 @@
-"""How well a simulated operator did its task: figures from the log of one run.
+"""Measures of a simulated operator's task, from the log of one run.
 
-============================ ====================================================================
-success                      1 if the operator ended its task, and the truth agrees: the tip is in
-                             the target; the tool touches; the force was held within its tolerance;
-                             the tip is within 2 mm of the slot's floor
-task_time_s                  from the task's start until the operator has done it
-contact_force_overshoot_N    largest contact force at the tool, less the force that was wanted
-effort_Ns                    integral of |force of the hand|: what tires an arm that pushes or holds
-task_work_J                  integral of |power of the hand|: pushing and braking both count
-detection_time_s             from the first contact until the operator answers to it; nan if never
-false_notices                times that contact was noticed before there was one
-press_error_N                root mean square error of the force while it was held; nan if not held
-============================ ====================================================================
+============================ =====================================================================
+success                      1 if the operator finished and the task is achieved: tip in the target;
+                             tool in contact; force in its tolerance; tip within 2 mm of the floor
+task_time_s                  from the task's start until the operator finished
+contact_force_overshoot_N    largest contact force at the tool minus the required force
+effort_Ns                    integral of |force of the hand|
+task_work_J                  integral of |power of the hand|
+detection_time_s             from the first contact to the operator's reaction; nan without one
+false_notices                number of detected contacts before the first contact
+press_error_N                RMS error of the held force; nan if not held
+============================ =====================================================================
 
-All of them are of the time from the task's start until it was done or given up, or the log's end.
-Of a task that failed, also where the operator believes that it is done, there are only the success
-and what was noticed; the others are nan, for little effort in vain is no merit. Why it failed is
-said by `task_failure`.
+The interval ends when the operator finishes or gives up, or with the log. A failed task has only
+success, detection_time_s and false_notices; the others are nan. `task_failure` gives the reason.
 """
 
 from __future__ import annotations
@@ -58,11 +55,11 @@ _DOING = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """The measures above, of one run of a scenario with a task.
+    """Return the measures above for one run.
 
     Args:
-        result: with the signal task_state.
-        scenario: that was run.
+        result: result with the signal task_state.
+        scenario: scenario of the run.
 
     Raises:
         DrakeTeleopError: if the scenario has no task.
@@ -84,7 +81,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
-    # The log may begin later than the task.
+    # The log may start after the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
     success = done and not _wrong(result, scenario, task, ended)
     done_well = {
@@ -105,12 +102,9 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
-    """Why the task failed: out of time, given up, or not as believed; "" if it did not.
+    """Return the reason for failure: timeout, given up, or not achieved; "" after success.
 
-    Times are those of the log.
-
-    Args:
-        result, scenario: as for `task_measures`; the scenario has a task.
+    Times are those of the log. The scenario must have a task.
     """
     task, state, ended = scenario.operator.task, result["task_state"], _ended(result)
     assert task is not None
@@ -140,7 +134,7 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
 
 
 def _ended(result: SimulationResult) -> int:
-    """The sample at which the operator has done its task or given up, or the last one."""
+    """Return the sample at which the operator finishes or gives up, or the last one."""
     outcome = result["task_state"][:, DONE]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
@@ -152,14 +146,14 @@ def _wanted_force(task: Task) -> float:
 
 
 def contact_force(result: SimulationResult) -> Array:
-    """(N,) size of the true contact force at the tool [N]; zeros if there is nothing to touch."""
+    """Return (N,) magnitude of the true contact force at the tool [N]; zeros without contact."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t))
     return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """From the first contact until it is noticed [s]; nan if there is none, or it never is."""
+    """Return the time from first contact to its detection [s]; nan if there is none."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))
@@ -173,12 +167,12 @@ def _false_notices(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> i
 
 
 def _held(t: Array, force: Array, task: Press, ended: int) -> Array:
-    """The true force in the time for which the operator believed to hold it."""
+    """Return the true force during the operator's hold phase."""
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
 def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    """What is not as the operator believes when it believes that it is done; "" if nothing is."""
+    """Return the violated success criterion as text, or ""."""
     force = contact_force(result)
     if isinstance(task, Press):
         held = float(_held(result.t, force, task, ended).mean())
@@ -209,7 +203,7 @@ def _force_and_place(result: SimulationResult, scenario: Scenario, task: Task, e
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
-    """(3,) from the target to the tool's tip, in W [m]."""
+    """Return (3,) vector from the target to the tool's tip, in W [m]."""
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(
