@@ -1,18 +1,13 @@
-"""The wrist sensor in the station: when it samples, and what (long: the step and its block).
+"""The wrist sensor in the station: sampling instants and samples.
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool is V phi of the
-tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that of S.
+The true wrench on the tool is V phi minus the wrench of the environment (Eqs. 1, 2).
 
-The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
-looks back: at each instant in it at which it samples, position and velocity are interpolated
-(Hermite), and the accelerations follow from the dynamics under the torque that the motors had. So
-8 kHz need no events, and what is sampled is exact for the state it belongs to. What the compiled
-law does not know of a tool that it knows otherwise (`Contact.watched`) Drake is asked for where it
-comes near, in a plant of its own (`ContactTwin`). Contact that it does not know at all
-(`Contact.beyond`) Drake tells, for the end of a step alone: then each sample is an event, and ends
-one.
+Sampling needs no events: after each integration step, position and velocity at each sampling
+instant in the step are interpolated (Hermite), and accelerations follow from the dynamics. A tool
+near a shape of `Contact.watched` gets its contact wrench from Drake (`ContactTwin`). With contact
+outside the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -89,22 +84,22 @@ from drake_teleop.station.slave.tool_contact import (
 
 Array = NDArray[np.float64]
 
-#: A part of a period, within which two instants are one.
+#: Tolerance of equal instants, in periods.
 _SAME = 1e-6
-#: Steps of the plant that wait to be sampled, at most.
+#: Largest number of queued steps.
 _LONGEST = 16
-#: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
-#: have to be: rounding is 1e-12, in a stiff contact 1e-9.
+#: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
+#: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
 _CHECK_PERIOD, _ALIKE = 0.1, 1e-6
-#: For so many samples a lost one shows, so that no log misses it.
+#: Samples for which a lost sample stays flagged, so that the log contains the flag.
 _SHOWS = 40
-#: Instead of a wrench that the plant tells, see `sample_step`.
+#: Value of `touching_W` in `sample_step` that selects the compiled contact law.
 _BY_LAW = np.zeros(0)
 
 
 @njit(cache=True)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+    """Write [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
 
     The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
     about the world's origin, in W.
@@ -123,7 +118,7 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 
 @njit(cache=True)
 def _interpolate(h, u, x, xdot, end, end_dot, out):
-    """Hermite: positions from values and two derivatives, velocities from values and one."""
+    """Interpolate by Hermite polynomials: quintic for positions, cubic for velocities."""
     half = x.shape[0] // 2
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -140,7 +135,7 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 @njit(cache=True)
 def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
-    """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
+    """Write one sample of the state x into `memory`, see `sample_step`."""
     arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
     half = x.shape[0] // 2
@@ -153,7 +148,7 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = BEFORE_JOINTS + n
     sample = memory[:size]
     put(memory, size, memory, 0, size)
-    if not believable(constants, truth):  # filters would remember it for long
+    if not believable(constants, truth):  # keeps it out of the filters
         sample[SATURATED] = LOST + _SHOWS
         return
     lost = sample[SATURATED] - 1.0
@@ -171,7 +166,7 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 @njit(cache=True)
 def remember_step(tail, time, state, around):
-    """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
+    """Append the end of a step to the queue of `sample_step`, see its `memory`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
@@ -181,7 +176,7 @@ def remember_step(tail, time, state, around):
 
 @njit(cache=True, borrows=True)
 def _postpone(memory, tail, longest, time, state, around):
-    """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
+    """Append the end of a step to the queue in `memory`; return whether there was room."""
     if memory[tail + 1] >= longest:
         return False
     remember_step(memory[tail:], time, state, around)
@@ -190,7 +185,7 @@ def _postpone(memory, tail, longest, time, state, around):
 
 @njit(cache=True)
 def _torque_at(held, after, torque):
-    """The motors' torque (n,) `after` now [s]; `held` as of `sample_step`."""
+    """Write the motors' torque (n,) at `after` from now [s]; `held` as in `sample_step`."""
     put(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -201,30 +196,29 @@ def sample_step(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
-    """Takes the samples that have become due in the steps since the last call.
+    """Take the samples due in the steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity; joints of what else moves, wrenches that are told).
-        sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
+            acceleration by gravity; joints of other moving bodies, wrenches from Drake).
+        sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
             ideal).
         period: of the sensor [s].
         time: now [s], the end of a step.
         state: (2 n,) [q; v] now.
-        around: [the sheet's deflection and its rate, the plant's state if anything else moves] now.
-        held: torque (n,) now, of these steps' motors [N m], and at which rate it changed in them;
-            (0,) if it was held.
+        around: [deflection and rate of the sheet, plant's state if other bodies move] now.
+        held: motor torque (n,) now [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,), see `environment_wrench`.
         noise: for the chain.
         memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
             samples taken, length of the queue, time and x of each step's end in it].
-        until_now: whether the sample that may be due this very instant is taken.
-        touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
-            origin, in W, or (0,), as `physics` says. A stiff contact multiplies the last digit of
-            a position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
-        scratch: (9, 2 n + 6 + size of the plant's state), whatever it holds.
-        result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
-            queue now's end alone].
+        until_now: whether to take a sample that is due now.
+        touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
+            in W; or (0,) to calculate it with `physics`. The plant's own penetration avoids
+            rounding errors of stiff contacts.
+        scratch: (9, 2 n + 6 + size of the plant's state).
+        result: output: [last sample before now (16 + n) | its time [s] | memory with now's end as
+            the only queue entry].
     """
     n = state.shape[0] // 2
     size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
@@ -240,7 +234,7 @@ def sample_step(
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     joined(state, around, now)
-    put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
+    put(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _torque_at(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
@@ -275,7 +269,7 @@ def sample_step(
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
             _take(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
-    # A step that is all rounding may have ended a little before, and have taken this sample.
+    # A step of rounding length may have ended just before and have taken this sample.
     taken = (count - 1.0 + _SAME) * period > time
     put(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
@@ -287,7 +281,7 @@ def sample_step(
 
 
 class WristSensor(LeafSystem):
-    """Samples force, torque, motion of S and joint angles at the sensor's rate.
+    """Sensor of force, torque, motion of S and joint angles at its own rate.
 
     .. pydrake_system::
 
@@ -295,30 +289,30 @@ class WristSensor(LeafSystem):
         input_ports:
         - slave_state: [q; v] of the arm
         - joint_torque: (n,) of the motors now [N m]
-        - torque_rate: (n,) at which it changes [N m/s] (only with `ramps`)
-        - slave_acceleration: vdot of the arm, to see that nothing else moves it
+        - torque_rate: (n,) its rate of change [N m/s] (only with `ramps`)
+        - slave_acceleration: vdot of the arm, to detect unknown forces
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
-        - plant_state: [q; v] of the whole plant (only if anything else moves)
-        - contact_results: the plant's (only with something to touch)
+        - plant_state: [q; v] of the whole plant (only if other bodies move)
+        - contact_results: the plant's (only with surroundings)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
-        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
+        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | when it was
-          taken [s] | memory]
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | its time [s] |
+          memory]
 
     Args:
-        slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
+        slave: the plant; source of the tool's true inertial parameters and contact shapes.
         config: the sensor.
-        motion: how the motion of S is estimated from its readings.
+        motion: estimation of the motion of S.
         period: sampling period [s].
-        held: for how long the motors hold a torque, or its rate [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-        ramps: whether they hold a rate.
+        held: duration for which the motors hold a torque, or its rate [s].
+        q_start: (n,) joint angles at rest before the first sample [rad].
+        ramps: whether the motors hold a rate.
 
     Raises:
-        DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
-            told of: its samples would be wrong.
+        DrakeTeleopError: during simulation, if a force that the sensor does not receive moves the
+            arm, because its samples would be wrong.
     """
 
     __slots__ = ONE_DICT
@@ -344,9 +338,9 @@ class WristSensor(LeafSystem):
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[WRENCH] += config.offset
-        # Contact takes many steps for one torque, and to work off the queue takes longer than them.
+        # Contact needs many steps per torque sample, so queueing them saves time.
         self._beyond = contact.beyond
-        # To ask the plant takes as long as two samples. Noise is 1e9 times what that would tell.
+        # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
         self._exact = config.ideal or bool(contact.beyond)
         self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
@@ -354,7 +348,7 @@ class WristSensor(LeafSystem):
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
-        # Neither plant nor indices in it, which would hold the Diagram that holds this.
+        # No reference to the plant: it would be a cycle with the Diagram that owns this block.
         self._watched, self._moving, self._plant_size = (
             contact.watched,
             tuple(contact.moving),
@@ -389,9 +383,9 @@ class WristSensor(LeafSystem):
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
-        self._remains = slice(len(first) + 1, None)  # of a step: the memory
+        self._remains = slice(len(first) + 1, None)  # memory in the output
         self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
-        # Not the acceleration: whatever changes in the plant would be passed on twice.
+        # Without the acceleration: each change in the plant would invalidate twice.
         pushes = (self._torque, self._rate, self._applied)
         around = (self._sheet, self._plant, self._contacts)
         seen = (self._state, *pushes, *around, self._noise)
@@ -408,35 +402,35 @@ class WristSensor(LeafSystem):
 
     @property
     def offset(self) -> Array:
-        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        """(6,) offset of force and torque [N, N m]; a view that may be changed during a run."""
         return self._offset
 
     @property
     def phi(self) -> Array:
-        """(10,) of what hangs on the sensor, a view: something may be grasped in a simulation."""
+        """(10,) inertial parameters of the tool; a view that may be changed during a run."""
         return self._physics[1]
 
     @property
     def contact_pairs(self) -> Array:
-        """(k, 28) what may touch, see `Pairs`, a view."""
+        """(k, 28) contact pairs, see `Pairs`; a view."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
-        """What its own contact law does not know, see `Contact`."""
+        """Contact outside the compiled contact law, see `Contact`."""
         return self._beyond
 
     @property
     def moves(self) -> str:
-        """What of the surroundings moves besides a leaf, as a sentence, or nothing."""
+        """Moving bodies of the surroundings besides a leaf, as a sentence, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Where in the discrete state stands what the motion has left there.
+        """Indices of the discrete state that depend on the motion.
 
-        Not counters and flags, nor random walks, nor the sample before the last one.
+        Counters, flags, random walks and the sample before the last one are excluded.
         """
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
@@ -445,15 +439,15 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Takes the samples before now, for who wants to see the state that results."""
+        """Take the samples before now and store the resulting discrete state."""
         seen = self._seen(context)
         self._sample(context, seen, self._near(*seen), False, _BY_LAW, self._result)
         context.SetDiscreteState(self._result[self._remains])
 
     def bring_up_to_date(self, context: Context) -> None:
-        """Makes now the end of the last step, with the samples before now taken.
+        """Reset the sample queue to the current time.
 
-        For who sets states by hand: as if the simulation had arrived here.
+        Call this after setting states manually.
         """
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
@@ -461,11 +455,11 @@ class WristSensor(LeafSystem):
         remember_step(tail, time, *self._seen(context))
 
     def _seen(self, context: Context) -> tuple[Array, Array]:
-        """[q; v] of the arm, and `_surroundings`."""
+        """Return [q; v] of the arm, and `_surroundings`."""
         return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
-        """[Deflection, rate] of the leaf, or [0, 0, the plant's state]."""
+        """Return [deflection, rate] of the leaf, or [0, 0, the plant's state]."""
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
         return self._around if self._sheet is None else self._sheet.Eval(context)
@@ -474,7 +468,7 @@ class WristSensor(LeafSystem):
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
 
     def _near(self, state: Array, around: Array) -> int:
-        """See `nearness`."""
+        """Return the level of `nearness`."""
         if self._contacts is None:
             return FAR
         if self._beyond:
@@ -488,7 +482,7 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _touching_So_W(self, context: Context) -> Array:
-        """What contacts exert on the tool, about So, as what is applied to it."""
+        """Return the contact wrench on the tool about So, in W."""
         wrench_W = self._touching_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
@@ -531,7 +525,7 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        """`sample_step`, with Drake's contact at each instant if the tool is watched."""
+        """Call `sample_step`, with Drake's contact at each instant near monitored shapes."""
         inputs = self._inputs(context, seen)
         if near != WATCHED:
             sample_step(*inputs, until_now, touching_W, self._scratch, result)
@@ -542,7 +536,7 @@ class WristSensor(LeafSystem):
         size = own + self._plant_size
         told = np.zeros((1 + self._most_told, 2 + size))
         physics = (*self._physics[:-1], told)
-        # The state of each wrench that is asked for follows from those before.
+        # The state of each requested wrench depends on the previous wrenches.
         for k in range(self._most_told):
             told[0, :2] = k, 0.0
             sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
@@ -561,8 +555,8 @@ class WristSensor(LeafSystem):
         discrete_state.set_value(0, self._step.Eval(context)[self._remains])
 
     def _is_due(self, time: float) -> bool:
-        """Whether now the torque may change, or the noise."""
-        # Written out, because in contact it is asked at every step.
+        """Return whether the torque or the noise may change now."""
+        # Inline for speed: called at every step in contact.
         margin, (held, block) = _SAME * self._period, self._holds
         if abs(time - held * round(time / held)) < margin:
             return True
@@ -573,7 +567,7 @@ class WristSensor(LeafSystem):
         state, around = self._seen(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         joined(state, around, x)
-        if not np.isfinite(x).all():  # nothing is known; the samples say so
+        if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
@@ -592,7 +586,7 @@ class WristSensor(LeafSystem):
 
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
-    """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
+    """Return the true sample (16 + n,) of the arm at rest at q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
     touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
     true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
@@ -611,22 +605,16 @@ def AddWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Adds "wrist_sensor" and its noise, and what divides its port, for Drake numbers the parts.
+    """Add "wrist_sensor", its noise, and demultiplexers of its port.
 
-    What remains to be connected is the state, the acceleration and the torque of the arm.
+    State, acceleration and torque of the arm remain to be connected.
 
     Args:
-        builder: the diagram that holds the plant.
-        slave: the plant.
-        config: the sensor.
-        motion: how the motion of S is estimated.
-        period: sampling period [s].
-        held: for how long the motors hold a torque, or its rate [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-        ramps: whether they hold a rate.
+        builder: diagram that contains the plant.
+        slave, config, motion, period, held, q_start, ramps: as for `WristSensor`.
 
     Returns:
-        The ports by name: "sample", with each of its parts, see `sample_parts`, and "sample_time".
+        The ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
