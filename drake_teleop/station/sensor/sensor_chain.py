@@ -311,7 +311,7 @@ def calibration_matrices(
     """Return the calibration matrices: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
 
     (1 + gains + cross-talk) times the rotation of the misalignment. Gains and cross-talk are
-    uniform within their bounds; the rotation axis is random. The drawn numbers depend only on `unit`.
+    uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
     """
     random = np.random.default_rng(config.unit)
     gains, talk, axis = (
