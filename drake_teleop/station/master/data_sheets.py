@@ -1,8 +1,7 @@
-"""Haptic devices by name: the Phantom of the paper, and others by what their data sheets say.
+"""Haptic devices by name: the paper's Phantom, and others by data sheets.
 
-How sure each number is: D the manufacturer's figure, recalled and not read again; E an engineering
-estimate. A workspace of another form is the largest box inside it: of an omega a cylinder of 160 mm
-across and 110 mm, of a Virtuose a ball of 450 mm across, D.
+D: the manufacturer's value from memory; E: estimate. The workspace is the largest box in the real
+one: in a cylinder of 160 x 110 mm (omega) or a ball of 450 mm (Virtuose), D.
 
 | name | mass at the grip | friction | peak force | workspace, depth x width x height |
 |---|---|---|---|---|
@@ -12,7 +11,7 @@ across and 110 mm, of a Virtuose a ball of 450 mm across, D.
 | haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
 | virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
 
-| name | step of position | of the turns | own rate |
+| name | position step | rotation step | device rate |
 |---|---|---|---|
 | geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
 | omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
@@ -20,8 +19,8 @@ across and 110 mm, of a Virtuose a ball of 450 mm across, D.
 | haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
 | virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
 
-Of them only the Virtuose displays torque (3.1 N m D); an omega.3 and a Falcon do not turn. The
-omega.7's gripper and the buttons of all are left out.
+Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate. Gripper and buttons
+are not modelled.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -78,7 +77,7 @@ class JointFriction:
 @settings
 @dataclass
 class DeviceFigures:
-    """A device by its data sheet, see `task_space`; x of its base points to the operator, z up."""
+    """Data sheet of a device, see `task_space`; x of its base points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "that the hand moves with the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "likewise, about every axis")
@@ -121,7 +120,7 @@ _OMEGA = [0.11, 0.113, 0.113]
 _OMEGA_TURN = np.radians([120.0, 70.0, 160.0]).tolist()  # D
 _OMEGA_READ = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
 
-#: What the devices by name have, for `Master.figures`.
+#: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
     "geomagic_touch": _sheet(
         0.045,
@@ -163,7 +162,7 @@ FIGURES: dict[str, DeviceFigures] = {
 @settings
 @dataclass
 class Master:
-    """Which haptic device, and where it starts."""
+    """Haptic device and its start position."""
 
     model: str = choice(
         PHANTOM,
@@ -178,7 +177,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """The device with a hand on it.
+        """Return the device with the hand's passive mass.
 
         Args:
             hand_mass: [kg], moves with the stylus.
@@ -207,14 +206,14 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """Whether it is a leader that leads joint by joint."""
+        """Whether a leader arm commands the slave's joints one by one."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_leads_the_pose(self, what: str) -> None:
-        """Refuses a leader that leads joint by joint.
+        """Reject a leader arm in joint mode.
 
         Raises:
-            DrakeTeleopError: if it does, for what knows poses alone.
+            DrakeTeleopError: in joint mode; `what` names the caller, which supports poses only.
         """
         if self.leads_joints:
             raise DrakeTeleopError(
@@ -224,19 +223,19 @@ class Master:
             )
 
     def steps(self) -> NDArray[np.float64]:
-        """(6,) in which its axes are read [m, rad]; 0 if exactly."""
+        """Return (6,) encoder steps of the axes [m, rad]; 0 for exact reading."""
         if self.model in (PHANTOM, LEADER):
             return np.zeros(6)
         figures = self._figures()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def own_period(self, hand_hz: float) -> float | None:
-        """Of a device that is slower than the rate of the hand [s]; None of any other."""
+        """Return the sampling period of a device slower than `hand_hz` [s], else None."""
         rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """The same, linear: its encoders have no steps either."""
+        """Return a linear copy: no Coulomb friction, no encoder steps."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -248,7 +247,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """The same with its file found from a folder."""
+        """Return a copy whose file path is relative to `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -257,10 +256,10 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Checks what belongs to which device.
+        """Check combinations of fields.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
@@ -300,8 +299,8 @@ _STEEPEST = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """The defaults for a scenario's `master.figures`: those of the model that it names.
+    """Return the defaults for a scenario's `master.figures`, from its model.
 
-    A name that is not known is left to the check of the loaded block.
+    The check of the loaded block rejects unknown names.
     """
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

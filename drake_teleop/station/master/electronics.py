@@ -1,8 +1,7 @@
-"""What lies between a haptic device and the station: encoders with steps, and a rate of its own.
+"""Encoders with finite steps, and the sampling rate of a device.
 
-The hand feels the device itself; what the station reads of it is in steps of the encoders, counted
-from the start. A device that is slower than `rates.hand_hz` is read, and takes a force, at its own
-rate: both are held in between, and `force_to_master` is the force as it is held.
+Encoder steps count from the start and affect only the station's readings. A device slower than
+`rates.hand_hz` holds its reading and its force; `force_to_master` is the held force.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def read_pose_into(q, q_start, steps, device, pose):
-    """Writes X_BE (7,) as encoders read it: q (6,) to whole `steps` (6,) from `q_start` (6,)."""
+    """Write X_BE (7,) for q (6,) rounded to whole `steps` (6,) from `q_start` (6,)."""
     read = np.empty(6)
     for i in range(6):
         away = q[i] - q_start[i]
@@ -27,7 +26,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """The pose that the device's encoders read.
+    """Pose as read by the device's encoders.
 
     .. pydrake_system::
 
@@ -38,9 +37,9 @@ class Encoders(LeafSystem):
         - pose_read: (7,) X_BE
 
     Args:
-        device: whose kinematics it is.
-        q_start: (6,) from where it counts.
-        steps: (6,) of its axes [m, rad]; 0 for one that is read exactly.
+        device: source of the kinematics.
+        q_start: (6,) origin of the steps.
+        steps: (6,) of its axes [m, rad]; 0 for exact reading.
     """
 
     __slots__ = ONE_DICT
@@ -60,7 +59,7 @@ class Encoders(LeafSystem):
 
 
 class Held(LeafSystem):
-    """A vector that is looked at with a rate of its own. Unlike Drake's hold it has a start.
+    """Sample and hold of a vector; unlike Drake's ZeroOrderHold it has a start value.
 
     .. pydrake_system::
 
@@ -68,11 +67,11 @@ class Held(LeafSystem):
         input_ports:
         - value: (n,)
         output_ports:
-        - held: (n,) as it was at the last look
+        - held: (n,) at the last sample
 
     Args:
-        period: from one look to the next [s].
-        start: (n,) before the first.
+        period: [s].
+        start: (n,) before the first sample.
     """
 
     __slots__ = ONE_DICT

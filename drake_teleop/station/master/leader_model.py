@@ -1,4 +1,4 @@
-"""A leader arm out of its file: whatever the slave's arm may be read from."""
+"""A leader arm from a model file, in the formats of the slave's arm."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -41,7 +41,7 @@ JOINTS = "joints"
 @settings
 @dataclass
 class Leader:
-    """An arm that the hand leads; it stands so that E is at `position` when it is at home."""
+    """Arm that the operator moves; its base is placed so that E is at `position` at home."""
 
     file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
     package_paths: list[str] = plain(
@@ -73,10 +73,10 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Checks what needs no file.
+        """Check the fields without reading the file.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
@@ -92,7 +92,7 @@ class Leader:
                 )
 
     def found_from(self, folder: Path) -> "Leader":
-        """The same with its files found from a folder, wherever the program runs."""
+        """Return a copy with absolute paths, relative to `folder`."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -100,7 +100,7 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Adds the arm to a plant, with its base at the origin of B, which stands at X_Table.
+        """Add the arm to a plant, with its base at the origin of B; X_Table is the pose of B.
 
         Raises:
             DrakeTeleopError: if it cannot be read, see `ParseModel`.
@@ -111,15 +111,15 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """The arm with a hand on it.
+        """Return the arm with the hand's passive mass.
 
         Args:
             position: (3,) p_BE at home [m].
-            hand_mass, hand_inertia: as of `Master.device`.
+            hand_mass, hand_inertia: as for `Master.device`.
 
         Raises:
-            DrakeTeleopError: if it cannot be read, is no chain of joints, or a list has not as many
-                numbers as it has joints.
+            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
+                length of a list differs from the number of joints.
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)
@@ -149,7 +149,7 @@ class Leader:
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
     def _of_all(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        """(n,) of a list with a number for each joint, or one for all (not of home), or none."""
+        """Return (n,) values of a list with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
@@ -161,12 +161,12 @@ class Leader:
 
 
 def _at_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
-    """The arm to E in place of the hand's frame, standing where p_BE (3,) is E at home."""
+    """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
     table[0, TRANSLATION:PHI] += p_BE - p
-    # R at home turns the hand's frame into B: E has B's axes there.
+    # R rotates the hand's frame into B, so that E has B's axes at home.
     R_LS = table[n, ROTATION:TRANSLATION].reshape(3, 3)
     table[n, ROTATION:TRANSLATION] = (R_LS @ R.T).ravel()
     phi, upper = table[n, PHI:ROTOR], np.triu_indices(3)

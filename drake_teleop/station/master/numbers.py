@@ -1,4 +1,4 @@
-"""The numbers of a haptic device in one vector, for compiled code: a place and a name for each."""
+"""Parameters of a haptic device in one vector for compiled code, with named indices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PEAK_FORCE = _places.number()  #: of the wrench that is displayed [N]
 PEAK_TORQUE = _places.vector(3)  #: of the three turning axes [N m]; 0: not actuated
 IN_TASK_SPACE = _places.number()  #: 1 for a device of `task_space`, 0 for the Phantom
 # Only in task space:
-MASS = _places.number()  #: that the hand feels [kg]
+MASS = _places.number()  #: apparent mass at the grip [kg]
 INERTIA = _places.number()  #: likewise, about every axis [kg m^2]
 CENTRE = _places.vector(3)  #: of the workspace, p_B [m]
 HALF_SIZE = _places.vector(3)  #: of the workspace [m]

@@ -1,15 +1,10 @@
-"""A haptic device by its data sheet: what the hand feels of it at the grip, not how it is built.
-
-Six axes, as of a gantry with a wrist on it: three slide along x, y and z of B, three turn through
-one point E. With all turns at zero R_BE is the identity.
+"""A haptic device by its data sheet, as seen at the grip.
 
     q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 
-The device is a mass and an inertia that are the same in every direction (`apparent_mass`,
-`inertia`), Coulomb friction and damping against the grip's velocity and angular velocity, end stops
-at the workspace's faces and the turns' ends, and its weight is balanced. So a data sheet gives it,
-and so it is for a delta or a counterbalanced arm in the middle of its workspace: there the mass
-of a Phantom changes by a third from one direction to another, which this leaves out.
+Isotropic mass and inertia (`apparent_mass`, `inertia`), Coulomb friction and damping against linear
+and angular velocity, end stops at the faces of the workspace, balanced weight. This approximates a
+delta or counterbalanced arm in the middle of its workspace.
 """
 
 from __future__ import annotations
@@ -36,16 +31,16 @@ from drake_teleop.station.master.numbers import (
     VISCOUS,
 )
 
-# Coulomb friction is tanh(speed / this): below it the device creeps instead of sticking.
+# Coulomb friction is tanh(speed / this), so the device creeps below it.
 SLIDING_SPEED, TURNING_SPEED = 0.002, 0.01  # m/s, rad/s, E
-# End stops, a spring and a damper that never pulls back, E.
+# End stops: spring and damper that never pull, E.
 _STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
 _TURN_STIFFNESS, _TURN_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
     s4, c4 = math.sin(q[3]), math.cos(q[3])
     s5, c5 = math.sin(q[4]), math.cos(q[4])
     J[:, :] = 0.0
@@ -56,7 +51,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
-    """Writes the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
+    """Write the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
     M[:, :] = 0.0
     inertia = device[INERTIA] + device[HAND_INERTIA]
     for i in range(3):
@@ -68,7 +63,7 @@ def mass_matrix_into(q, J, device, M):
 
 @njit(cache=True)
 def _against(motion, coulomb, viscous, speed_of_tanh):
-    """The factor of a velocity in the friction against it."""
+    """Return the ratio of friction to velocity."""
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / speed_of_tanh
@@ -77,7 +72,7 @@ def _against(motion, coulomb, viscous, speed_of_tanh):
 
 @njit(cache=True)
 def _stop(beyond, rate, stiffness, damping):
-    """Of an end stop that is passed by `beyond`, of either sign, at `rate`: never pulls back."""
+    """Return the force of an end stop at penetration `beyond` (either sign); it never pulls."""
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
     if beyond < 0.0:
@@ -92,7 +87,7 @@ def _beyond(x, half):
 
 @njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
-    """Forward dynamics of device and hand; arguments as of `phantom.acceleration_into`."""
+    """Write accelerations of device and hand; arguments as `phantom.acceleration_into`."""
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS] + device[HAND_MASS]
@@ -102,7 +97,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         stop = _stop(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
-    # Of the turns: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
+    # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
     inertia = device[INERTIA] + device[HAND_INERTIA]
     omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
     for k in range(4, 6):
@@ -110,7 +105,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
     drag = _against(omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], TURNING_SPEED)
-    # Joint torques: of motors and stops, then of what acts about B's axes.
+    # Joint torques of motors and stops, then of moments about B's axes.
     pushed = np.empty(3)
     for i in range(3):
         beyond = _beyond(q[3 + i], device[TURN][i])
@@ -118,7 +113,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
             pushed[i] += J[3 + k, 3 + i] * about
-    # J^T J of the turns is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
+    # J^T J of the rotational axes is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
     s5 = math.sin(q[4])
     of_two = 1.0 - s5 * s5
     vdot[3] = (pushed[0] + s5 * pushed[2]) / (of_two * inertia)
@@ -128,7 +123,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]; even the signs are continuous in q."""
+    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz], with a sign continuous in q."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
@@ -144,7 +139,7 @@ def pose_into(q, pose):
 def damping_matrix(
     q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
 ) -> NDArray[np.float64]:
-    """(6, 6) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
+    """Return (6, 6) joint forces against dq/dt, as `HapticDevice.damping_matrix`."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([SLIDING_SPEED, TURNING_SPEED])
@@ -155,7 +150,7 @@ def damping_matrix(
 def inverse_kinematics(
     pose: NDArray[np.float64], device: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The axes q (6,) that put the grip at X_BE (7,).
+    """Return the axes q (6,) with the grip at X_BE (7,).
 
     Raises:
         DrakeTeleopError: if the pose is outside the workspace.
@@ -170,23 +165,23 @@ def inverse_kinematics(
 def _beyond_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    """(..., 6) which axes of q are beyond the workspace by more than a margin [m, rad]."""
+    """Return (..., 6) axes of q outside the workspace by more than a margin [m, rad]."""
     centre = np.append(device[CENTRE], np.zeros(3))
     return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
 
 
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether an end stop holds at q (N, 6); an axis that does not turn has none."""
+    """Return (N,) whether an end stop is active at q (N, 6); fixed rotations have none."""
     return (_beyond_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1
     )
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    """Checks that the axes q (6,) are within the workspace.
+    """Check that the axes q (6,) are within the workspace.
 
     Raises:
-        DrakeTeleopError: if they are not.
+        DrakeTeleopError: if they are outside.
     """
     if _beyond_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
