@@ -1,4 +1,4 @@
-"""What an operator intends, given from outside."""
+"""Check of an externally commanded intent."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from drake_teleop.common.compiled import njit
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Writes a pose (7,) with a quaternion of length 1; whether it is one, and all is finite.
+    """Write a pose (7,) with unit quaternion; return whether all inputs are valid and finite.
 
     Args:
         pose: (7,) X_BE.
         twist: (6,) of it.
-        out: (7,) written.
+        out: (7,) output.
     """
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
     for k in range(7):
-        rest += pose[k] - pose[k]  # not a number unless it is finite
+        rest += pose[k] - pose[k]  # NaN unless it is finite
     for k in range(6):
         rest += twist[k] - twist[k]
     if not (rest == 0.0 and 0.0 < square < math.inf):
