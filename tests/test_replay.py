@@ -173,12 +173,12 @@ def test_all_logs_of_a_folder_are_replayed(tmp_path, scenario, result, monkeypat
     summary = replay_command(tmp_path, tmp_path / "out", quiet=True)
     films = [tmp_path / "out" / "a.html", tmp_path / "out" / "b.html"]
     assert [entry["film"] for entry in summary["films"]] == [str(film) for film in films]
-    with pytest.raises(DrakeTeleopError, match="does not say of which scenario it is; give --sc"):
+    with pytest.raises(DrakeTeleopError, match="has no scenario beside it; give --sc"):
         replay_command(tmp_path / "logs" / "without_scenario.parquet", tmp_path / "out")
 
 
 def test_what_holds_no_run_is_said(tmp_path, scenario, result):
-    with pytest.raises(DrakeTeleopError, match=r"holds no log of a run; give .* a study keeps"):
+    with pytest.raises(DrakeTeleopError, match=r"contains no log of a run; give .* a study"):
         replay_command(tmp_path, tmp_path)
     wrench = SimulationResult(
         result.t,

@@ -15,7 +15,13 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.run_warnings import behind, hunts, run_warnings, spans_of, turns
+from drake_teleop.station.run_warnings import (
+    find_reversals,
+    find_spans,
+    lag_beyond_delay,
+    oscillates,
+    run_warnings,
+)
 from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
@@ -79,21 +85,22 @@ PLANTED = [
     ("ik_status", (0, 3.0 * during(1, 2)), "OUT_OF_REACH from 1.000 to 2.000 s"),
     ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
     ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
-    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "most that it can from 1.000"),
+    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "its largest force or torque from 1.000"),
     ("master_state", (1, 2.1 * during(1, 2)), "at the end of its workspace from 1.000 to 2.000 s"),
-    ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, as nothing comes from"
-     " the slave, from 1.000 to 2.000 s"),
+    ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, no packets arrive"
+     " from the slave, from 1.000 to 2.000 s"),
     ("ports", (5, np.where(during(1, 2), np.inf, 0)), "slave's end is in its safe state"),
     # It stays 4 cm behind: more than is explained from 0.5 s + half of the movement + delay on.
-    ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) holds"
-     " the slave's command back: up to 40.0 mm more than its delay explains, from 0.9"),
+    ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) delays"
+     " the slave's command: up to 40.0 mm more than its delay explains, from 0.9"),
     ("pose_received", (3, 0.1 * during(2, 2.5)), "11.5 degrees more"),
     ("slave_state", (5, 0.01 * during(1, 1.5)), "joint 6 is up to 0.6 degrees behind"),
-    ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave hunts"),
-    ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand hunts"),
-    ("pose_master", (1, 0.005 * np.sin(190 * T) * during(2, 3)), "the hand hunts: it is shaken to"
-     " and fro from 2.0"),
-    ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "lets the slave hunt"),
+    ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave oscillates"),
+    ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand oscillates"),
+    ("pose_master", (1, 0.005 * np.sin(190 * T) * during(2, 3)), "the hand oscillates while its"
+     " intent does not, from 2.0"),
+    ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "makes the slave's command"
+     " oscillate"),
 ]  # fmt: skip
 
 
@@ -136,8 +143,8 @@ def test_a_ledger_says_that_its_reserve_holds_the_slave_back_and_what_would_pay(
     slower = {"pose_received": (6, -held)}
     found = [x for x in run_warnings(recorded(**slower), scenario, ARM) if "reserve" in x]
     (warning,) = found
-    assert warning.startswith("the ledger's reserve lets the slave go at 0.091 m/s, and the hand")
-    assert "wants up to 0.16: " in warning
+    assert warning.startswith("the ledger's reserve limits the slave to 0.091 m/s, and the hand")
+    assert "moves at up to 0.16: " in warning
     # What it was told within the last 50 ms is no further away than this.
     far = float(warning.split("command is up to ")[1].split(" mm")[0])
     assert 0.0 < 1e3 * np.abs(held).max() - far < 50 * 0.164
@@ -159,14 +166,14 @@ def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():
             recorded(force_to_master=full, master_state=posture), OVER_NETWORK, ARM
         )
         assert len(found) == warnings
-        assert all("the device displays the most that it can from 1.000" in x for x in found)
+        assert all("the device displays its largest force or torque from 1.000" in x for x in found)
 
 
 def test_spans_close_gaps_and_leave_out_what_is_short():
     happened = during(0.5, 0.6) | during(0.62, 1.0) | during(2.0, 2.1)
-    assert spans_of(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
-    assert spans_of(T, happened, 0.2) == [(0.5, 1.0)]
-    assert spans_of(T, 0 * T > 1) == []
+    assert find_spans(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
+    assert find_spans(T, happened, 0.2) == [(0.5, 1.0)]
+    assert find_spans(T, 0 * T > 1) == []
 
 
 def test_many_times_are_counted():
@@ -192,32 +199,32 @@ def test_behind_is_what_neither_delay_nor_a_low_pass_explains(delay):
     command = np.column_stack([np.sin(5 * T), np.cos(3 * T)])
     late = np.column_stack([np.sin(5 * (T - delay)), np.cos(3 * (T - delay))])
     late[delay > T] = command[0]
-    assert behind(T, command, late, 0.3 + 1e-9).max() < 1e-9
+    assert lag_beyond_delay(T, command, late, 0.3 + 1e-9).max() < 1e-9
     slow = command.copy()
     for k in range(1, len(T)):
         slow[k] = slow[k - 1] + 0.001 / 0.05 * (command[k - 1] - slow[k - 1])
-    assert behind(T, command, slow, 0.3).max() < 2 * np.exp(-6)
+    assert lag_beyond_delay(T, command, slow, 0.3).max() < 2 * np.exp(-6)
     step = np.where(T > 1.0 + 1e-9, 1.0, 0.0)[:, np.newaxis] * [3.0, 4.0]
-    found = behind(T, step, 0 * step, 0.2)
+    found = lag_beyond_delay(T, step, 0 * step, 0.2)
     np.testing.assert_allclose(found, np.where(T > 1.2 + 1e-9, 5.0, 0.0))
 
 
 def test_turns_are_extremes_that_go_far_enough():
     x = np.sin(2 * np.pi * T) + 0.01 * np.sin(2 * np.pi * 50 * T)
-    np.testing.assert_allclose(T[turns(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
-    assert len(turns(x, 0.005)) > 50
-    assert len(turns(np.zeros(10), 0.1)) == len(turns(T, 0.1)) == 0
+    np.testing.assert_allclose(T[find_reversals(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
+    assert len(find_reversals(x, 0.005)) > 50
+    assert len(find_reversals(np.zeros(10), 0.1)) == len(find_reversals(T, 0.1)) == 0
 
 
 def test_who_follows_to_and_fro_does_not_hunt():
     command = 0.066 * np.sin(2 * np.pi * 2.63 * T)[:, np.newaxis]
     follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
-    assert not hunts(T, command, follows, 5e-4).any()
-    assert hunts(T, 0 * command, follows, 5e-4).mean() > 0.8
+    assert not oscillates(T, command, follows, 5e-4).any()
+    assert oscillates(T, 0 * command, follows, 5e-4).mean() > 0.8
     slow = 0.02 * np.sin(2 * np.pi * 2 * T)[:, np.newaxis]
     shaken = slow.copy()
     shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
-    found = T[hunts(T, slow, shaken, 5e-4)]
+    found = T[oscillates(T, slow, shaken, 5e-4)]
     assert 0.95 < found[0] < 1.1
     assert 1.9 < found[-1] < 2.05
     assert len(found) > 800

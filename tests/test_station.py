@@ -422,7 +422,7 @@ def test_eliminating_a_load_that_nobody_identified_is_refused():
     MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
     MakeTeleopStation(Scenario())
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
-    with pytest.raises(DrakeTeleopError, match=r"detected, but the load is not known"):
+    with pytest.raises(DrakeTeleopError, match=r"contact detection needs a load estimate"):
         MakeTeleopStation(seen)
 
 

@@ -122,16 +122,16 @@ FAILURES = {
     # It gives up.
     f"at 3.00 s, after the 2.5 s of its timeout, while pressing, {FAR}, 6.0 N at the tool instead"
     " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PRESSING}),
-    f"at 3.00 s, for it saw the tool far beyond the surface and felt nothing, {FAR}, 0.0 N": (
+    f"at 3.00 s: it saw the tool far beyond the surface and detected no contact, {FAR}, 0.0 N": (
         Touch(**AT),
         {"done": -1.0, "phase": FEELING, "force": 0.0},
     ),
     # The log ends before.
-    f"after 3.50 s of the task, while the operator was seeking the way into the slot, {FAR}": (
+    f"after 3.50 s of the task, while the operator was searching for the slot, {FAR}": (
         Insert(**AT),
         {"done": 0.0, "phase": SEEKING},
     ),
-    f"on its way to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
+    f"moving to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
     "begins at 7 s, when the simulation has ended": (
         Reach(t_start=7.0),
         {"done": 0.0, "phase": WAITING},

@@ -60,7 +60,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _told_of_the_device(scenario, told_of_the_arm(scenario)),
+            _limit_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
@@ -86,7 +86,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
     """Limit the method's wrench to the largest wrench of the device.
 
     Otherwise the energy balance would contain a wrench that the device does not display.
@@ -99,7 +99,7 @@ def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> Passi
     )
 
 
-def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
+def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's method; add mass and servo of the arm for `ledger`.
 
     Raises:
@@ -112,9 +112,9 @@ def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"an arm of {slave.arm.num_joints} joints gives way in no direction but those",
+            f"an arm of {slave.arm.num_joints} joints has no mass in some directions",
             where="passivity.method",
-            remedy="take another method, or give passivity.slave_mass with its servo yourself",
+            remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
     servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(

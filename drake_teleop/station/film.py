@@ -38,14 +38,14 @@ Show = Callable[[float, int], None]
 
 FRAMES_PER_SECOND = 50
 # A longer replay has a lower frame rate; a frame takes 3 kB and the browser interpolates.
-_MOST_FRAMES = 2000
-_SHORTEST = 6.0  # shortest replay with the default speed [s]
-_SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds of the player
+_MAX_FRAMES = 2000
+_MIN_DURATION_S = 6.0  # shortest replay with the default speed [s]
+_SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds of the player
 
-_SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
-_METRES_PER_NEWTON = 0.003
-_GREY = Rgba(0.9, 0.9, 0.9)  # Drake's own default
-_BACK = RotationMatrix.MakeXRotation(np.pi)
+_SHAFT_RADIUS_M, _HEAD_LENGTH_M = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
+_ARROW_M_PER_N = 0.003
+_DEFAULT_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
+_R_FLIPPED = RotationMatrix.MakeXRotation(np.pi)
 # Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
 _POLICY = '<meta http-equiv="Content-Security-Policy" content="{}">'
 _TITLE = '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
@@ -127,15 +127,15 @@ class Film:
         collects = gc.isenabled()
         gc.disable()
         try:
-            page = self._recorded(make_scene)
+            page = self._record_scene(make_scene)
             gc.collect()
         finally:
             if collects:
                 gc.enable()
         make_folder(path.parent)
-        write_text(path, self._with_player(page))
+        write_text(path, self._add_player(page))
 
-    def _recorded(self, make_scene: Callable[[Meshcat], Show]) -> str:
+    def _record_scene(self, make_scene: Callable[[Meshcat], Show]) -> str:
         with quiet_drake():  # no client connects to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
@@ -152,7 +152,7 @@ class Film:
     def _span(self) -> float:
         return max(float(self.times[-1] - self.times[0]), 1e-3)
 
-    def _with_player(self, page: str) -> str:
+    def _add_player(self, page: str) -> str:
         start = float(self.times[0])
         film = {
             "title": self.title,
@@ -185,12 +185,15 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
     """
     span = stop - start
     if slow_motion is None:
-        slow_motion = next((s for s in _SLOWER if s * span >= _SHORTEST), _SLOWER[-1])
-    frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MOST_FRAMES)
+        slow_motion = next(
+            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_DURATION_S),
+            _SLOW_MOTION_FACTORS[-1],
+        )
+    frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MAX_FRAMES)
     return np.linspace(start, stop, max(frames, 1) + 1), slow_motion
 
 
-def plain_room(meshcat: Meshcat) -> None:
+def set_plain_background(meshcat: Meshcat) -> None:
     """Set a light background without grid and axes."""
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
@@ -203,7 +206,7 @@ def add_shapes(
     path: str,
     inspector: SceneGraphInspector,
     shapes: Iterable[GeometryId],
-    colour: Rgba = _GREY,
+    colour: Rgba = _DEFAULT_COLOUR,
 ) -> None:
     """Add a body's shapes below its path, in the model's colours or else in `colour`."""
     for shape in shapes:
@@ -224,24 +227,26 @@ class Arrow:
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
         self._path = f"/forces/{name}"
-        meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_SHAFT, 1.0), rgba(colour))
+        meshcat.SetObject(
+            f"{self._path}/shaft/scaled", Cylinder(_SHAFT_RADIUS_M, 1.0), rgba(colour)
+        )
         # The cone's tip is at its origin; its axis is z.
-        head = MeshcatCone(_HEAD, 0.4 * _HEAD, 0.4 * _HEAD)
+        head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
     def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
         """Show `force` (3,) [N] at `place` (3,) [m], both in W, at a recording time [s]."""
-        length = _METRES_PER_NEWTON * float(np.linalg.norm(force))
-        shaft = max(length - _HEAD, 1e-3)
+        length = _ARROW_M_PER_N * float(np.linalg.norm(force))
+        shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
-        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD) * R[:, 2]
-        back = along @ _BACK
+        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
+        back = along @ _R_FLIPPED
         put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
         put(f"{self._path}/head", RigidTransform(back, tip), film_time)
         scale = canvas.SetProperty
-        size = min(1.0, length / _HEAD)
+        size = min(1.0, length / _HEAD_LENGTH_M)
         scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
         scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)
 

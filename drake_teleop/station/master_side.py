@@ -10,7 +10,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.master.device import AddDevice
 from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.electronics import Encoders, Held
+from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.operator.decision import Training
 from drake_teleop.station.operator.operator import Operator
@@ -58,7 +58,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     builder = DiagramBuilder()
 
     name = "operator" if operator is None else "live_hand"
-    operator = builder.AddNamedSystem(name, operator or _operator(scenario, start_B))
+    operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
     device, display = AddDevice(builder, period, model, q_start)
@@ -91,8 +91,8 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         read = encoders.get_output_port()
     own_period = scenario.master.own_period(scenario.rates.hand_hz)
     if own_period is not None:
-        held_pose = builder.AddNamedSystem("held_pose", Held(own_period, start_B))
-        held_wrench = builder.AddNamedSystem("held_wrench", Held(own_period, np.zeros(6)))
+        held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
+        held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
         read, command = held_pose.get_output_port(), held_wrench.get_input_port()
@@ -110,7 +110,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     return builder.Build()
 
 
-def _operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
+def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
     """Return the scenario's operator; for a task it gets delays, scales and the arm model."""
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)

@@ -35,7 +35,7 @@ from drake_teleop.station.film import (
     Show,
     add_shapes,
     frame_times,
-    plain_room,
+    set_plain_background,
 )
 from drake_teleop.station.master.data_sheets import PHANTOM
 from drake_teleop.station.master.leader_model import Leader
@@ -55,18 +55,21 @@ _TABLE_TOP = 0.60
 # Origin of the haptic device's base frame B in W [m].
 _P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # B is 0.28 m above the foot
 _CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_WITHOUT_MASTER = np.array([-0.3, 0.0, 0.0])  # offset of camera and target
+_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target
 
 
 _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
-_GRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_WRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
+_P_EGRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
 # Arrows inside arm and tool would be hidden.
-_BESIDE_WRIST_W, _BESIDE_TIP_W = np.array([0.07, -0.09, 0.0]), np.array([-0.06, 0.0, 0.0])
+_WRIST_ARROW_OFFSET_W, _TIP_ARROW_OFFSET_W = (
+    np.array([0.07, -0.09, 0.0]),
+    np.array([-0.06, 0.0, 0.0]),
+)
 
 # Required signals, and signals that are shown if they were recorded.
-_NEEDED = ("slave_state", "measured_wrench_S", "load_estimate")
-_SHOWN = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
+_REQUIRED_SIGNALS = ("slave_state", "measured_wrench_S", "load_estimate")
+_OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
 
 
 def replay_command(
@@ -86,13 +89,13 @@ def replay_command(
     Raises:
         DrakeTeleopError: if there is no log or no scenario.
     """
-    logs = _logs(run)
+    logs = _find_logs(run)
     films = []
     with output_folder(out):
         for log in logs:
             path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
             result = SimulationResult.scan_parquet(log)
-            write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
+            write_replay(path, result, LoadScenario(scenario or _find_scenario(log)))
             films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
             if not quiet:
                 print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
@@ -117,18 +120,18 @@ def write_replay(
     Raises:
         DrakeTeleopError: if required signals are missing.
     """
-    missing = [name for name in _NEEDED if name not in result]
+    missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
         raise DrakeTeleopError(
-            f"cannot be shown: it holds no {', '.join(missing) or 'samples'}",
+            f"cannot be shown: it contains no {', '.join(missing) or 'samples'}",
             where="replay",
             remedy="give the log of a station with its own slave",
         )
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
-    rows = _nearest(result.t, times)
+    rows = _nearest_rows(result.t, times)
     # Read each signal of a log on disk once, and keep only the displayed rows.
     moving = [name for name in result.signals if name.startswith(POSE_OF)]
-    shown = [name for name in (*_NEEDED, *_SHOWN, *moving) if name in result]
+    shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
     signals = {name: result[name][rows] for name in shown}
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
@@ -150,7 +153,7 @@ def write_replay(
     film.write(path, make_scene)
 
 
-def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
+def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
     """Return the rows of sorted `t` (N,) that are nearest to `times`."""
     after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
     after = np.minimum(after, len(t) - 1)
@@ -160,20 +163,22 @@ def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
 
 def _readings(signals: Signals) -> list[Reading]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
-    readings = [Reading("Measured at the wrist", "N", _norm(measured), BLUE, arrow=True)]
+    readings = [Reading("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)]
     if "contact_wrench_S" in signals:
-        contact = _norm(signals["contact_wrench_S"][:, :3])
+        contact = _row_norms(signals["contact_wrench_S"][:, :3])
         readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
     if "force_to_master" in signals:
-        readings.append(Reading("Shown to the hand", "N", _norm(signals["force_to_master"][:, :3])))
+        readings.append(
+            Reading("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
+        )
     return readings
 
 
-def _norm(vectors: Array) -> Array:
+def _row_norms(vectors: Array) -> Array:
     return np.linalg.norm(vectors, axis=1)
 
 
-def _logs(run: Path) -> list[Path]:
+def _find_logs(run: Path) -> list[Path]:
     """Return the log itself, or the logs in a folder that have a scenario."""
     if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
@@ -184,20 +189,20 @@ def _logs(run: Path) -> list[Path]:
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
         raise DrakeTeleopError(
-            "holds no log of a run",
+            "contains no log of a run",
             where=str(run),
-            remedy="give a folder that drake-teleop run or reproduce wrote, or a log.parquet; a"
-            " study keeps measures, no logs: run one of its points as a scenario",
+            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+            " stores measures only: run one of its points as a scenario",
         )
     return logs
 
 
-def _scenario_of(log: Path) -> Path:
+def _find_scenario(log: Path) -> Path:
     for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
         if path.exists():
             return path
     raise DrakeTeleopError(
-        "does not say of which scenario it is",
+        "has no scenario beside it",
         where=str(log),
         remedy="give --scenario, a shipped one or a YAML file",
     )
@@ -230,10 +235,12 @@ class ReplayScene:
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
         finalize(self.plant)
-        self._moving = {POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()}
+        self._moving_bodies = {
+            POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()
+        }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
-        _furnish(meshcat, scenario, with_table=self._master is not None)
+        _add_room(meshcat, scenario, with_table=self._master is not None)
         # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
@@ -267,20 +274,20 @@ class ReplayScene:
             plant.SetPositions(context, self._master.instance, q)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
-        for name, body in self._moving.items():
+        for name, body in self._moving_bodies.items():
             if name in signals:
-                self._move(body, signals[name][sample])
+                self._set_body_pose(body, signals[name][sample])
         for path, body in self._bodies.items():
             self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
         if not self._arrows:
             return
-        forces, places = self._forces(signals, sample), self._places()
+        forces, places = self._contact_forces_W(signals, sample), self._arrow_positions_W()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
             arrow.show(self.canvas, film_time, places[place], f_W)
 
-    def _move(self, index: BodyIndex, pose: Array) -> None:
+    def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
         """Set the pose of a free body of the surroundings; its parents must be set before."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
@@ -292,7 +299,7 @@ class ReplayScene:
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
-    def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
+    def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
         """Return forces of the load on the sensor in W, opposite in sign to Eq. (1)."""
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
@@ -301,13 +308,13 @@ class ReplayScene:
             forces["contact"] = -R_WS @ signals["contact_wrench_S"][sample, :3]
         return forces
 
-    def _places(self) -> dict[str, Array]:
+    def _arrow_positions_W(self) -> dict[str, Array]:
         """Return the arrows' start points in W."""
 
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _WRIST_S + _BESIDE_WRIST_W,
-            "tip": X_WS @ self._tip + _BESIDE_TIP_W,
+            "wrist": X_WS @ _P_SWRIST_S + _WRIST_ARROW_OFFSET_W,
+            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
         }
         if self._master is not None:
             places["stylus"] = self._master.hand.CalcPoseInWorld(self.context) @ self._master.grip
@@ -341,7 +348,7 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
-    return _Device(master, plant.GetFrameByName("stylus", master), _GRIP_E, positions)
+    return _Device(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
 
 
 def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
@@ -357,7 +364,7 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
     return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
 
 
-def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
+def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     """Add floor, table and stands; set light and camera."""
 
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
@@ -377,6 +384,6 @@ def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
         if stand is not None and stand.height > 0:
             size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
             box(f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL)
-    plain_room(meshcat)
-    aside = np.zeros(3) if with_table else _WITHOUT_MASTER
+    set_plain_background(meshcat)
+    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_W
     meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 _METADATA_KEY = "drake_teleop.station.signals"
 # Longer curves are drawn as minimum and maximum of blocks.
-_DRAWN = 20_000
+_MAX_CURVE_POINTS = 20_000
 # Columns of the canonical log (README, "Logs") for each signal.
-_CANONICAL = {
+_CANONICAL_COLUMNS = {
     "sample_time": ("t",),
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
     "specific_force_S": ("s_x", "s_y", "s_z"),
@@ -102,9 +102,9 @@ class SimulationResult:
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
         else:
-            self._values = {name: self._checked(name, signals[name]) for name in self._specs}
+            self._values = {name: self._checked_values(name, signals[name]) for name in self._specs}
 
-    def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
+    def _checked_values(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
         array = numbers(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
@@ -203,7 +203,7 @@ class SimulationResult:
         """
         import polars as pl
 
-        missing = [name for name in _CANONICAL if name not in self]
+        missing = [name for name in _CANONICAL_COLUMNS if name not in self]
         if missing:
             raise DrakeTeleopError(
                 f"this result holds no {', '.join(missing)}",
@@ -211,7 +211,7 @@ class SimulationResult:
                 remedy="record the wrist sensor's signals",
             )
         columns: dict[str, NDArray[np.float64]] = {}
-        for name, names in _CANONICAL.items():
+        for name, names in _CANONICAL_COLUMNS.items():
             columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
@@ -271,14 +271,14 @@ class SimulationResult:
         expect((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
-        parts = _parts(path)
+        parts = _log_parts(path)
         for part in parts:
             with reading(part, remedy, "is not a simulation result"):
                 check_parquet(part)
         with reading(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
-            t = _columns_of_numbers(path, ["t"])[:, 0]
+            t = _read_columns(path, ["t"])[:, 0]
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
@@ -300,7 +300,7 @@ class SimulationResult:
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_drawn(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_reduce_curve(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -321,21 +321,21 @@ class SimulationResult:
         groups = groupby(range(len(units)), key=lambda index: units[index])
         return [(name, unit, list(indices)) for unit, indices in groups]
 
-    def _span(self) -> str:
+    def _time_range_text(self) -> str:
         if not len(self._t):
             return "no samples"
         return f"{len(self._t)} samples, {self._t[0]:g} to {self._t[-1]:g} s"
 
     def __repr__(self) -> str:
         width = max((len(name) for name in self.signals), default=0)
-        lines = [f"SimulationResult: {self._span()}"]
-        lines += [f"  {spec.name:{width}}  {_describe(spec)}" for spec in self.specs]
+        lines = [f"SimulationResult: {self._time_range_text()}"]
+        lines += [f"  {spec.name:{width}}  {_signal_text(spec)}" for spec in self.specs]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td style='text-align:left'><code>{html.escape(spec.name)}</code></td>"
-            f"<td style='text-align:left'>{html.escape(_components(spec))}</td>"
+            f"<td style='text-align:left'>{html.escape(_components_text(spec))}</td>"
             f"<td style='text-align:left'>{html.escape(spec.description)}</td></tr>"
             for spec in self.specs
         )
@@ -344,7 +344,7 @@ class SimulationResult:
             for title in ("signal", "components [unit]", "what it is")
         )
         return (
-            f"<b>SimulationResult</b>: {self._span()}"
+            f"<b>SimulationResult</b>: {self._time_range_text()}"
             f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
         )
 
@@ -358,7 +358,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         columns = self._columns[name]
         with reading(self._path, "write it again"):
-            return _read_only(_columns_of_numbers(self._path, columns))
+            return _read_only(_read_columns(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns
@@ -370,11 +370,11 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         return len(self._columns)
 
 
-def _drawn(
+def _reduce_curve(
     t: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reduce a curve to about _DRAWN points: minimum and maximum of each block."""
-    length = 2 * len(t) // _DRAWN
+    """Reduce a curve to about _MAX_CURVE_POINTS points: minimum and maximum of each block."""
+    length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values
     starts = np.arange(0, len(t), length)
@@ -382,29 +382,29 @@ def _drawn(
     return np.repeat(t[starts], 2), np.ravel(extremes, order="F")
 
 
-def _components(spec: Signal) -> str:
+def _components_text(spec: Signal) -> str:
     """Return text such as "f_x, f_y, f_z [N], tau_x [N m]"."""
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
 
 
-def _describe(spec: Signal) -> str:
-    text = _components(spec)
+def _signal_text(spec: Signal) -> str:
+    text = _components_text(spec)
     return f"{text}  {spec.description}" if spec.description else text
 
 
-def _parts(path: Path) -> list[Path]:
+def _log_parts(path: Path) -> list[Path]:
     """Return the parts of a log in order, or its single file."""
     return sorted(path.glob(PARTS_OF_LOG)) or [path]
 
 
-def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
+def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
     """Return (N, k) columns of a Parquet file; the caller converts errors with `reading`."""
     import polars as pl
 
     refuse_fork()
-    table = pl.read_parquet(_parts(path), columns=columns)
+    table = pl.read_parquet(_log_parts(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"{', '.join(columns)} hold no numbers")
     return table.to_numpy()

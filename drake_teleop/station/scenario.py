@@ -57,7 +57,7 @@ Thing: TypeAlias = (
     | Scene
 )  # fmt: skip
 #: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
-_CONTACT_STEP = 1.25e-4
+_CONTACT_STEP_S = 1.25e-4
 
 
 @settings
@@ -134,7 +134,7 @@ class Scenario:
     @property
     def surroundings(self) -> Environment | None:
         """All objects to touch as one `Environment`, or None."""
-        things = self._things
+        things = self._objects
         if not things:
             return None
         return things[0] if len(things) == 1 else Several(things)
@@ -142,10 +142,10 @@ class Scenario:
     @property
     def leaf(self) -> SheetSpring | None:
         """The sheet spring, from `sheet_spring` or `environment`."""
-        return next((thing for thing in self._things if isinstance(thing, SheetSpring)), None)
+        return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
 
     @property
-    def _things(self) -> list[Environment]:
+    def _objects(self) -> list[Environment]:
         own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
         return [*own, *self.environment]
 
@@ -174,7 +174,7 @@ class Scenario:
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
-            if sum(isinstance(thing, kind) for thing in self._things) > 1:
+            if sum(isinstance(thing, kind) for thing in self._objects) > 1:
                 raise DrakeTeleopError(
                     f"there is more than one {name}",
                     where=f"{where}:environment",
@@ -289,7 +289,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
     check_task(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
-            "a hand that does not move the tool cannot do a task",
+            "a task needs a hand that moves the tool",
             where=f"{where}:kinematic_scaling.translation_scale",
             remedy="set it above 0, or operator.task: null",
         )
@@ -298,11 +298,15 @@ def _check_task(scenario: Scenario, where: str) -> None:
 def _check_steps(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
-    if scenario.surroundings is not None and not controlled and simulation.max_step > _CONTACT_STEP:
+    if (
+        scenario.surroundings is not None
+        and not controlled
+        and simulation.max_step > _CONTACT_STEP_S
+    ):
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_CONTACT_STEP:g}, or integrator: runge_kutta3, which finds its own",
+            remedy=f"set it to {_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
         )
 
 
@@ -314,15 +318,15 @@ def _check_channel(scenario: Scenario, where: str) -> None:
             raise DrakeTeleopError(
                 f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
-                remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
+                remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
     if scenario.master.leads_joints and not (
         scenario.is_direct and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
-            "a channel carries poses, not joints",
+            "a channel transmits poses, not joint positions",
             where=f"{where}:master.leader.leads",
-            remedy="lead by the pose, or without network, passivity and contact_detection",
+            remedy="set it to pose, or remove network, passivity and contact_detection",
         )
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)

@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-_COLUMN = 34  # column of the comments, unless a value is longer
+_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
 _HEAD = """\
 # Every field: its value, [what it may be] and what it means. What you leave out has its default.
@@ -55,14 +55,14 @@ def commented(scenario: Scenario) -> str:
     return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
-def _words(value: Any) -> list[str]:
+def _all_texts(value: Any) -> list[str]:
     """Return all texts in a scenario, which an incorrect YAML writer would change."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
         value = [*value, *value.values()]
     if isinstance(value, (list, tuple)):
-        return [word for each in value for word in _words(each)]
+        return [word for each in value for word in _all_texts(each)]
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
@@ -76,7 +76,7 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
     if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
-    if found != scenario and _words(found) != _words(scenario):
+    if found != scenario and _all_texts(found) != _all_texts(scenario):
         raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
     write_text(path, text)
 
@@ -92,7 +92,7 @@ def json_schema() -> str:
     return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
 
 
-def _takes(entry: FieldInfo) -> str:
+def _allowed_values(entry: FieldInfo) -> str:
     """Return the allowed values as text."""
     words = entry.range if entry.unit or entry.choices else entry.kind
     if entry.lists:
@@ -101,7 +101,7 @@ def _takes(entry: FieldInfo) -> str:
 
 
 def _comment(entry: FieldInfo) -> str:
-    return f"[{_takes(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
+    return f"[{_allowed_values(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
 
 
 def _block_lines(config: Any) -> list[str]:
@@ -109,7 +109,7 @@ def _block_lines(config: Any) -> list[str]:
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
-    column = min(_COLUMN, max(map(len, starts.values()), default=0))
+    column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
     lines = []
     for entry in entries:
@@ -128,18 +128,18 @@ def _inner_lines(entry: FieldInfo) -> list[str]:
         return _named_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _out(_named_lines(entry, blocks))
-    return [line for block in blocks for line in _out(_named_lines(entry, block))]
+        return _commented_out(_named_lines(entry, blocks))
+    return [line for block in blocks for line in _commented_out(_named_lines(entry, block))]
 
 
 def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
     """Return `name:` and the indented contents."""
     if not entry.lists:
         head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
-        return [head, *_indented(_block_lines(value))]
+        return [head, *_indent(_block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag(entry, item)}", *_indented(_indented(_block_lines(item)))]
+        lines += [f"  -{_tag(entry, item)}", *_indent(_indent(_block_lines(item)))]
     return lines
 
 
@@ -147,11 +147,11 @@ def _tag(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
-def _indented(lines: list[str]) -> list[str]:
+def _indent(lines: list[str]) -> list[str]:
     return [f"  {line}" for line in lines]
 
 
-def _out(lines: list[str]) -> list[str]:
+def _commented_out(lines: list[str]) -> list[str]:
     return [f"# {line}" for line in lines]
 
 
@@ -161,7 +161,7 @@ def _sections(config: Any, path: str) -> Iterator[str]:
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
         default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
-        takes = _links(entry, path) if entry.kind == "block" else _takes(entry)
+        takes = _links(entry, path) if entry.kind == "block" else _allowed_values(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
     for entry in entries:

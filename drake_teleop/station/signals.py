@@ -26,14 +26,14 @@ def _state(joints: int) -> tuple[str, str]:
     return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
 
 
-def _joints(joints: int) -> str:
+def _joint_names(joints: int) -> str:
     return " ".join(f"joint_{i + 1}" for i in range(joints))
 
 
 _STATE, _STATE_UNITS = _state(6)
-_JOINTS = _joints(6)
+_JOINTS = _joint_names(6)
 # Their number of components follows the number of joints, as that of the states does.
-_OF_JOINTS = ("joint_position", "joint_torque", "joint_command")
+_JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
 
 
 #: All signals in the order of the log, for an arm with six joints.
@@ -121,8 +121,8 @@ def signal_of(name: str, size: int) -> Signal:
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal
-    if name in _OF_JOINTS:
-        return _signal(name, _joints(size), signal.units[0], signal.description)
+    if name in _JOINT_SIGNALS:
+        return _signal(name, _joint_names(size), signal.units[0], signal.description)
     if name in ("slave_state", "master_state"):
         return _signal(name, *_state(size // 2), signal.description)
     return signal

@@ -22,7 +22,7 @@ from drake_teleop.station.scenario import Simulation
 from drake_teleop.station.signals import LOG, signal_of
 
 # Interval of progress updates [ms].
-_PROGRESS_STEP = 20
+_PROGRESS_INTERVAL_MS = 20
 # Rows of a part of a log on disk: some seconds, some MB.
 _PART_ROWS = 8192
 
@@ -66,7 +66,7 @@ def simulate(
     simulator.Initialize()
     try:
         # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
-        milliseconds = np.arange(_PROGRESS_STEP, 1e3 * end - 1, _PROGRESS_STEP)
+        milliseconds = np.arange(_PROGRESS_INTERVAL_MS, 1e3 * end - 1, _PROGRESS_INTERVAL_MS)
         for time in np.append(1e-3 * milliseconds, end):
             advance(simulator, time)
             if stops:

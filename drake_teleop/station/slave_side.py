@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 #: Sampling period of the monitor [s]; 2 kHz events would cost time.
 MONITOR_PERIOD = 0.01
 # See `_check_friction`.
-_LARGEST_FRICTION_STEP = 2.0
+_MAX_FRICTION_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -83,7 +83,7 @@ def MakeSlaveSide(
     if load_covariance is not None:
         checked("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    body = _add_body(builder, scenario, load_estimate, load_covariance)
+    body = _add_slave_blocks(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
 
     start, led = body.slave.start, scenario.master.leads_joints
@@ -116,7 +116,7 @@ def MakeSlaveSide(
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
     export(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
-    if _is_known(scenario, load_estimate):
+    if _has_load_estimate(scenario, load_estimate):
         export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     if not scenario.is_direct:
@@ -128,9 +128,9 @@ def MakeSlaveSide(
     if scenario.contact_detection is not None:
         if noise_floor is None:
             raise DrakeTeleopError(
-                "nobody knows how large the contact wrench is in free motion",
+                "no noise floor given",
                 where="contact_detection",
-                remedy="pass the noise_floor of identify_load, as load_estimate",
+                remedy="pass noise_floor=identify_load(...).noise_floor",
             )
         expect(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         detection = builder.AddNamedSystem(
@@ -153,7 +153,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
-    body = _add_body(builder, scenario, q_start=start)
+    body = _add_slave_blocks(builder, scenario, q_start=start)
     command = builder.AddNamedSystem(
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
@@ -165,7 +165,7 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
 
 
 @dataclass(frozen=True)
-class _Body:
+class _SlaveBlocks:
     """Plant, joint control, wrist sensor, load estimator and monitor, connected to each other."""
 
     slave: SlavePlant
@@ -176,13 +176,13 @@ class _Body:
     command_period: float  # period of joint commands [s]
 
 
-def _add_body(
+def _add_slave_blocks(
     builder: DiagramBuilder,
     scenario: Scenario,
     load_estimate: Array | None = None,
     load_covariance: Array | None = None,
     q_start: Array | None = None,
-) -> _Body:
+) -> _SlaveBlocks:
     """Add the blocks that every slave has; the joint command stays unconnected."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
@@ -190,7 +190,7 @@ def _add_body(
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
 
-    samples = 1 if q_start is not None else _samples_within(scenario, slave)
+    samples = 1 if q_start is not None else _servo_samples_per_event(scenario, slave)
     ramps = samples > 1
     control = builder.AddNamedSystem(
         "joint_control",
@@ -250,17 +250,17 @@ def _add_body(
     # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
-    if _is_known(scenario, load_estimate):
+    if _has_load_estimate(scenario, load_estimate):
         export(builder, estimator, "load_estimate")
     if scenario.load_estimator.watch:
         export(builder, estimator, "load_state")
 
     if slave.can_touch:
         _add_tool_contact(builder, slave, state)
-    return _Body(slave, control, monitor, estimator, sample, held)
+    return _SlaveBlocks(slave, control, monitor, estimator, sample, held)
 
 
-def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
+def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
     """Return servo samples per event.
 
     It is 1 if only the plant itself predicts its motion (contact by Drake, position interface).
@@ -284,8 +284,8 @@ def _check_friction(slave: SlavePlant, step: float) -> None:
     mass = mass_matrix(slave.arm, slave.start)
     slope = np.diag(slave.friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _LARGEST_FRICTION_STEP:
-        shorter = 0.9 * _LARGEST_FRICTION_STEP / rate
+    if rate * step > _MAX_FRICTION_STEP:
+        shorter = 0.9 * _MAX_FRICTION_STEP / rate
         raise DrakeTeleopError(
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
@@ -332,20 +332,20 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
             learnt("load_estimate", estimate[6:])
     sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
     needed = not sigma_gripper == sigma_object == gamma
-    if needed and not _is_known(scenario, estimate):
+    if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "sigma and gamma differ, but the load is not known",
+            "sigma and gamma differ, but there is no load estimate",
             where="load_estimate",
             remedy="pass the estimate of identify_load, or set load_estimator.enabled",
         )
-    if scenario.contact_detection is not None and not _is_known(scenario, estimate):
+    if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "contact is to be detected, but the load is not known",
+            "contact detection needs a load estimate",
             where="load_estimate",
             remedy="pass the estimate of identify_load, as its noise_floor",
         )
 
 
-def _is_known(scenario: Scenario, estimate: Array | None) -> bool:
+def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:
     """Return whether a load estimate exists or will be estimated, so that contact is measurable."""
     return estimate is not None or scenario.load_estimator.enabled

@@ -13,7 +13,7 @@ from drake_teleop.load.regressor import sample_parts
 from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
 
 #: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
-TOGETHER = {
+COMBINED_PORTS = {
     "sample": (*sample_parts(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
@@ -49,7 +49,7 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
     """Export and record every port that is a signal, in the order of `SIGNALS`, then poses.
 
-    Signals that share one port of a side (`TOGETHER`) are recorded from there.
+    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from there.
     """
     outputs = {
         port.get_name(): port
@@ -60,7 +60,9 @@ def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz:
     signals += [name for name in outputs if name.startswith(POSE_OF)]
     for name in signals:
         builder.ExportOutput(outputs[name], name)
-    wide = {part: port for port, parts in TOGETHER.items() if port in outputs for part in parts}
+    wide = {
+        part: port for port, parts in COMBINED_PORTS.items() if port in outputs for part in parts
+    }
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
     # One wide log: at 8 kHz each system with own events costs time at every step.
     row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))

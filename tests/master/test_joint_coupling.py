@@ -129,7 +129,7 @@ def test_the_follower_keeps_limits_and_speeds(scenario):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel carries poses"),
+        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel transmits poses"),
         ({"slave__sensor_frame": "wrist_2", "slave__home": HOME[:5]}, "has 6 joints, the slave 5"),
     ],
 )

@@ -211,7 +211,7 @@ def test_a_station_has_its_ports_and_a_file_is_found_from_the_scenarios(tmp_path
     ("leader", "said"),
     [
         (None, "master.leader: a leader arm and `model: leader` belong together"),
-        (Leader(hand_frame="hand"), "master.leader.file: a leader arm needs it"),
+        (Leader(hand_frame="hand"), "master.leader.file: is required for a leader arm"),
         (dataclasses.replace(LEADER, friction=[-1.0]), "master.leader.friction: has to be"),
         (dataclasses.replace(LEADER, home=[0.0]), "master.leader.home: has 1 numbers"),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),

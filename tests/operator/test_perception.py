@@ -85,5 +85,5 @@ def test_a_record_of_the_wrong_shape_is_refused():
     with pytest.raises(DrakeTeleopError, match="velocity"):
         perceive(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
     for times in (T[:1], T[::-1]):
-        with pytest.raises(DrakeTeleopError, match="t: does not rise"):
+        with pytest.raises(DrakeTeleopError, match="t: is not increasing"):
             perceive(times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0)

@@ -114,7 +114,7 @@ def test_a_submovement_keeps_to_the_acceleration_and_to_a_least_duration(
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_person(training, Perception(), movement), []
     monkeypatch.setattr(decision, "_to_hand", decision._to_hand.py_func)
-    monkeypatch.setattr(decision, "_random", lambda *_: 0.0)
+    monkeypatch.setattr(decision, "_random_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._submovement.py_func(person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0]))
     _, time, planned, change, _ = plans[0]

@@ -19,7 +19,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    _track,
+    _update_filters,
     estimate_into,
     estimated_motion_std,
     motion_estimator,
@@ -328,7 +328,7 @@ def test_the_filter_is_as_good_as_predicted():
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
     for k in range(1, steps):
         acceleration, moved = measured[k] - bias, angle[k] - angle[k - 1]
-        _track(found.gains, T, moved, acceleration, kept)
+        _update_filters(found.gains, T, moved, acceleration, kept)
         bias -= moved
         kept[6:9] = acceleration + moved
         estimates.append(angle[k] - kept[:3])

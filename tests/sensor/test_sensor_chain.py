@@ -25,8 +25,8 @@ from drake_teleop.station.sensor.sensor_chain import (
     PARTS,
     PRESET_NAMES,
     WristSensorConfig,
-    believable,
     calibration_matrices,
+    is_plausible,
     read_into,
     sensor_chain,
     without,
@@ -286,19 +286,19 @@ def test_the_offset_counts_in_the_saturation(low_pass):
 def test_what_no_sensor_survives_is_not_read_and_its_offset_counts():
     constants, _ = sensor_chain(part(saturates=True), JOINTS, PERIOD)
     truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     truth[0] = 0.99 * largest
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     constants[0] = 0.02 * largest  # of the offset
-    assert not believable(constants, truth)
+    assert not is_plausible(constants, truth)
     truth[0] = 0.0
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     constants[0] = np.nan
-    assert not believable(constants, truth)
+    assert not is_plausible(constants, truth)
     constants[0] = 0.0
     for place in range(len(truth)):
         for bad in (np.nan, -np.inf, 1e9):
-            assert not believable(constants, np.where(np.arange(len(truth)) == place, bad, truth))
+            assert not is_plausible(constants, np.where(np.arange(len(truth)) == place, bad, truth))
 
 
 # Latency

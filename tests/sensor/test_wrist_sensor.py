@@ -201,7 +201,7 @@ def test_an_instant_that_comes_twice_has_one_sample():
 def test_samples_wait_in_contact_until_the_torque_or_the_noise_changes():
     """Asked three times a period, of which five have one torque and 128 one block of noise."""
     period, k = 1.25e-4, np.arange(3 * 1000)
-    sensor: Any = SimpleNamespace(_period=period, _holds=(5 * period, NOISE_BLOCK * period))
+    sensor: Any = SimpleNamespace(_period=period, _event_periods=(5 * period, NOISE_BLOCK * period))
     due = [WristSensor._is_due(sensor, time) for time in k * period / 3]
     np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * NOISE_BLOCK) == 0))
 
@@ -227,8 +227,8 @@ def test_a_noisy_sensor_need_not_ask_the_plant_in_contact(monkeypatch):
         )
         station, before = MakeTeleopStation(scenario), len(asked)
         sensor = GetBlock(station, "wrist_sensor")
-        assert sensor._exact == ideal
-        sensor._exact = asks
+        assert sensor._uses_plant_contact == ideal
+        sensor._uses_plant_contact = asks
         result = simulate(station, scenario.simulation)
         assert np.abs(result["true_contact_wrench_W"][-20:, 2]).min() > 1.0
         return result["measured_wrench_S"], len(asked) - before

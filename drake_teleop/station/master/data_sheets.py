@@ -109,20 +109,22 @@ class DeviceFigures:
     )
 
 
-def _sheet(mass: float, friction: float, force: float, size: list[float], **others: Any) -> Any:
+def _data_sheet(
+    mass: float, friction: float, force: float, size: list[float], **others: Any
+) -> Any:
     return DeviceFigures(
         apparent_mass=mass, friction=friction, peak_force=force, size=size, **others
     )
 
 
-_FIXED = [0.0, 0.0, 0.0]
-_OMEGA = [0.11, 0.113, 0.113]
-_OMEGA_TURN = np.radians([120.0, 70.0, 160.0]).tolist()  # D
-_OMEGA_READ = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
+_NO_ROTATION = [0.0, 0.0, 0.0]
+_OMEGA_SIZE = [0.11, 0.113, 0.113]
+_OMEGA_ROTATION = np.radians([120.0, 70.0, 160.0]).tolist()  # D
+_OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
 
 #: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
-    "geomagic_touch": _sheet(
+    "geomagic_touch": _data_sheet(
         0.045,
         0.26,
         3.3,
@@ -131,11 +133,13 @@ FIGURES: dict[str, DeviceFigures] = {
         turn_resolution=2e-3,
         rate_hz=1000.0,
     ),
-    "omega_3": _sheet(0.25, 0.3, 12.0, _OMEGA, turn=_FIXED, **_OMEGA_READ),
-    "omega_6": _sheet(0.3, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
-    "omega_7": _sheet(0.35, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
-    "falcon": _sheet(0.2, 0.5, 8.9, [0.102] * 3, turn=_FIXED, resolution=6.35e-5, rate_hz=1000.0),
-    "haply_inverse3": _sheet(
+    "omega_3": _data_sheet(0.25, 0.3, 12.0, _OMEGA_SIZE, turn=_NO_ROTATION, **_OMEGA_READING),
+    "omega_6": _data_sheet(0.3, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
+    "omega_7": _data_sheet(0.35, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
+    "falcon": _data_sheet(
+        0.2, 0.5, 8.9, [0.102] * 3, turn=_NO_ROTATION, resolution=6.35e-5, rate_hz=1000.0
+    ),
+    "haply_inverse3": _data_sheet(
         0.2,
         0.15,
         10.0,
@@ -144,7 +148,7 @@ FIGURES: dict[str, DeviceFigures] = {
         turn_resolution=2e-3,
         rate_hz=4000.0,
     ),
-    "virtuose_6d": _sheet(
+    "virtuose_6d": _data_sheet(
         1.0,
         1.0,
         35.0,
@@ -209,7 +213,7 @@ class Master:
         """Whether a leader arm commands the slave's joints one by one."""
         return self.leader is not None and self.leader.leads == JOINTS
 
-    def check_leads_the_pose(self, what: str) -> None:
+    def check_pose_mode(self, what: str) -> None:
         """Reject a leader arm in joint mode.
 
         Raises:
@@ -217,9 +221,9 @@ class Master:
         """
         if self.leads_joints:
             raise DrakeTeleopError(
-                f"{what} knows a hand that leads the pose",
+                f"{what} supports pose mode only",
                 where="master.leader.leads",
-                remedy="set it to pose there: the hand feels the same",
+                remedy="set it to pose: the rendered force is the same",
             )
 
     def steps(self) -> NDArray[np.float64]:
@@ -287,15 +291,15 @@ class Master:
                     where=f"{where}.figures",
                     remedy="leave them out",
                 )
-        if self.figures is not None and self.figures.turn[1] > _STEEPEST:
+        if self.figures is not None and self.figures.turn[1] > _MAX_PITCH_RAD:
             raise DrakeTeleopError(
                 f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",
                 where=f"{where}.figures.turn",
-                remedy=f"choose at most {_STEEPEST:g} rad",
+                remedy=f"choose at most {_MAX_PITCH_RAD:g} rad",
             )
 
 
-_STEEPEST = 1.5  # rad
+_MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:

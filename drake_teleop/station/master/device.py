@@ -15,9 +15,9 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, 
 from drake_teleop.station.master.force_display import ForceDisplay, initial_display
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
-_LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
+_MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
 # A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
-_LARGEST_FRICTION_STEP = 2.0
+_MAX_FRICTION_STEP = 2.0
 
 
 @njit(cache=True, borrows=True)
@@ -43,16 +43,16 @@ def check_period(
     Raises:
         DrakeTeleopError: if the period is too long for haptic devices or for the friction.
     """
-    if not 0 < period <= _LARGEST_PERIOD:
+    if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
             f"a period of {period:g} s is too long for the haptic device",
             where="master.period",
-            remedy=f"choose at most {_LARGEST_PERIOD:g} s (1 kHz); the paper uses above 2 kHz",
+            remedy=f"choose at most {_MAX_PERIOD_S:g} s (1 kHz); the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _LARGEST_FRICTION_STEP:
+    if rate * period > _MAX_FRICTION_STEP:
         raise DrakeTeleopError(
             f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
             f"period of {1e3 * period:g} ms",

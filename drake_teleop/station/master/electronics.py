@@ -58,12 +58,12 @@ class Encoders(LeafSystem):
         read_pose_into(q, *self._constants, output.get_mutable_value())
 
 
-class Held(LeafSystem):
+class SampleHold(LeafSystem):
     """Sample and hold of a vector; unlike Drake's ZeroOrderHold it has a start value.
 
     .. pydrake_system::
 
-        name: Held
+        name: SampleHold
         input_ports:
         - value: (n,)
         output_ports:
@@ -80,7 +80,7 @@ class Held(LeafSystem):
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._value.Eval(context))

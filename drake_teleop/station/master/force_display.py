@@ -27,16 +27,18 @@ from drake_teleop.station.passivity.safe_state import (
 # From the device: joint positions, and memory of the last period: last valid positions, displayed
 # wrench and fault, whether the wrench was changed after a fault, time since the last fault [s],
 # watch. To the device: motor torques in place of the positions, and the new memory.
-_places = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
-_ANGLES, _LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6), _places.vector(6)
-_FAULT, _CHANGED, _SOUND = _places.number(), _places.number(), _places.number()
-_WATCH = _places.vector(MASTER_WATCH)
-_SHOWN = slice(_LAST.start, _FAULT + 1)
-_NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
+_slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_POSITIONS, _LAST_POSITIONS, _DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
+_FAULT, _CHANGED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
+_WATCH = _slots.vector(MASTER_WATCH)
+_DISPLAYED_AND_FAULT = slice(_DISPLAYED.start, _FAULT + 1)
+_NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING = map(
+    int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
+)
 
 
 @njit(cache=True)
-def _full(numbers):
+def _peak_wrench(numbers):
     """Return (2,) peak force and largest motor torque; torque is limited per motor elsewhere."""
     return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
 
@@ -49,8 +51,8 @@ def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDA
         numbers: (NUMBERS,) of the device.
     """
     display = np.zeros(_WATCH.stop)
-    display[_ANGLES] = display[_LAST_ANGLES] = q
-    display[_WATCH] = initial_master_watch(_full(numbers))
+    display[_POSITIONS] = display[_LAST_POSITIONS] = q
+    display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
     return display
 
 
@@ -100,33 +102,38 @@ def display_into(wrench, device, numbers, period, J, drive):
         J: (6, 6) scratch.
         drive: (27,) output for `MasterDevice`, with the displayed wrench and a `Fault`.
     """
-    q, fault = device[_ANGLES], _NONE
+    q, fault = device[_POSITIONS], _NO_FAULT
     put(drive, 6, device, 6, _WATCH.stop - 6)
     if sound(q):
-        put(drive, _LAST_ANGLES.start, q, 0, 6)
+        put(drive, _LAST_POSITIONS.start, q, 0, 6)
     else:
-        q, fault = device[_LAST_ANGLES], _HAND
+        q, fault = device[_LAST_POSITIONS], _HAND_FAULT
     if not sound(wrench):
-        fault = _WRENCH
-    displayed, drive[_FAULT] = drive[_LAST], fault
+        fault = _WRENCH_FAULT
+    displayed, drive[_FAULT] = drive[_DISPLAYED], fault
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
-    if fault != _NONE or device[_CHANGED] != 0.0:
-        _change(device, numbers, period, drive)
+    if fault != _NO_FAULT or device[_CHANGED] != 0.0:
+        _fade(device, numbers, period, drive)
     motor_torque_into(displayed, q, numbers, J, drive[:6])
 
 
 @njit(cache=True)
-def _change(device, numbers, period, drive):
+def _fade(device, numbers, period, drive):
     """Fade out during a fault, and cross-fade to the command afterwards.
 
     Arguments as for `display_into`; `drive` contains command and fault, and is changed.
     """
-    displayed, last, limits, full = drive[_LAST], device[_LAST], np.empty(2), _full(numbers)
-    fault = drive[_FAULT] != _NONE
-    drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
+    displayed, last, limits, full = (
+        drive[_DISPLAYED],
+        device[_DISPLAYED],
+        np.empty(2),
+        _peak_wrench(numbers),
+    )
+    fault = drive[_FAULT] != _NO_FAULT
+    drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
     # Complete within STOP, so that the direction does not jump either.
-    share = 0.0 if fault else period / max(STOP + period - drive[_SOUND], period)
+    share = 0.0 if fault else period / max(STOP + period - drive[_TIME_SINCE_FAULT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)
@@ -139,7 +146,7 @@ def _change(device, numbers, period, drive):
         drive[_FAULT] = _RESUMING
 
 
-class Numbered(Protocol):
+class DisplayDevice(Protocol):
     """Device of any kind with `numbers`."""
 
     @property
@@ -174,7 +181,7 @@ class ForceDisplay(LeafSystem):
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: Numbered) -> None:
+    def __init__(self, period: float, device: DisplayDevice) -> None:
         super().__init__()
         self._period = period
         self._numbers = device.numbers
@@ -204,10 +211,10 @@ class ForceDisplay(LeafSystem):
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_LAST])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT]
 
     def _calc_both(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_SHOWN])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT])

@@ -42,9 +42,16 @@ from drake_teleop.station.slave.servo import mass_matrix
 Array = NDArray[np.float64]
 
 # Rows of `LeaderDevice.joints`.
-(_COULOMB, _VISCOUS, _LOWER, _UPPER, _STOP_STIFFNESS, _STOP_DAMPING, _TORQUE_LIMIT, _CARRIED) = (
-    range(8)
-)
+(
+    _COULOMB,
+    _VISCOUS,
+    _LOWER,
+    _UPPER,
+    _STOP_STIFFNESS,
+    _STOP_DAMPING,
+    _TORQUE_LIMIT,
+    _WEIGHT_SHARE,
+) = range(8)
 # Coulomb friction is tanh(speed / this), so a joint creeps below it.
 FRICTION_SPEED = 0.02  # rad/s or m/s, E
 # Natural frequency of the critically damped end stops with the joint's inertia, E.
@@ -110,7 +117,7 @@ def motors_into(bare, arm, joints, q, F, torque):
     inverse_dynamics(bare, q, still, still, torque)
     jacobian(arm, q, J)
     for i in range(n):
-        torque[i] *= joints[_CARRIED, i]
+        torque[i] *= joints[_WEIGHT_SHARE, i]
         for k in range(6):
             torque[i] += J[k, i] * F[k]
         limit = joints[_TORQUE_LIMIT, i]
@@ -163,7 +170,7 @@ def step_leader(
 
 
 @njit(cache=True)
-def _strongest(bare, arm, joints, q, wrench, shortened):
+def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
     """Write `wrench` (6,), scaled down to the motors' limits at q."""
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
@@ -287,7 +294,7 @@ class LeaderDevice:
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
 
-def of_the_joints(
+def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
     """Return (8, n) for `LeaderDevice.joints`; end stops scale with the inertia at home.
@@ -393,7 +400,7 @@ class LeaderDisplay(ForceDisplay):
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _strongest(*self._constants, q, wrench, self._shortened)
+            _limit_to_motors(*self._constants, q, wrench, self._shortened)
             wrench = self._shortened
         display_into(
             wrench,

@@ -14,7 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import choice, plain, quantity
-from drake_teleop.station.master.leader import LeaderDevice, of_the_joints
+from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.master.numbers import (
     HAND_INERTIA,
     HAND_MASS,
@@ -81,7 +81,7 @@ class Leader:
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
                 raise DrakeTeleopError(
-                    "a leader arm needs it", where=f"{where}.{name}", remedy="name it"
+                    "is required for a leader arm", where=f"{where}.{name}", remedy="set it"
                 )
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
@@ -128,14 +128,14 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home(arm)
-        bare = _at_E(arm, home, np.array(position))
+        bare = _with_end_frame_E(arm, home, np.array(position))
         phi = bare.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
         held = bare.with_load(phi)
-        coulomb, viscous = (self._of_all(name, arm, 0.0) for name in ("friction", "damping"))
-        limit = self._of_all("torque_limit", arm, arm.effort_limit)
-        joints = of_the_joints(held, home, coulomb, viscous, limit, self.weight_carried)
+        coulomb, viscous = (self._per_joint(name, arm, 0.0) for name in ("friction", "damping"))
+        limit = self._per_joint("torque_limit", arm, arm.effort_limit)
+        joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
         numbers = np.zeros(NUMBERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
@@ -144,11 +144,11 @@ class Leader:
 
     def _home(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._of_all("home", arm, 0.0)
+            return self._per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
-    def _of_all(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+    def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         """Return (n,) values of a list with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
@@ -160,7 +160,7 @@ class Leader:
         return np.broadcast_to(np.array(values if values else otherwise, float), (n,)).copy()
 
 
-def _at_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
     """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)

@@ -32,10 +32,10 @@ from drake_teleop.station.master.numbers import (
 )
 
 # Coulomb friction is tanh(speed / this), so the device creeps below it.
-SLIDING_SPEED, TURNING_SPEED = 0.002, 0.01  # m/s, rad/s, E
+FRICTION_SPEED, FRICTION_ANGULAR_SPEED = 0.002, 0.01  # m/s, rad/s, E
 # End stops: spring and damper that never pull, E.
 _STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
-_TURN_STIFFNESS, _TURN_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
+_ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
 
 @njit(cache=True)
@@ -62,7 +62,7 @@ def mass_matrix_into(q, J, device, M):
 
 
 @njit(cache=True)
-def _against(motion, coulomb, viscous, speed_of_tanh):
+def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
     """Return the ratio of friction to velocity."""
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
@@ -71,7 +71,7 @@ def _against(motion, coulomb, viscous, speed_of_tanh):
 
 
 @njit(cache=True)
-def _stop(beyond, rate, stiffness, damping):
+def _stop_force(beyond, rate, stiffness, damping):
     """Return the force of an end stop at penetration `beyond` (either sign); it never pulls."""
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
@@ -81,7 +81,7 @@ def _stop(beyond, rate, stiffness, damping):
 
 
 @njit(cache=True)
-def _beyond(x, half):
+def _penetration(x, half):
     return x - half if x > half else (x + half if x < -half else 0.0)
 
 
@@ -91,10 +91,10 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS] + device[HAND_MASS]
-    drag = _against(v[:3], device[COULOMB.start], device[VISCOUS.start], SLIDING_SPEED)
+    drag = _friction_factor(v[:3], device[COULOMB.start], device[VISCOUS.start], FRICTION_SPEED)
     for i in range(3):
-        beyond = _beyond(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
-        stop = _stop(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        beyond = _penetration(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
+        stop = _stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
     # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
@@ -104,21 +104,25 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
         turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _against(omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], TURNING_SPEED)
+    drag = _friction_factor(
+        omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], FRICTION_ANGULAR_SPEED
+    )
     # Joint torques of motors and stops, then of moments about B's axes.
-    pushed = np.empty(3)
+    torque = np.empty(3)
     for i in range(3):
-        beyond = _beyond(q[3 + i], device[TURN][i])
-        pushed[i] = motor[3 + i] + _stop(beyond, v[3 + i], _TURN_STIFFNESS, _TURN_DAMPING)
+        beyond = _penetration(q[3 + i], device[TURN][i])
+        torque[i] = motor[3 + i] + _stop_force(
+            beyond, v[3 + i], _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
+        )
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
-            pushed[i] += J[3 + k, 3 + i] * about
+            torque[i] += J[3 + k, 3 + i] * about
     # J^T J of the rotational axes is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
     s5 = math.sin(q[4])
-    of_two = 1.0 - s5 * s5
-    vdot[3] = (pushed[0] + s5 * pushed[2]) / (of_two * inertia)
-    vdot[4] = pushed[1] / inertia
-    vdot[5] = (pushed[2] + s5 * pushed[0]) / (of_two * inertia)
+    determinant = 1.0 - s5 * s5
+    vdot[3] = (torque[0] + s5 * torque[2]) / (determinant * inertia)
+    vdot[4] = torque[1] / inertia
+    vdot[5] = (torque[2] + s5 * torque[0]) / (determinant * inertia)
 
 
 @njit(cache=True)
@@ -142,7 +146,7 @@ def damping_matrix(
     """Return (6, 6) joint forces against dq/dt, as `HapticDevice.damping_matrix`."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
-    of_tanh = np.array([SLIDING_SPEED, TURNING_SPEED])
+    of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
     drag = device[VISCOUS][[0, 3]] + creeping * device[COULOMB][[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
@@ -162,7 +166,7 @@ def inverse_kinematics(
     return q
 
 
-def _beyond_workspace(
+def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
     """Return (..., 6) axes of q outside the workspace by more than a margin [m, rad]."""
@@ -172,7 +176,7 @@ def _beyond_workspace(
 
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (N,) whether an end stop is active at q (N, 6); fixed rotations have none."""
-    return (_beyond_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
+    return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1
     )
 
@@ -183,7 +187,7 @@ def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
     Raises:
         DrakeTeleopError: if they are outside.
     """
-    if _beyond_workspace(q, device, 1e-9).any():
+    if _outside_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[TURN]))

@@ -36,8 +36,8 @@ from drake_teleop.station.operator.perception import Perception, perceive_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-_FORCE_LIMIT = 60.0  # N, largest controlled force of a hand on a stylus, E
-_TORQUE_LIMIT = 2.0  # N m, E
+_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, E
+_MAX_TORQUE_NM = 2.0  # N m, E
 
 
 @dataclass(frozen=True)
@@ -225,12 +225,12 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit(wrench[:3], _FORCE_LIMIT)
-    _limit(wrench[3:], _TORQUE_LIMIT)
+    _limit(wrench[:3], _MAX_FORCE_N)
+    _limit(wrench[3:], _MAX_TORQUE_NM)
 
 
 @njit(cache=True)
-def _wanted_into(packed, start, moving, memory, time, pose, twist):
+def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
     """Write the intended motion: the intent's segments plus the task's plan.
 
     `start` (7,) moves with the twist `moving` (6,). An empty `memory` means no task.
@@ -246,8 +246,8 @@ def _wanted_into(packed, start, moving, memory, time, pose, twist):
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip
-    """Call `_wanted_into` and `hand_wrench_into` in one compiled call."""
-    _wanted_into(packed, start, moving, memory, time, wanted, wanted_twist)
+    """Call `_intended_motion_into` and `hand_wrench_into` in one compiled call."""
+    _intended_motion_into(packed, start, moving, memory, time, wanted, wanted_twist)
     hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
 
 
@@ -290,7 +290,7 @@ def _look_feel_decide(
     decision.decide(task, person, time, seen, felt, task_state, memory)
 
 
-def _ring(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a ring buffer (n, k) for a delay [s], filled with `start`."""
     return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
 
@@ -340,7 +340,11 @@ class Operator(LeafSystem):
         )
         # Segments, their reference pose and its twist.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
-        self._wanted, self._wanted_twist, self._intended = np.empty(7), np.empty(6), np.empty(7)
+        self._intent_pose, self._intent_twist, self._commanded_pose = (
+            np.empty(7),
+            np.empty(6),
+            np.empty(7),
+        )
         self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
@@ -371,9 +375,9 @@ class Operator(LeafSystem):
         """Declare ports, states and event of the task; return the plan's ticket."""
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._sights = _ring(senses.vision_delay + training.backward, np.zeros(3))
-        self._touches = _ring(senses.reaction_time, nothing_felt)
-        self._head = (
+        self._sights = _ring_buffer(senses.vision_delay + training.backward, np.zeros(3))
+        self._touches = _ring_buffer(senses.reaction_time, nothing_felt)
+        self._task_parameters = (
             decision.pack_task(task),
             decision.pack_person(training, senses, config.movement),
             senses.parameters(decision.PERIOD),
@@ -400,7 +404,7 @@ class Operator(LeafSystem):
         state[3] = state[3].reshape(self._sights.shape)
         state[4] = state[4].reshape(self._touches.shape)
         _look_feel_decide(
-            *self._head,
+            *self._task_parameters,
             context.get_time(),
             self._wrench.Eval(context),
             self._twist.Eval(context),
@@ -420,13 +424,13 @@ class Operator(LeafSystem):
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not unit_pose_into(pose, twist, self._intended):
+        if not unit_pose_into(pose, twist, self._commanded_pose):
             raise DrakeTeleopError(
-                f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
+                f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
                 where="intended_pose",
                 remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
             )
-        return self._no_segments, self._intended, twist
+        return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_now(
@@ -434,8 +438,8 @@ class Operator(LeafSystem):
             self._memory(context),
             context.get_time(),
             self._impedance,
-            self._wanted,
-            self._wanted_twist,
+            self._intent_pose,
+            self._intent_twist,
             self._pose.Eval(context),
             self._twist.Eval(context),
             output.get_mutable_value(),
@@ -443,4 +447,4 @@ class Operator(LeafSystem):
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
         time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
-        _wanted_into(*self._intention(context), memory, time, pose, self._wanted_twist)
+        _intended_motion_into(*self._intention(context), memory, time, pose, self._intent_twist)

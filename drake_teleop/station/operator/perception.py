@@ -28,19 +28,19 @@ Array = NDArray[np.float64]
 
 # Random walks of [m, b, c, u_0 (3)] per second, and initial standard deviations; all E.
 _WALK = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
-_FIRST_DOUBT = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_RESIDUAL = 0.007  # N / sqrt(Hz), measurement noise of the filter: 0.1 N at 200 Hz, E
-_SLOW = 0.01  # m/s, v_0, about that of the device's friction
-_PARAMETERS = 6
+_INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
+_NOISE_DENSITY = 0.007  # N / sqrt(Hz), measurement noise of the filter: 0.1 N at 200 Hz, E
+_FRICTION_SPEED = 0.01  # m/s, v_0, about that of the device's friction
+_NUM_PARAMETERS = 6
 
 # Memory: filtered u and v, and those a sample ago (12), held |u_expected|, count, estimate
 # [m, b, c, u_0 (3)], and its covariance.
 _HELD, _COUNT, _THETA = 12, 13, 14
-_P = _THETA + _PARAMETERS
-SIZE = _P + _PARAMETERS**2
+_P = _THETA + _NUM_PARAMETERS
+MEMORY_SIZE = _P + _NUM_PARAMETERS**2
 """Size of the memory of `perceive_into`."""
 
-EXCESS, THRESHOLD, NOTICED, PERCEIVED = 0, 3, 4, 5
+EXCESS, THRESHOLD, NOTICED, OUTPUT_SIZE = 0, 3, 4, 5
 """Indices of the output of `perceive_into`, and its size."""
 
 
@@ -68,8 +68,8 @@ class Perception:
 
 def initial_memory() -> Array:
     """Return the memory of `perceive_into` before the first step."""
-    memory = np.zeros(SIZE)
-    memory[_P:] = np.diag(_FIRST_DOUBT**2).ravel()
+    memory = np.zeros(MEMORY_SIZE)
+    memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
 
 
@@ -78,7 +78,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     """Update the force perception by one step; inputs are not checked.
 
     Args:
-        memory: (SIZE,) of `initial_memory`, updated.
+        memory: (MEMORY_SIZE,) of `initial_memory`, updated.
         parameters: (4,) of `Perception.parameters`.
         dt: time since the last step [s].
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
@@ -98,19 +98,19 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
     memory[_COUNT] += 1.0
     # Midway between two samples, where the velocity difference gives the acceleration.
-    speed = _SLOW * _SLOW
+    speed = _FRICTION_SPEED * _FRICTION_SPEED
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
     theta, expected_square, excess_square = memory[_THETA:_P], 0.0, 0.0
-    rows, excess = np.zeros((3, _PARAMETERS)), out[:3]
+    rows, excess = np.zeros((3, _NUM_PARAMETERS)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
         a = (memory[3 + i] - memory[9 + i]) / dt
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3 + i] = a, v, v / speed, 1.0
         felt = 0.5 * (memory[i] + memory[6 + i]) + hand_mass * a
         expected = 0.0
-        for j in range(_PARAMETERS):
+        for j in range(_NUM_PARAMETERS):
             expected += rows[i, j] * theta[j]
         excess[i] = felt - expected
         expected_square += expected * expected
@@ -120,27 +120,29 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD]
     out[NOTICED] = 1.0 if noticed else 0.0
     if not noticed:
-        _learn(theta, memory[_P:].reshape(_PARAMETERS, _PARAMETERS), rows, excess, dt)
+        _update_expectation(
+            theta, memory[_P:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS), rows, excess, dt
+        )
 
 
 @njit(cache=True)
-def _learn(theta, P, rows, excess, dt):
+def _update_expectation(theta, P, rows, excess, dt):
     """Update the Kalman filter of a random walk, row by row."""
-    gain = np.empty(_PARAMETERS)
-    for j in range(_PARAMETERS):
+    gain = np.empty(_NUM_PARAMETERS)
+    for j in range(_NUM_PARAMETERS):
         P[j, j] += _WALK[j] * _WALK[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = excess[i], _RESIDUAL * _RESIDUAL / dt
-        for j in range(_PARAMETERS):
+        residual, variance = excess[i], _NOISE_DENSITY * _NOISE_DENSITY / dt
+        for j in range(_NUM_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0
-            for k in range(_PARAMETERS):
+            for k in range(_NUM_PARAMETERS):
                 gain[j] += P[j, k] * rows[i, k]
             variance += rows[i, j] * gain[j]
-        for j in range(_PARAMETERS):
+        for j in range(_NUM_PARAMETERS):
             theta[j] += gain[j] * residual / variance
-            for k in range(_PARAMETERS):
+            for k in range(_NUM_PARAMETERS):
                 P[j, k] -= gain[j] * gain[k] / variance
 
 
@@ -181,9 +183,9 @@ def perceive(
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
         raise DrakeTeleopError(
-            "does not rise", where="t", remedy="give two samples or more, in order of their time"
+            "is not increasing", where="t", remedy="give at least two samples in order of time"
         )
-    dt, out = float(np.median(steps)), np.empty((len(times), PERCEIVED))
+    dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.parameters(dt)
     _perceive_all(times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out)
     return out

@@ -55,27 +55,27 @@ from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
 _SOURCES = ("encoders", "accelerometer", "fused")
 #: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
 #: gains depend on its square root at most.
-_REACH = 0.4
+_RMS_LEVER_M = 0.4
 #: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
-_LEAST_ANGLE_STD, _LEAST_ACCELERATION_STD = 1e-8, 1e-6
+_MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
 # accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
-_PERIOD, _ENCODERS, _FUSED, _WAITS = 0, 1, 2, 3
-_PLACE = 6  # (3,) position of the accelerometer
-_ORIENTATION = _PLACE + 3  # (3, 3)
-_FILTERS = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
+_PERIOD, _ENCODERS, _FUSED, _DELAYS = 0, 1, 2, 3
+_POSITION = 6  # (3,) position of the accelerometer
+_ORIENTATION = _POSITION + 3  # (3, 3)
+_LOW_PASSES = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
 _SECTIONS = 4
-_ANGULAR_GAINS = _FILTERS + 5 * _SECTIONS
+_ANGULAR_GAINS = _LOW_PASSES + 5 * _SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
-# Memory: samples taken, samples for which the flag stays; state of `_track` for angle and
+# Memory: samples taken, samples for which the flag stays; state of `_update_filters` for angle and
 # displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
 # kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
-_HELD = 1
+_FLAG_SAMPLES = 1
 _ANGULAR = 2
-_TRACK = 24
-_LINEAR = _ANGULAR + _TRACK
-_MOTION = _LINEAR + _TRACK
+_FILTER_SIZE = 24
+_LINEAR = _ANGULAR + _FILTER_SIZE
+_MOTION = _LINEAR + _FILTER_SIZE
 _JOINTS = _MOTION + MOTION_SIZE
 _PER_JOINT = 5 + 2 * _SECTIONS
 #: Index in the last row of `ArmModel.table`.
@@ -177,7 +177,7 @@ def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, perio
     The wrench waits whole samples, so that only the encoders' angles are interpolated.
     """
     wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _lag(_filters(config, sensor, period)) * period
+    encoders += _group_delay(_filters(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -192,7 +192,7 @@ def motion_gains(
     angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
         steady_state(angle_std, alpha_std.mean(), drift, period),
-        steady_state(angle_std * _REACH, s_std.mean(), config.acceleration_drift, period),
+        steady_state(angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period),
     )
 
 
@@ -217,7 +217,7 @@ def estimated_motion_std(
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _angle_std(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _REACH, 0.0, alpha], 3)
+    return np.repeat([alpha * _RMS_LEVER_M, 0.0, alpha], 3)
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
@@ -225,7 +225,7 @@ def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
 
     Assumption: n joint axes of random direction; each direction has a third of their variance.
     """
-    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _LEAST_ANGLE_STD)
+    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
 
@@ -233,7 +233,7 @@ def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return (3,) standard deviations of s, moved to So (adds alpha x r), and of alpha."""
-    std = np.maximum(sensor.motion_std(), _LEAST_ACCELERATION_STD)
+    std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
     x, y, z = p_SoAo_S**2
@@ -299,7 +299,7 @@ def _filters(
     return filters
 
 
-def _lag(sections: NDArray[np.float64]) -> float:
+def _group_delay(sections: NDArray[np.float64]) -> float:
     """Return the group delay of second-order sections at zero frequency [samples]."""
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
@@ -323,9 +323,9 @@ def estimate_into(constants, memory, arm, reading, sample):
     angles = sample[JOINT_POSITION]
     put(angles, 0, reading, READ_ANGLES.start, n)
     if starts:
-        settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
-    low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
-    _wait(constants, memory, n, reading, sample)
+        settle(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
+    low_pass(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
+    _delay_paths(constants, memory, n, reading, sample)
     if starts:
         for i in range(3 * n):
             joints[2 * n + i] = angles[i % n]
@@ -334,12 +334,12 @@ def estimate_into(constants, memory, arm, reading, sample):
     if constants[_ENCODERS] != 0.0:
         put(sample, MOTION.start, motion, 0, 9)
     else:
-        _accelerate(constants, memory, arm[n, _GRAVITY:], motion, sample)
+        _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def _wait(constants, memory, n, reading, sample):
+def _delay_paths(constants, memory, n, reading, sample):
     """Delay wrench, accelerometer (written in place of s and omega) and angles.
 
     The saturation flag stays while any part of its reading waits.
@@ -355,20 +355,21 @@ def _wait(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             put(line, k * width, line, 0, width)
-    wrench = int(constants[_WAITS]) * width
-    acceleration = int(constants[_WAITS + 1]) * width
+    wrench = int(constants[_DELAYS]) * width
+    acceleration = int(constants[_DELAYS + 1]) * width
     waited, read = sample[WRENCH], sample[MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_WAITS + 2])
-    older = constants[_WAITS + 2] - wait
+    wait = int(constants[_DELAYS + 2])
+    older = constants[_DELAYS + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    memory[_HELD] = float(rows) if reading[READ_SATURATED] != 0.0 else max(memory[_HELD] - 1.0, 0.0)
-    sample[SATURATED] = 1.0 if memory[_HELD] > 0.0 else 0.0
+    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES] - 1.0
+    memory[_FLAG_SAMPLES] = max(flagged, 0.0)
+    sample[SATURATED] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
 
 
 @njit(cache=True)
@@ -387,7 +388,7 @@ def _differentiate(constants, joints, angles):
 
 
 @njit(cache=True)
-def _accelerate(constants, memory, gravity, motion, sample):
+def _convert_accelerometer(constants, memory, gravity, motion, sample):
     """Convert the accelerometer's reading in `sample` to s, omega and alpha.
 
     `motion` is the encoders' motion without accelerations.
@@ -405,11 +406,11 @@ def _accelerate(constants, memory, gravity, motion, sample):
         if starts:
             put(angular, 3, omega, 0, 3)
             put(angular, 15, R, 0, 9)
-        _turned(angular[15:], R, motion)
+        _rotation_vector_into(angular[15:], R, motion)
         put(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
-        _track(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
+        _update_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
         for i in range(3):
             angular[12 + i] -= motion[i]
             alpha[i] += motion[i]
@@ -417,7 +418,7 @@ def _accelerate(constants, memory, gravity, motion, sample):
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
     # From Ao to So, with r = p_SoAo_S.
-    r, w = three(constants, _PLACE), three(omega, 0)
+    r, w = three(constants, _POSITION), three(omega, 0)
     s[0], s[1], s[2] = minus(s, plus_cross(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
@@ -428,7 +429,7 @@ def _accelerate(constants, memory, gravity, motion, sample):
             s[i] -= linear[12 + i]
         a_W = motion[3:6]  # reuses the encoders' omega
         a_W[0], a_W[1], a_W[2] = plus(apply(R, s), gravity)
-        _track(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
+        _update_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
         correction = apply(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]
@@ -437,7 +438,7 @@ def _accelerate(constants, memory, gravity, motion, sample):
 
 
 @njit(cache=True)
-def _turned(before, R, angle):
+def _rotation_vector_into(before, R, angle):
     """Write the rotation vector from one R_WS (by rows) to the next, in S, for small angles."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -448,7 +449,7 @@ def _turned(before, R, angle):
 
 
 @njit(cache=True)
-def _track(gains, period, moved, acceleration, kept):
+def _update_filters(gains, period, moved, acceleration, kept):
     """Update the three filters of `steady_state`.
 
     The rate belongs to the middle between two samples. The mean acceleration is Numerov's, so that

@@ -45,13 +45,13 @@ PRESET_NAMES = (
     *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
     *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
 )
-_LOW_PASS = ("none", "before_noise", "after_converter")
+_LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
-_ROTATION_ERROR = 1e-6
+_ROTATION_TOLERANCE = 1e-6
 # Overload limit in ranges.
-_OVERLOAD = 10.0
+_OVERLOAD_FACTOR = 10.0
 # The low-pass overshoots by 11 % of a step, which may be two ranges.
-_OVERSHOOT = 1.5
+_OVERSHOOT_FACTOR = 1.5
 
 
 @settings
@@ -87,7 +87,9 @@ class WristSensorConfig:
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "its axes, row by row"
     )
 
-    low_pass: str = choice("after_converter", _LOW_PASS, "where the low-pass stands, if anywhere")
+    low_pass: str = choice(
+        "after_converter", _LOW_PASS_CHOICES, "where the low-pass stands, if anywhere"
+    )
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white, 1 sigma of each raw sample")
@@ -163,7 +165,7 @@ class WristSensorConfig:
 
     def largest_wrench(self) -> NDArray[np.float64]:
         """Return (6,) the largest valid reading [N, N m]."""
-        share = _OVERSHOOT if self.saturates and not self.ideal else _OVERLOAD
+        share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
@@ -218,7 +220,7 @@ class WristSensorConfig:
         """
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
-        if error > _ROTATION_ERROR or np.linalg.det(R_SA) < 0:
+        if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
             raise DrakeTeleopError(
                 "is not a rotation: its rows are not unit vectors at right angles, right-handed",
                 where=f"{where}.R_SA",
@@ -346,14 +348,14 @@ READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 _DRIFT, _NOISE, _WALK, _QUANTA, _LIMITS = range(12, 72, 12)
 _WRENCH = 72  # (6, 6)
 _MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
-_PLACE = _MOTION + 18  # (3,)
-_FILTER = _PLACE + 3  # (2, 5)
-_LOW_PASS_PLACE = _FILTER + 5 * _SECTIONS
-_LATENCIES = _LOW_PASS_PLACE + 1  # (3,)
+_POSITION = _MOTION + 18  # (3,)
+_FILTER = _POSITION + 3  # (2, 5)
+_LOW_PASS_STAGE = _FILTER + 5 * _SECTIONS
+_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
 _ENCODER = _LATENCIES + 3
 _IDEAL = _ENCODER + 1
 _OVERLOADS = _IDEAL + 1  # (6,)
-_BEFORE, _AFTER = 1.0, 2.0  # as in _LOW_PASS
+_BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
 # Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
 # channels, saturation of force and of acceleration, angles.
 _WALKS = 1
@@ -398,8 +400,13 @@ def sensor_chain(
             (angular @ R_SA.T).ravel(),
             p_SoAo_S,
             sections.ravel(),
-            [_LOW_PASS.index(config.low_pass), *latencies, config.encoder_resolution, config.ideal],
-            _OVERLOAD * config.ranges()[:6],
+            [
+                _LOW_PASS_CHOICES.index(config.low_pass),
+                *latencies,
+                config.encoder_resolution,
+                config.ideal,
+            ],
+            _OVERLOAD_FACTOR * config.ranges()[:6],
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
@@ -407,7 +414,7 @@ def sensor_chain(
 
 
 @njit(cache=True)
-def believable(constants, truth):
+def is_plausible(constants, truth):
     """Return whether the truth is finite and does not overload the sensor.
 
     Args:
@@ -450,26 +457,26 @@ def read_into(constants, memory, noise, truth, reading):
     row = memory[_LINE:][:width]
     channels = row[:_CHANNELS]
     walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
-    sections, place = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
+    sections, place = constants[_FILTER:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % NOISE_BLOCK == 0:
         for i in range(_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
 
     _calibrate(constants, truth, channels)
-    if place == _BEFORE:
+    if place == _BEFORE_NOISE:
         if count == 0:
             settle(sections, filtered, channels)
         low_pass(sections, filtered, channels)
     for i in range(_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
-    if place == _AFTER and count == 0:
+    if place == _AFTER_CONVERTER and count == 0:
         settle(sections, filtered, channels)
     first = _CHANNELS * (count % NOISE_BLOCK)
     for i in range(_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
     row[_CHANNELS] = _convert(constants, 0, 6, channels)
     row[_CHANNELS + 1] = _convert(constants, 6, 12, channels)
-    if place == _AFTER:
+    if place == _AFTER_CONVERTER:
         low_pass(sections, filtered, channels)
     quantum = constants[_ENCODER]
     for i in range(_ROW, width):
@@ -513,7 +520,7 @@ def _calibrate(constants, truth, out):
         for j in range(6):
             value += constants[_WRENCH + 6 * i + j] * wrench[j]
         out[i] = value
-    r = three(constants, _PLACE)
+    r = three(constants, _POSITION)
     at_Ao = plus_cross(plus_cross(s, alpha, r), omega, cross(omega, r))
     out[6], out[7], out[8] = apply(nine(constants, _MOTION), at_Ao)
     out[9], out[10], out[11] = apply(nine(constants, _MOTION + 9), alpha)

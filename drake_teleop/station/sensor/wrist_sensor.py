@@ -60,7 +60,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     OFFSET,
     TRUE_ANGLES,
     WristSensorConfig,
-    believable,
+    is_plausible,
     read_into,
     sensor_chain,
 )
@@ -85,16 +85,16 @@ from drake_teleop.station.slave.tool_contact import (
 Array = NDArray[np.float64]
 
 #: Tolerance of equal instants, in periods.
-_SAME = 1e-6
+_TIME_TOLERANCE = 1e-6
 #: Largest number of queued steps.
-_LONGEST = 16
+_MAX_QUEUED_STEPS = 16
 #: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
 #: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD, _ALIKE = 0.1, 1e-6
+_CHECK_PERIOD, _ACCELERATION_TOLERANCE = 0.1, 1e-6
 #: Samples for which a lost sample stays flagged, so that the log contains the flag.
-_SHOWS = 40
+_LOST_FLAG_SAMPLES = 40
 #: Value of `touching_W` in `sample_step` that selects the compiled contact law.
-_BY_LAW = np.zeros(0)
+_USE_CONTACT_LAW = np.zeros(0)
 
 
 @njit(cache=True)
@@ -134,7 +134,7 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 
 @njit(cache=True)
-def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
+def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
     """Write one sample of the state x into `memory`, see `sample_step`."""
     arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
@@ -148,8 +148,8 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = BEFORE_JOINTS + n
     sample = memory[:size]
     put(memory, size, memory, 0, size)
-    if not believable(constants, truth):  # keeps it out of the filters
-        sample[SATURATED] = LOST + _SHOWS
+    if not is_plausible(constants, truth):  # keeps it out of the filters
+        sample[SATURATED] = LOST + _LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
@@ -165,7 +165,7 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def remember_step(tail, time, state, around):
+def queue_step(tail, time, state, around):
     """Append the end of a step to the queue of `sample_step`, see its `memory`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
@@ -175,11 +175,11 @@ def remember_step(tail, time, state, around):
 
 
 @njit(cache=True, borrows=True)
-def _postpone(memory, tail, longest, time, state, around):
+def _try_queue_step(memory, tail, longest, time, state, around):
     """Append the end of a step to the queue in `memory`; return whether there was room."""
     if memory[tail + 1] >= longest:
         return False
-    remember_step(memory[tail:], time, state, around)
+    queue_step(memory[tail:], time, state, around)
     return True
 
 
@@ -251,7 +251,7 @@ def sample_step(
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
-        if (count + _SAME) * period >= until:
+        if (count + _TIME_TOLERANCE) * period >= until:
             continue
         _torque_at(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
@@ -259,7 +259,7 @@ def sample_step(
             _torque_at(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
-        while (count + _SAME) * period < until:
+        while (count + _TIME_TOLERANCE) * period < until:
             u = (count * period - start[0]) / h
             _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
@@ -267,17 +267,17 @@ def sample_step(
                 interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
             _torque_at(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
-            _take(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
+            _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
     # A step of rounding length may have ended just before and have taken this sample.
-    taken = (count - 1.0 + _SAME) * period > time
+    taken = (count - 1.0 + _TIME_TOLERANCE) * period > time
     put(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _SAME) * period < time:
-        _take(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
+    if until_now and (count - _TIME_TOLERANCE) * period < time:
+        _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
-    remember_step(tail, time, state, around)
+    queue_step(tail, time, state, around)
 
 
 class WristSensor(LeafSystem):
@@ -339,12 +339,12 @@ class WristSensor(LeafSystem):
         if not config.ideal:
             first[WRENCH] += config.offset
         # Contact needs many steps per torque sample, so queueing them saves time.
-        self._beyond = contact.beyond
+        self._beyond_contact_law = contact.beyond
         # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
-        self._exact = config.ideal or bool(contact.beyond)
-        self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
+        self._uses_plant_contact = config.ideal or bool(contact.beyond)
+        self._max_queued_steps = _MAX_QUEUED_STEPS if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
-        tail = np.zeros(2 + self._longest * (2 * n + 1 + len(self._around)))
+        tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
@@ -354,12 +354,12 @@ class WristSensor(LeafSystem):
             tuple(contact.moving),
             contact.plant_size,
         )
-        self._twins = slave.config, slave.environment, slave.start
+        self._twin_arguments = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
-        self._most_told = 2 * self._longest + int(held / period) + 4
+        self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
-        self._holds = (held, NOISE_BLOCK * period)
-        self._no_noise, self._nothing, self._no_rate = (
+        self._event_periods = (held, NOISE_BLOCK * period)
+        self._no_noise, self._zero_wrench, self._no_rate = (
             np.zeros(NOISE_SIZE),
             np.zeros(6),
             np.zeros(0),
@@ -383,7 +383,7 @@ class WristSensor(LeafSystem):
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
-        self._remains = slice(len(first) + 1, None)  # memory in the output
+        self._memory_slice = slice(len(first) + 1, None)  # memory in the output
         self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
         # Without the acceleration: each change in the plant would invalidate twice.
         pushes = (self._torque, self._rate, self._applied)
@@ -394,7 +394,7 @@ class WristSensor(LeafSystem):
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
-        if self._beyond:
+        if self._beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update)
@@ -418,7 +418,7 @@ class WristSensor(LeafSystem):
     @property
     def beyond(self) -> str:
         """Contact outside the compiled contact law, see `Contact`."""
-        return self._beyond
+        return self._beyond_contact_law
 
     @property
     def moves(self) -> str:
@@ -440,21 +440,23 @@ class WristSensor(LeafSystem):
 
     def take_samples(self, context: Context) -> None:
         """Take the samples before now and store the resulting discrete state."""
-        seen = self._seen(context)
-        self._sample(context, seen, self._near(*seen), False, _BY_LAW, self._result)
-        context.SetDiscreteState(self._result[self._remains])
+        seen = self._states(context)
+        self._sample(
+            context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
+        )
+        context.SetDiscreteState(self._result[self._memory_slice])
 
-    def bring_up_to_date(self, context: Context) -> None:
+    def reset_queue(self, context: Context) -> None:
         """Reset the sample queue to the current time.
 
         Call this after setting states manually.
         """
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
-        tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
-        remember_step(tail, time, *self._seen(context))
+        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
+        queue_step(tail, time, *self._states(context))
 
-    def _seen(self, context: Context) -> tuple[Array, Array]:
+    def _states(self, context: Context) -> tuple[Array, Array]:
         """Return [q; v] of the arm, and `_surroundings`."""
         return self._state.Eval(context), self._surroundings(context)
 
@@ -465,25 +467,25 @@ class WristSensor(LeafSystem):
         return self._around if self._sheet is None else self._sheet.Eval(context)
 
     def _applied_W(self, context: Context) -> Array:
-        return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
+        return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _near(self, state: Array, around: Array) -> int:
+    def _contact_level(self, state: Array, around: Array) -> int:
         """Return the level of `nearness`."""
         if self._contacts is None:
             return FAR
-        if self._beyond:
+        if self._beyond_contact_law:
             return TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
         return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
-    def _touching_W(self, context: Context) -> Array:
+    def _plant_contact_W(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _touching_So_W(self, context: Context) -> Array:
+    def _plant_contact_So_W(self, context: Context) -> Array:
         """Return the contact wrench on the tool about So, in W."""
-        wrench_W = self._touching_W(context).copy()
+        wrench_W = self._plant_contact_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
@@ -506,14 +508,14 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._seen(context)
-        near = self._near(*seen)
+        seen = self._states(context)
+        near = self._contact_level(*seen)
         if near == FAR:
-            touching_W = self._nothing
-        elif near == WATCHED or self._exact:
-            touching_W = self._touching_W(context)
+            touching_W = self._zero_wrench
+        elif near == WATCHED or self._uses_plant_contact:
+            touching_W = self._plant_contact_W(context)
         else:
-            touching_W = _BY_LAW
+            touching_W = _USE_CONTACT_LAW
         self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
 
     def _sample(
@@ -531,13 +533,13 @@ class WristSensor(LeafSystem):
             sample_step(*inputs, until_now, touching_W, self._scratch, result)
             return
         if self._twin is None:
-            self._twin = ContactTwin(*self._twins)
+            self._twin = ContactTwin(*self._twin_arguments)
         own = 2 * self._n + 2
         size = own + self._plant_size
-        told = np.zeros((1 + self._most_told, 2 + size))
+        told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
         physics = (*self._physics[:-1], told)
         # The state of each requested wrench depends on the previous wrenches.
-        for k in range(self._most_told):
+        for k in range(self._max_twin_wrenches):
             told[0, :2] = k, 0.0
             sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
             if told[0, 1] <= k:
@@ -546,41 +548,43 @@ class WristSensor(LeafSystem):
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._longest > 1 and not self._is_due(context.get_time()):
-            seen = self._seen(context)
-            if not self._watched.size or self._near(*seen) != WATCHED:
+        if self._max_queued_steps > 1 and not self._is_due(context.get_time()):
+            seen = self._states(context)
+            if not self._watched.size or self._contact_level(*seen) != WATCHED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
-                if _postpone(memory, self._sensor[3], self._longest, time, *seen):
+                if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
-        discrete_state.set_value(0, self._step.Eval(context)[self._remains])
+        discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
     def _is_due(self, time: float) -> bool:
         """Return whether the torque or the noise may change now."""
         # Inline for speed: called at every step in contact.
-        margin, (held, block) = _SAME * self._period, self._holds
+        margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
-        state, around = self._seen(context)
+        state, around = self._states(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         joined(state, around, x)
         if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
-        if self._beyond or self._near(state, around) == WATCHED:
-            applied = applied + self._touching_So_W(context)
+        if self._beyond_contact_law or self._contact_level(state, around) == WATCHED:
+            applied = applied + self._plant_contact_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
-        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
+        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ACCELERATION_TOLERANCE * (
+            1.0 + np.abs(vdot).max()
+        ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s something moves the slave that it knows nothing of",
+                f"at {context.get_time():g} s an unknown force moves the slave",
                 where="wrist_sensor.applied_wrench_W",
-                remedy="connect whatever pushes the tool to this port too",
+                remedy="connect every wrench on the tool to this port",
             )
         return EventStatus.Succeeded()
 
