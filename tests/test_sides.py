@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from operator_motion import intent_at
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -17,7 +18,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.master_side import MakeMasterSide
-from drake_teleop.station.operator.operator import OperatorConfig, Sine, intent_at
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.operator.task import Touch
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.signals import SIGNALS

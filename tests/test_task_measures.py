@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.operator.decision import (
     FEELING,
     MOVING,
@@ -20,7 +19,7 @@ from drake_teleop.station.operator.decision import (
     WAITING,
 )
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import Insert, Press, Reach, Touch
+from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.signals import SIGNALS

@@ -252,8 +252,8 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         spans = find_spans(t, values > least, _MIN_DURATION_S)
         largest = _maximum_within(t, values, spans)
         yield (
-            f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit} more"
-            " than its delay explains,",
+            f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
+            " more than its delay explains,",
             spans,
         )
     yield from _check_reserve(result, scenario)

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.operator.decision import (
     DONE,
     FEELING,
@@ -36,7 +35,7 @@ from drake_teleop.station.operator.decision import (
     STOPPING,
     WAITING,
 )
-from drake_teleop.station.operator.task import Insert, Press, Reach, Task, Touch
+from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from operator_motion import intent_at
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
@@ -24,7 +25,6 @@ from drake_teleop.station.operator.operator import (
     OperatorConfig,
     Sine,
     hand_wrench_into,
-    intent_at,
 )
 
 START = phantom.forward_kinematics(phantom.HOME)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +32,11 @@ from drake_teleop.station.sensor.sensor_chain import (
     sensor_chain,
     without,
 )
-from drake_teleop.station.sensor.sensor_noise import (
-    allan_deviation,
-    predicted_allan_deviation,
-    rest_record,
-    spectral_density,
+
+NOISE = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "_ext" / "sensor_noise.py"))
+allan_deviation, predicted_allan_deviation, rest_record, spectral_density = (
+    NOISE[name]
+    for name in ("allan_deviation", "predicted_allan_deviation", "rest_record", "spectral_density")
 )
 
 RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3

@@ -270,18 +270,6 @@ def pose_into(q, pose):
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
 
 
-def closed_form_mass_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the main axes' mass matrix (3, 3) [kg m^2] without wrist, motors, hand."""
-    M = np.empty((6, 6))
-    _main_mass_matrix_into(q, M)
-    return M[:3, :3]
-
-
-def closed_form_gravity(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the main axes' gravity torque (3,) [N m] without wrist."""
-    return np.array([0.0, _GRAVITY_2 * np.cos(q[1]), _GRAVITY_3 * np.sin(q[2])])
-
-
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the geometric Jacobian of E (6, 6), rows [v; omega] in B."""
     J = np.empty((6, 6))
@@ -303,13 +291,6 @@ def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
-
-
-def potential_energy(q: NDArray[np.float64]) -> float:
-    """Return the potential energy [J] with wrist; its gradient is `gravity_torque`."""
-    weight = WRIST_MASS * GRAVITY
-    energy = (_GRAVITY_2 + weight * L1) * np.sin(q[1]) - (_GRAVITY_3 + weight * L2) * np.cos(q[2])
-    return float(energy)
 
 
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:

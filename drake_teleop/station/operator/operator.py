@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -30,7 +30,6 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import Training
-from drake_teleop.station.operator.intended import unit_pose_into
 from drake_teleop.station.operator.minimum_jerk import add_plan_into
 from drake_teleop.station.operator.perception import Perception, perceive_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
@@ -176,24 +175,28 @@ def intent_into(packed, start, t, pose, twist):
         twist[3 + k] = omega[k]
 
 
-def intent_at(
-    segments: Sequence[MinimumJerk | Sine], start: NDArray[np.float64], t: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the intended motion at the times t (n,) [s].
+@njit(cache=True)
+def unit_pose_into(pose, twist, out):
+    """Write a pose (7,) with unit quaternion; return whether all inputs are valid and finite.
 
     Args:
-        segments: the intent, relative to the start pose.
-        start: (7,) X_BE before the first segment.
-
-    Returns:
-        (n, 7) poses X_BE and (n, 6) twists [v; omega] of E in B.
+        pose: (7,) X_BE.
+        twist: (6,) of it.
+        out: (7,) output.
     """
-    times = np.atleast_1d(np.asarray(t, dtype=float))
-    packed = pack_intent(segments)
-    poses, twists = np.empty((len(times), 7)), np.empty((len(times), 6))
-    for time, pose, twist in zip(times, poses, twists, strict=True):
-        intent_into(packed, start, time, pose, twist)
-    return poses, twists
+    square, rest = 0.0, 0.0
+    for k in range(4):
+        square += pose[k] * pose[k]
+    for k in range(7):
+        rest += pose[k] - pose[k]  # NaN unless it is finite
+    for k in range(6):
+        rest += twist[k] - twist[k]
+    if not (rest == 0.0 and 0.0 < square < math.inf):
+        return False
+    size = math.sqrt(square)
+    for k in range(7):
+        out[k] = pose[k] / size if k < 4 else pose[k]
+    return True
 
 
 @njit(cache=True)

@@ -69,6 +69,18 @@ Task: TypeAlias = Reach | Touch | Press | Insert
 REACH, TOUCH, PRESS, INSERT = range(4)
 KINDS = (Reach, Touch, Press, Insert)
 
+#: Names of the measures that `station.task_measures` defines.
+TASK_MEASURES = (
+    "success",
+    "task_time_s",
+    "contact_force_overshoot_N",
+    "effort_Ns",
+    "task_work_J",
+    "detection_time_s",
+    "false_notices",
+    "press_error_N",
+)
+
 
 @settings
 @dataclass

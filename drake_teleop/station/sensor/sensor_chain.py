@@ -130,27 +130,11 @@ class WristSensorConfig:
 
     def noise_std(self) -> NDArray[np.float64]:
         """Return (12,) standard deviations of raw white noise [N, N m, m/s^2, rad/s^2]."""
-        return np.repeat(
-            [
-                self.force_noise,
-                self.torque_noise,
-                self.acceleration_noise,
-                self.angular_acceleration_noise,
-            ],
-            3,
-        )
+        return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
     def random_walk(self) -> NDArray[np.float64]:
         """Return (12,) standard deviations of the random walks after 1 s, in units per sqrt(s)."""
-        return np.repeat(
-            [
-                self.force_walk,
-                self.torque_walk,
-                self.acceleration_walk,
-                self.angular_acceleration_walk,
-            ],
-            3,
-        )
+        return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
         """Return the 12 ranges in the order of the noise."""
@@ -235,32 +219,21 @@ class WristSensorConfig:
             )
 
 
+_CALIBRATION = (
+    *("gain_error", "cross_talk", "misalignment"),
+    *("acceleration_gain_error", "acceleration_misalignment"),
+)
+_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
 #: Parts by name, with the field values that switch them off.
 PARTS: dict[str, dict[str, Any]] = {
-    "calibration": {
-        "gain_error": 0.0,
-        "cross_talk": 0.0,
-        "misalignment": 0.0,
-        "acceleration_gain_error": 0.0,
-        "acceleration_misalignment": 0.0,
-    },
+    "calibration": dict.fromkeys(_CALIBRATION, 0.0),
     "place": {
         "p_SoAo_S": [0.0] * 3,
         "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     },
     "low_pass": {"low_pass": "none"},
-    "noise": {
-        "force_noise": 0.0,
-        "torque_noise": 0.0,
-        "acceleration_noise": 0.0,
-        "angular_acceleration_noise": 0.0,
-    },
-    "random_walk": {
-        "force_walk": 0.0,
-        "torque_walk": 0.0,
-        "acceleration_walk": 0.0,
-        "angular_acceleration_walk": 0.0,
-    },
+    "noise": {f"{name}_noise": 0.0 for name in _QUANTITIES},
+    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITIES},
     "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
     "drift": {"drift": [0.0] * 6},
     "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},

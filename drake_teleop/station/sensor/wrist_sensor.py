@@ -349,21 +349,15 @@ class WristSensor(LeafSystem):
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
         # No reference to the plant: it would be a cycle with the Diagram that owns this block.
-        self._watched, self._moving, self._plant_size = (
-            contact.watched,
-            tuple(contact.moving),
-            contact.plant_size,
-        )
+        self._watched, self._plant_size = contact.watched, contact.plant_size
+        self._moving = tuple(contact.moving)
         self._twin_arguments = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
         self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
         self._event_periods = (held, NOISE_BLOCK * period)
-        self._no_noise, self._zero_wrench, self._no_rate = (
-            np.zeros(NOISE_SIZE),
-            np.zeros(6),
-            np.zeros(0),
-        )
+        self._no_noise, self._zero_wrench = np.zeros(NOISE_SIZE), np.zeros(6)
+        self._no_rate = np.zeros(0)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._torque = self.DeclareVectorInputPort("joint_torque", n)

@@ -13,9 +13,9 @@ sigma / sqrt(m) for white noise, K sqrt(m T / 3) for a random walk.
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.compiled import njit
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
@@ -112,7 +112,7 @@ def rest_record(
     return record
 
 
-@njit(cache=True)
+@njit
 def _record_into(constants, memory, noise, truth, record):
     reading = np.empty(14)
     for k in range(record.shape[0]):
