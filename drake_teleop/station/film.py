@@ -218,7 +218,6 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
-    """Return Drake's colour of "#rrggbb"."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
@@ -253,7 +252,6 @@ class Arrow:
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
-    """Suppress Drake's information messages, such as Meshcat's address."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

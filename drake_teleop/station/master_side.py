@@ -111,7 +111,6 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
 
 
 def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
-    """Return the scenario's operator; for a task it gets delays, scales and the arm model."""
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling

@@ -154,7 +154,6 @@ def write_replay(
 
 
 def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
-    """Return the rows of sorted `t` (N,) that are nearest to `times`."""
     after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
     after = np.minimum(after, len(t) - 1)
     before = np.maximum(after - 1, 0)
@@ -218,7 +217,6 @@ class ReplayScene:
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
-        """Add all objects; `recorded` contains the names of available signals."""
         self.canvas: Canvas = meshcat
         self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
         self.plant.RegisterAsSourceForSceneGraph(self._shapes)
@@ -253,7 +251,6 @@ class ReplayScene:
         ]
 
     def _add_bodies(self, meshcat: Meshcat) -> Iterator[tuple[str, RigidBody]]:
-        """Add the shapes of all bodies; yield path and body of moving ones."""
         plant, inspector = self.plant, self._shapes.model_inspector()
         for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
             path = f"/station/{int(body.index())}_{body.name()}"
@@ -309,8 +306,6 @@ class ReplayScene:
         return forces
 
     def _arrow_positions_W(self) -> dict[str, Array]:
-        """Return the arrows' start points in W."""
-
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
             "wrist": X_WS @ _P_SWRIST_S + _WRIST_ARROW_OFFSET_W,
@@ -325,9 +320,7 @@ class _Device(NamedTuple):
     """Haptic device in the plant.
 
     Attributes:
-        instance: model instance.
-        hand: frame at the stylus.
-        grip: (3,) grip point in that frame [m].
+        hand: frame at the stylus; the hand holds it at `grip` (3,) [m].
         positions: converts joint positions of the device state to those of the plant.
         folder: folder of converted meshes, kept while shapes are in use.
     """
@@ -352,7 +345,6 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
 
 
 def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
-    """Add the leader arm with its base on the table, independent of B."""
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
 
@@ -365,8 +357,6 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
 
 
 def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
-    """Add floor, table and stands; set light and camera."""
-
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))

@@ -311,7 +311,6 @@ class SimulationResult:
         return figure
 
     def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
-        """Return the subplots of a signal: adjacent components of one unit together."""
         if (found := self._column(name)) is not None:
             signal, index = found
             return [(signal, self._specs[signal].units[index], [index])]
@@ -350,8 +349,6 @@ class SimulationResult:
 
 
 class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
-    """Arrays by signal name, read from the disk at each access."""
-
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
 
@@ -395,7 +392,6 @@ def _signal_text(spec: Signal) -> str:
 
 
 def _log_parts(path: Path) -> list[Path]:
-    """Return the parts of a log in order, or its single file."""
     return sorted(path.glob(PARTS_OF_LOG)) or [path]
 
 

@@ -86,13 +86,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
-    """Return start and stop times of a condition; gaps shorter than 50 ms are closed.
-
-    Args:
-        t: (N,) [s].
-        happened: (N,) condition.
-        least: shortest interval to return [s].
-    """
+    """Return spans of at least `least` [s] with `happened` (N,); gaps below 50 ms are closed."""
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
         if spans and start - spans[-1][1] < _MAX_GAP_S:
@@ -119,12 +113,7 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 
 def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
-    """Return the indices of local extremes that differ by more than `swing` from the previous one.
-
-    Args:
-        x: (N,).
-        swing: in the unit of `x`.
-    """
+    """Return indices of local extremes that differ by more than `swing` from the previous one."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -265,7 +254,6 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
 
 
 def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
-    """Yield the times when lack of energy in `ledger` makes the slave slower than the hand."""
     if scenario.passivity.method != "ledger" or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
@@ -353,7 +341,6 @@ def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
 
 
 def _pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
-    """Return (N,) whether a pose (N, 7) oscillates in position or orientation."""
     turned, wanted = (_rotation(pose, command) for pose in (actual, command))
     swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
     return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
@@ -376,7 +363,6 @@ def _joint_error(result: SimulationResult) -> Array:
 
 
 def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    """Return (N,) whether a wrist motor of the device gives its largest torque."""
     full, peak = np.zeros(len(torque), dtype=bool), _LIMIT_SHARE * device.peak_torque
     # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
@@ -386,7 +372,6 @@ def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -
 
 
 def _running_maximum(x: Array, rows: int) -> Array:
-    """Return (N, k) running maximum over the last `rows` rows, by doubling."""
     largest, done = x.copy(), 1
     while done < min(rows, len(x)):
         step = min(done, rows - done)

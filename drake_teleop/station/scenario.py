@@ -199,7 +199,6 @@ def check_scenario(scenario: Any) -> None:
 
 
 def ScenarioNames() -> list[str]:
-    """Return the names of the shipped scenarios."""
     return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
 
 

@@ -93,7 +93,6 @@ def json_schema() -> str:
 
 
 def _allowed_values(entry: FieldInfo) -> str:
-    """Return the allowed values as text."""
     words = entry.range if entry.unit or entry.choices else entry.kind
     if entry.lists:
         words = f"{entry.length or 'any number'} of {words}"
@@ -105,7 +104,6 @@ def _comment(entry: FieldInfo) -> str:
 
 
 def _block_lines(config: Any) -> list[str]:
-    """Return the lines of a block and its inner blocks, without indentation."""
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
@@ -133,7 +131,6 @@ def _inner_lines(entry: FieldInfo) -> list[str]:
 
 
 def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
-    """Return `name:` and the indented contents."""
     if not entry.lists:
         head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
         return [head, *_indent(_block_lines(value))]
@@ -156,7 +153,6 @@ def _commented_out(lines: list[str]) -> list[str]:
 
 
 def _sections(config: Any, path: str) -> Iterator[str]:
-    """Yield the table of a block, then those of its inner blocks."""
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
@@ -173,7 +169,6 @@ def _sections(config: Any, path: str) -> Iterator[str]:
 
 
 def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
-    """Return title and type of the sections of an entry's blocks."""
     several = len(entry.blocks) > 1
     return [
         (f"{path}{entry.name}{f': !{block.__name__}' if several else ''}", block)
@@ -182,7 +177,6 @@ def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
 
 
 def _links(entry: FieldInfo, path: str) -> str:
-    """Return links to these sections, for a table cell."""
     several = len(entry.blocks) > 1
     links = [
         f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor(title)})"

@@ -166,8 +166,6 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
 
 @dataclass(frozen=True)
 class _SlaveBlocks:
-    """Plant, joint control, wrist sensor, load estimator and monitor, connected to each other."""
-
     slave: SlavePlant
     joint_control: LeafSystem
     monitor: LeafSystem
@@ -347,5 +345,4 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
 
 
 def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:
-    """Return whether a load estimate exists or will be estimated, so that contact is measurable."""
     return estimate is not None or scenario.load_estimator.enabled

@@ -133,7 +133,6 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
 
 
 def _end_sample(result: SimulationResult) -> int:
-    """Return the sample at which the operator finishes or gives up, or the last one."""
     outcome = result["task_state"][:, DONE]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
@@ -166,7 +165,6 @@ def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.boo
 
 
 def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
-    """Return the true force during the operator's hold phase."""
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
@@ -208,7 +206,6 @@ def _force_and_position_text(
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
-    """Return (3,) vector from the target to the tool's tip, in W [m]."""
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(

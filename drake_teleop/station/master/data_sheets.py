@@ -181,11 +181,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the device with the hand's passive mass.
-
-        Args:
-            hand_mass: [kg], moves with the stylus.
-            hand_inertia: [kg m^2], about every axis through E.
+        """Return the device with the hand's passive mass [kg] and inertia about E [kg m^2].
 
         Raises:
             DrakeTeleopError: as `Leader.device`.
@@ -210,15 +206,10 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """Whether a leader arm commands the slave's joints one by one."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Reject a leader arm in joint mode.
-
-        Raises:
-            DrakeTeleopError: in joint mode; `what` names the caller, which supports poses only.
-        """
+        """Raise a DrakeTeleopError for a leader in joint mode; `what` names the caller."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",

@@ -136,10 +136,6 @@ def AddDevice(
 ) -> tuple[LeafSystem, LeafSystem]:
     """Add "master_device" and "force_display" of a device or leader arm, and connect them.
 
-    Args:
-        builder: the diagram.
-        period, device, q_initial: as for `MasterDevice`.
-
     Returns:
         Both blocks; the hand's wrench and the command remain to be connected.
     """

@@ -66,11 +66,9 @@ def step(state, hand_wrench, motor, device, period, work, stages):
     """Advance `state` (12,) [q; v] in place by one classical Runge-Kutta step with held inputs.
 
     Args:
-        state: (12,), changed.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
         motor: (6,) torques (or forces) at the joints.
-        device: (NUMBERS,) of the device, see `numbers`.
-        period: [s].
+        device: (NUMBERS,), see `numbers`.
         work, stages: (2, 6, 6) and (3, 12) scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
@@ -119,12 +117,10 @@ class HapticDevice:
 
     @property
     def num_joints(self) -> int:
-        """Number of axes."""
         return 6
 
     @property
     def friction_field(self) -> str:
-        """Scenario field of the friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -137,11 +133,7 @@ class HapticDevice:
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joints (6,) with E at X_BE (7,).
-
-        Raises:
-            DrakeTeleopError: if it is out of reach.
-        """
+        """Return the joints (6,) with E at X_BE (7,); raise if it is out of reach."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
@@ -153,11 +145,7 @@ class HapticDevice:
         return pose
 
     def check_limits(self, q: NDArray[np.float64]) -> None:
-        """Check the limits of the joints q (6,).
-
-        Raises:
-            DrakeTeleopError: if a joint is outside its limits.
-        """
+        """Raise a DrakeTeleopError if a joint of q (6,) is outside its limits."""
         if self.is_phantom:
             phantom.check_limits(q)
         else:
@@ -184,11 +172,9 @@ class HapticDevice:
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """Return the matrix (6, 6) of joint forces against dq/dt.
+        """Return the matrix (6, 6) of joint forces against dq/dt at q (6,).
 
-        Args:
-            q: (6,) joints.
-            creeping: include the slope of Coulomb friction at standstill.
+        `creeping` includes the slope of Coulomb friction at standstill.
         """
         if self.is_phantom:
             slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED

@@ -26,7 +26,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Pose as read by the device's encoders.
+    """Pose as read by encoders that count `steps` (6,) [m, rad] from `q_start` (6,); 0 is exact.
 
     .. pydrake_system::
 
@@ -35,11 +35,6 @@ class Encoders(LeafSystem):
         - master_state: (12,) of the device
         output_ports:
         - pose_read: (7,) X_BE
-
-    Args:
-        device: source of the kinematics.
-        q_start: (6,) origin of the steps.
-        steps: (6,) of its axes [m, rad]; 0 for exact reading.
     """
 
     __slots__ = ONE_DICT
@@ -59,7 +54,7 @@ class Encoders(LeafSystem):
 
 
 class SampleHold(LeafSystem):
-    """Sample and hold of a vector; unlike Drake's ZeroOrderHold it has a start value.
+    """Sample and hold with `period` [s]; unlike Drake's ZeroOrderHold it has a start value.
 
     .. pydrake_system::
 
@@ -68,10 +63,6 @@ class SampleHold(LeafSystem):
         - value: (n,)
         output_ports:
         - held: (n,) at the last sample
-
-    Args:
-        period: [s].
-        start: (n,) before the first sample.
     """
 
     __slots__ = ONE_DICT

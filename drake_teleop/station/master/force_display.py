@@ -44,12 +44,7 @@ def _peak_wrench(numbers):
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the display's input before the first period.
-
-    Args:
-        q: (6,) the device's joints.
-        numbers: (NUMBERS,) of the device.
-    """
+    """Return the display's input before the first period, for joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -98,7 +93,6 @@ def display_into(wrench, device, numbers, period, J, drive):
         wrench: (6,) F_E_B to render.
         device: (27,) of `MasterDevice`.
         numbers: (NUMBERS,) of the device.
-        period: [s].
         J: (6, 6) scratch.
         drive: (27,) output for `MasterDevice`, with the displayed wrench and a `Fault`.
     """
@@ -150,8 +144,7 @@ class DisplayDevice(Protocol):
     """Device of any kind with `numbers`."""
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
-        """(NUMBERS,), see `numbers`."""
+    def numbers(self) -> NDArray[np.float64]: ...
 
 
 class ForceDisplay(LeafSystem):

@@ -171,7 +171,6 @@ def step_leader(
 
 @njit(cache=True)
 def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
-    """Write `wrench` (6,), scaled down to the motors' limits at q."""
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motors_into(bare, arm, joints, q, np.zeros(6), weight)
@@ -214,22 +213,18 @@ class LeaderDevice:
 
     @property
     def num_joints(self) -> int:
-        """Number of joints n."""
         return self.arm.num_joints
 
     @property
     def peak_force(self) -> float:
-        """Largest displayed force [N]; some postures allow less."""
         return float(self.numbers[PEAK_FORCE])
 
     @property
     def peak_torque(self) -> Array:
-        """(3,) largest displayed torques [N m]."""
         return self.numbers[PEAK_TORQUE]
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
-        """Arguments of the compiled functions."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
@@ -237,11 +232,7 @@ class LeaderDevice:
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return the joints (n,) with E at X_BE (7,), searched from home.
-
-        Raises:
-            DrakeTeleopError: if it is out of reach.
-        """
+        """Return the joints (n,) with E at X_BE (7,), from home; raise if it is out of reach."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -255,17 +246,11 @@ class LeaderDevice:
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """Return X_BE (7,) at the joints q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
-        """Check the limits of the joints q (n,).
-
-        Raises:
-            DrakeTeleopError: if a joint is outside its limits.
-        """
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
                 f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
@@ -275,21 +260,17 @@ class LeaderDevice:
             )
 
     def at_an_end(self, q: Array) -> NDArray[np.bool_]:
-        """Return (N,) whether an end stop is active at the joints q (N, n)."""
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the Jacobian (6, n), rows [v; omega] of E in B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return the mass matrix (n, n), with the hand."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        """Return (n, n) joint forces against dq/dt, as `HapticDevice.damping_matrix`."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
@@ -299,12 +280,7 @@ def joint_parameters(
 ) -> Array:
     """Return (8, n) for `LeaderDevice.joints`; end stops scale with the inertia at home.
 
-    Args:
-        arm: with the hand.
-        home: (n,).
-        coulomb, viscous: (n,) friction in addition to the model's damping.
-        limit: (n,) of the motors.
-        carried: compensated share of the arm's weight.
+    `viscous` (n,) adds to the model's damping; `carried` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
@@ -383,10 +359,6 @@ class LeaderDisplay(ForceDisplay):
         - force_to_master: (6,) F, displayed within the limits [N, N m]
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two in one vector, for a log
-
-    Args:
-        period: of the device [s].
-        device: the leader.
     """
 
     __slots__ = ()

@@ -111,11 +111,7 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """Return the arm with the hand's passive mass.
-
-        Args:
-            position: (3,) p_BE at home [m].
-            hand_mass, hand_inertia: as for `Master.device`.
+        """Return the arm with the hand's passive mass; E is at p_BE = `position` (3,) [m] at home.
 
         Raises:
             DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the

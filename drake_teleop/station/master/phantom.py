@@ -228,12 +228,10 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
     Args:
-        q, v: joint angles and rates (6,).
+        q, v, motor_torque: (6,) of the joints.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        motor_torque: (6,) at the joints.
-        device: (NUMBERS,) of the device, see `numbers`.
+        device: (NUMBERS,), see `numbers`.
         work: (2, 6, 6) scratch.
-        vdot: (6,) output.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)

@@ -63,7 +63,6 @@ def mass_matrix_into(q, J, device, M):
 
 @njit(cache=True)
 def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
-    """Return the ratio of friction to velocity."""
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / speed_of_tanh
@@ -154,11 +153,7 @@ def damping_matrix(
 def inverse_kinematics(
     pose: NDArray[np.float64], device: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the axes q (6,) with the grip at X_BE (7,).
-
-    Raises:
-        DrakeTeleopError: if the pose is outside the workspace.
-    """
+    """Return the axes q (6,) with the grip at X_BE (7,); raise outside the workspace."""
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -182,11 +177,7 @@ def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    """Check that the axes q (6,) are within the workspace.
-
-    Raises:
-        DrakeTeleopError: if they are outside.
-    """
+    """Raise a DrakeTeleopError if the axes q (6,) are outside the workspace."""
     if _outside_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))

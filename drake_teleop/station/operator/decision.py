@@ -136,7 +136,6 @@ _FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floo
 
 
 def initial_memory() -> Array:
-    """Return the memory of `decide` before the first step."""
     memory = np.zeros(MEMORY)
     memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
@@ -166,7 +165,6 @@ def look_into(person, step, displacement_W, seen_W):
 
 @njit(cache=True)
 def _submovement(person, memory, step, time, error_W):
-    """Plan a hand movement that removes the error, with motor noise; return its duration."""
     change = np.empty(3)
     _to_hand(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
@@ -267,7 +265,6 @@ def _seen_target(task, person, out):
 
 @njit(cache=True)
 def _seen_depth(task, person, seen_W):
-    """Return the perceived penetration of surface or slot along the axis [m]."""
     target, beyond = np.empty(3), -task[_STANDOFF]
     _seen_target(task, person, target)
     for i in range(3):
@@ -277,7 +274,6 @@ def _seen_depth(task, person, seen_W):
 
 @njit(cache=True)
 def _move_by_vision(task, person, step, time, seen_W, state, memory):
-    """Move by vision to the target, or to the standoff before it."""
     error = np.empty(3)
     _seen_target(task, person, error)
     off = 0.0
@@ -346,7 +342,6 @@ def _press_displacement(task, memory, force):
 
 @njit(cache=True)
 def _control_force(task, person, step, time, felt, state, memory):
-    """Correct the force by small submovements."""
     force = _perceived_force(task, person, felt, memory)
     error = abs(task[_FORCE] - force)
     met = _is_met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])

@@ -177,13 +177,7 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion; return whether all inputs are valid and finite.
-
-    Args:
-        pose: (7,) X_BE.
-        twist: (6,) of it.
-        out: (7,) output.
-    """
+    """Write a pose (7,) with unit quaternion; return whether pose and twist (6,) are valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -201,7 +195,6 @@ def unit_pose_into(pose, twist, out):
 
 @njit(cache=True)
 def _limit(vector, limit):
-    """Scale a vector (3,) in place to a length of at most `limit`."""
     length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
     if length > limit:
         for k in range(3):
@@ -217,9 +210,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
-        intent_pose, pose: (7,) intended and actual X_BE.
-        intent_twist, twist: (6,) intended and actual [v; omega] of E in B.
-        wrench: (6,) output.
+        intent_pose, pose: (7,) X_BE.
+        intent_twist, twist: (6,) [v; omega] of E in B.
     """
     wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
     error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
@@ -249,7 +241,6 @@ def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip
-    """Call `_intended_motion_into` and `hand_wrench_into` in one compiled call."""
     _intended_motion_into(packed, start, moving, memory, time, wanted, wanted_twist)
     hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
 
@@ -262,12 +253,9 @@ def _look_feel_decide(
     """Update perception and decision by one step; inputs are not checked.
 
     Args:
-        task, person: of `pack_task`, `pack_person`.
-        senses: (4,) of `Perception.parameters`.
-        hand_mass: [kg].
+        task, person, senses: of `pack_task`, `pack_person`, `Perception.parameters`.
         arm: the slave's table.
         tip: (6,) the tool's tip in S, and its start in W [m].
-        time: now [s].
         hand_wrench, twist: (6,) of the hand on the stylus and of the stylus, in B.
         slave_q: (n,) [rad].
         task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
@@ -294,7 +282,6 @@ def _look_feel_decide(
 
 
 def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a ring buffer (n, k) for a delay [s], filled with `start`."""
     return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
 
 
@@ -362,7 +349,6 @@ class Operator(LeafSystem):
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
     def _declare_intention(self) -> set[DependencyTicket]:
-        """Declare the ports of the intent; return their tickets."""
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
         return {pose.ticket(), twist.ticket()}
@@ -421,7 +407,6 @@ class Operator(LeafSystem):
         return context.get_discrete_state(self._groups[1]).value()
 
     def _intention(self, context: Context) -> tuple[NDArray[np.float64], ...]:
-        """Return segments, their reference pose and its twist."""
         if not self._intended_pose.HasValue(context):
             return self._intent
         pose = self._intended_pose.Eval(context)

@@ -67,7 +67,6 @@ class Perception:
 
 
 def initial_memory() -> Array:
-    """Return the memory of `perceive_into` before the first step."""
     memory = np.zeros(MEMORY_SIZE)
     memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory

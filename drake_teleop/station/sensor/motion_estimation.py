@@ -121,10 +121,9 @@ class Delays:
 class SteadyState:
     """Steady-state Kalman filter of position, rate and error of a measured acceleration.
 
-    Args:
+    Attributes:
         gains: (3,) of the innovation for position [1], rate [1/s] and acceleration [1/s^2].
-        innovation_std: standard deviation of the innovation, in the position's unit.
-        position_std: standard deviation of the corrected position.
+        innovation_std, position_std: standard deviations, in the position's unit.
         crossover_hz: the accelerometer dominates above it, the positions below it.
     """
 
@@ -244,13 +243,9 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants and initial memory of `estimate_into`.
+    """Return constants and initial memory of `estimate_into` for an arm with n joints.
 
-    Args:
-        config: source of the motion.
-        sensor: nominal properties: delays, filter, noise, pose of the accelerometer.
-        num_joints: n, of the arm.
-        period: of the sensor [s].
+    `sensor` gives the nominal delays, filter, noise and pose of the accelerometer.
 
     Raises:
         DrakeTeleopError: if the encoders' bandwidth is 0.45 of the sensor's rate or more.
@@ -300,21 +295,19 @@ def _filters(
 
 
 def _group_delay(sections: NDArray[np.float64]) -> float:
-    """Return the group delay of second-order sections at zero frequency [samples]."""
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 
 
 @njit(cache=True)
 def estimate_into(constants, memory, arm, reading, sample):
-    """Convert one reading (13 + n,) to one sample (16 + n,) of a single instant.
+    """Convert one reading (13 + n,) of `read_into` to one sample (16 + n,) of a single instant.
 
     Call it once per period. At the first reading all filters settle on it, at rest.
 
     Args:
         constants, memory: of `motion_estimator`.
         arm: `ArmModel.table`.
-        reading: see `drake_teleop.station.sensor.sensor_chain.read_into`.
         sample: see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
@@ -456,8 +449,6 @@ def _update_filters(gains, period, moved, acceleration, kept):
     both integrations are of fourth order.
 
     Args:
-        gains: of `steady_state`.
-        period: [s].
         moved: (3,) encoder displacement since the last sample; becomes the acceleration correction.
         acceleration: (3,) now.
         kept: estimated position error (3), rate half a sample ago (3), last acceleration and the

@@ -20,13 +20,8 @@ def _with_imu(
 ) -> WristSensorConfig:
     """Return a wrench sensor with the IMU of the ATI record.
 
-    Args:
-        side: range of fx and fy [N].
-        along: range of fz [N].
-        bending: range of tx and ty [N m].
-        twist: range of tz [N m].
-        force_noise, torque_noise: white, 1 sigma per sample [N, N m].
-        **others: further fields of `WristSensorConfig`.
+    Ranges: `side` of fx, fy and `along` of fz [N], `bending` of tx, ty and `twist` of tz [N m].
+    Noise: white, 1 sigma per sample [N, N m].
     """
     figures: dict[str, Any] = {
         "p_SoAo_S": [0.0, 0.0, 0.05],

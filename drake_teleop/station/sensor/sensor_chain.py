@@ -137,7 +137,6 @@ class WristSensorConfig:
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
-        """Return the 12 ranges in the order of the noise."""
         return np.concatenate(
             [
                 self.force_range,
@@ -193,15 +192,7 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Check the rotation and the bandwidth.
-
-        Args:
-            where: the place for the message.
-            rate_hz: the sensor's sampling rate [Hz].
-
-        Raises:
-            DrakeTeleopError: with `where` and the field.
-        """
+        """Raise a DrakeTeleopError if R_SA is no rotation or the bandwidth is too high."""
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
@@ -253,17 +244,10 @@ def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Return a fourth-order Butterworth low-pass as second-order sections (bilinear, prewarped).
+    """Return (2, 5) rows [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
 
-    The poles equal those of `scipy.signal.butter`, whose import is slow and whose sections do not
-    have unit gain, as `settle` requires.
-
-    Args:
-        cutoff_hz: -3 dB frequency [Hz], below half the rate.
-        rate_hz: sampling rate [Hz].
-
-    Returns:
-        (2, 5) rows [b0, b1, b2, a1, a2], each of unit gain at zero frequency.
+    Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires. The
+    poles equal those of `scipy.signal.butter`, whose import is slow.
     """
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_SECTIONS, 5))
@@ -305,7 +289,6 @@ def calibration_matrices(
 
 
 def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Return Rodrigues' rotation matrix; `axis` may have any length."""
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
@@ -340,16 +323,10 @@ _ROW = _CHANNELS + 2
 def sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants and initial memory of `read_into`.
+    """Return constants and initial memory of `read_into` for an arm with n joints.
 
-    Args:
-        config: the sensor.
-        num_joints: n, of the arm.
-        period: sampling period [s].
-
-    Returns:
-        constants: `constants[OFFSET]` is the wrench's offset [N, N m]; it may change during a run.
-        memory: its first entry counts samples.
+    `constants[OFFSET]` is the wrench's offset [N, N m], which may change during a run.
+    `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()

@@ -176,7 +176,6 @@ def queue_step(tail, time, state, around):
 
 @njit(cache=True, borrows=True)
 def _try_queue_step(memory, tail, longest, time, state, around):
-    """Append the end of a step to the queue in `memory`; return whether there was room."""
     if memory[tail + 1] >= longest:
         return False
     queue_step(memory[tail:], time, state, around)
@@ -451,7 +450,6 @@ class WristSensor(LeafSystem):
         queue_step(tail, time, *self._states(context))
 
     def _states(self, context: Context) -> tuple[Array, Array]:
-        """Return [q; v] of the arm, and `_surroundings`."""
         return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
@@ -464,7 +462,6 @@ class WristSensor(LeafSystem):
         return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
     def _contact_level(self, state: Array, around: Array) -> int:
-        """Return the level of `nearness`."""
         if self._contacts is None:
             return FAR
         if self._beyond_contact_law:
@@ -478,7 +475,6 @@ class WristSensor(LeafSystem):
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
     def _plant_contact_So_W(self, context: Context) -> Array:
-        """Return the contact wrench on the tool about So, in W."""
         wrench_W = self._plant_contact_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
@@ -551,7 +547,6 @@ class WristSensor(LeafSystem):
         discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
     def _is_due(self, time: float) -> bool:
-        """Return whether the torque or the noise may change now."""
         # Inline for speed: called at every step in contact.
         margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
@@ -603,13 +598,9 @@ def AddWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Add "wrist_sensor", its noise, and demultiplexers of its port.
+    """Add "wrist_sensor", its noise, and demultiplexers of its port; arguments as `WristSensor`.
 
     State, acceleration and torque of the arm remain to be connected.
-
-    Args:
-        builder: diagram that contains the plant.
-        slave, config, motion, period, held, q_start, ramps: as for `WristSensor`.
 
     Returns:
         The ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
