@@ -242,8 +242,8 @@ def test_the_longest_delay_is_that_of_the_latest_packet(tmp_path):
 def test_slave_follows_with_a_late_wrist_sensor():
     """The accelerations, and so the sample, are 6 ms late.
 
-    Energy must not be calculated with joint angles of that instant: it would empty the slave's tank,
-    and the slave would lag by 4 cm without a warning.
+    Energy must not be calculated with joint angles of that instant: it would empty the slave's
+    tank, and the slave would lag by 4 cm without a warning.
     """
     move = MinimumJerk(t_start=0.5, duration=0.8, translation=[0.0, 0.0, -0.07])
     scenario = replace(

@@ -144,7 +144,7 @@ def swinging(rate: float) -> SimulationResult:
 
 
 def test_sample_time_is_the_instant_of_the_sample():
-    """Reaction force, motion and joint angles at `sample_time` equal the sample; those of the row do not."""
+    """Reaction force, motion and joint angles at `sample_time`, not at t, equal the sample."""
     result = swinging(8000.0)
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     plant, context = slave.plant, slave.plant.CreateDefaultContext()
