@@ -9,6 +9,7 @@ it; without Chromium it stays as it is.
 
 from __future__ import annotations
 
+import runpy
 import shutil
 import subprocess
 import tempfile
@@ -42,14 +43,9 @@ from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.sample import sample_log_command
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import without
-from drake_teleop.station.sensor.sensor_noise import (
-    allan_deviation,
-    predicted_allan_deviation,
-    rest_record,
-    spectral_density,
-)
 
 FIGURES = Path(__file__).parent / "figures"
+NOISE = runpy.run_path(str(Path(__file__).parent / "_ext" / "sensor_noise.py"))
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 # Inches: columns from the operator to the slave, rows for motion, force and what serves them.
@@ -331,17 +327,21 @@ def noise_figure() -> Picture:
         spectrum, allan = figure.subplots(1, 2)
         for name, colour in (("jr3_85m35a3", BLUE), ("ati_gamma_imu", VERMILION)):
             config = without(PRESETS[name], "drift")
-            record = rest_record(config, count, period, seed=1)[:, :1]
+            record = NOISE["rest_record"](config, count, period, seed=1)[:, :1]
             f, density = welch(record[:, 0], 1 / period, nperseg=2**19)
             edges = np.logspace(np.log10(0.05), np.log10(3000), 32)
             places = np.sqrt(edges[1:] * edges[:-1])
             means = [density[(f >= a) & (f < b)].mean() for a, b in pairwise(edges)]
             grid = np.logspace(np.log10(0.05), np.log10(3000), 200)
-            spectrum.plot(grid, spectral_density(config, grid, period)[0], color=colour, label=name)
+            spectrum.plot(
+                grid, NOISE["spectral_density"](config, grid, period)[0], color=colour, label=name
+            )
             spectrum.plot(places, means, ".", color=colour)
-            predicted = predicted_allan_deviation(config, lengths, period)[0]
+            predicted = NOISE["predicted_allan_deviation"](config, lengths, period)[0]
             allan.plot(lengths * period, predicted, color=colour, label=name)
-            allan.plot(lengths * period, allan_deviation(record, lengths)[0], ".", color=colour)
+            allan.plot(
+                lengths * period, NOISE["allan_deviation"](record, lengths)[0], ".", color=colour
+            )
         spectrum.set(
             xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=r"density of $f_x$ [N²/Hz]"
         )

@@ -43,7 +43,7 @@ from matplotlib.figure import Figure
 from drake_teleop.station.film import Film
 painted = Figure.savefig
 Figure.savefig = lambda _, path, **options: painted(Figure(figsize=(0.1, 0.1)), path, **options)
-Film._recorded = lambda self, make_scene: "<body></body>"
+Film._record_scene = lambda self, make_scene: "<body></body>"
 """
 
 
@@ -64,7 +64,7 @@ def test_two_surroundings_that_have_nothing_in_common(benchmark, tmp_path, monke
     found = benchmark.written(others, commands, tmp_path / "there", program)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    for kind, name in ((Figure, "savefig"), (Film, "_recorded")):
+    for kind, name in ((Figure, "savefig"), (Film, "_record_scene")):
         monkeypatch.setattr(kind, name, getattr(kind, name))  # to have it back
     monkeypatch.setattr("sys.argv", ["", json.dumps(benchmark.typed(commands))])
     exec(program, {})

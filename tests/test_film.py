@@ -1,4 +1,4 @@
-"""Films: how many frames, and that nothing in them can break the page."""
+"""3D replay: number of frames, and escaped texts."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from drake_teleop.station.film import Film, Reading, frame_times
     ("seconds", "slow_motion", "frames"),
     [(0.8, 10, 401), (6.0, 1, 301), (5.0, 2, 501), (39.0, 1, 1951), (36000.0, 1, 2001)],
 )
-def test_a_film_lasts_six_seconds_at_least_and_is_never_large(seconds, slow_motion, frames):
+def test_replay_lasts_at_least_six_seconds_with_limited_frames(seconds, slow_motion, frames):
     times, chosen = frame_times(1.0, 1.0 + seconds)
     assert (chosen, len(times)) == (slow_motion, frames)
     assert (times[0], times[-1]) == (1.0, 1.0 + seconds)
 
 
-def test_one_instant_is_a_film_too():
+def test_replay_of_one_instant():
     times, _ = frame_times(1.0, 1.0)
     np.testing.assert_array_equal(times, [1.0, 1.0])
 
 
-def test_no_word_or_number_breaks_the_page(tmp_path):
+def test_page_escapes_all_texts_and_numbers(tmp_path):
     reading = Reading("<b>", "N", np.array([np.nan, 1.23456, 20.0]), "#0072B2")
     film = Film("</script><b>&", np.array([0.0, 0.5, 1.0]), 1.0, [reading], notes=("<i>",))
     frames = []

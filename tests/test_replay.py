@@ -1,4 +1,4 @@
-"""The replay: postures as recorded, forces the right way round, a page that stands alone."""
+"""3D replay: postures, directions of forces, self-contained page."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from drake_teleop.station.station import MakeTeleopStation
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """Far enough into the movement for everything to be away from its start; no contact."""
+    """Return a scenario in free motion, away from its start."""
     return replace(
         LoadScenario("contact_transition"), simulation__settle=0.9, simulation__duration=0.04
     )
@@ -39,7 +39,7 @@ def result(scenario) -> SimulationResult:
 
 @pytest.fixture
 def arrows(monkeypatch) -> dict[str, np.ndarray]:
-    """The forces that the arrows show, by the arrow's name."""
+    """Return the forces of the arrows by name."""
     shown = {}
 
     class Arrow:
@@ -54,11 +54,11 @@ def arrows(monkeypatch) -> dict[str, np.ndarray]:
 
 
 def of_player(page: str) -> dict:
-    """What the page's player reads."""
+    """Return the data of the page's player."""
     return json.loads(re.search(r"const film = (.*);\n", page)[1])
 
 
-def test_master_and_slave_stand_as_recorded(meshcat, scenario, result):
+def test_postures_equal_the_record(meshcat, scenario, result):
     scene = ReplayScene(meshcat, scenario, result)
     base = scene.plant.GetFrameByName("base", scene.plant.GetModelInstanceByName("master::phantom"))
     for sample in (0, 25):
@@ -73,9 +73,7 @@ def test_master_and_slave_stand_as_recorded(meshcat, scenario, result):
         )
 
 
-def test_a_load_at_rest_pulls_the_hand_down_and_contact_pushes_it_up(
-    meshcat, scenario, result, arrows
-):
+def test_arrows_of_load_point_down_and_of_contact_up(meshcat, scenario, result, arrows):
     recorded = {name: np.array(result[name]) for name in result}
     recorded["load_estimate"][:] = 0.0
     weight = R_WS_HOME.inverse().matrix() @ [0.0, 0.0, 30.7]  # the sensor holds the load up
@@ -90,8 +88,8 @@ def test_a_load_at_rest_pulls_the_hand_down_and_contact_pushes_it_up(
     np.testing.assert_allclose(arrows["contact_at_tip"], arrows["contact_at_stylus"])
 
 
-def test_without_a_hand_there_is_the_slave_with_what_it_measures(meshcat, scenario, result, arrows):
-    """As of a run that identifies the load."""
+def test_replay_without_master_shows_slave_and_measured_force(meshcat, scenario, result, arrows):
+    """As in a run that identifies the load."""
     names = ("slave_state", "measured_wrench_S", "load_estimate", "sheet_state")
     recorded = {name: result[name] for name in names}
     scene = ReplayScene(meshcat, scenario, recorded)
@@ -102,7 +100,7 @@ def test_without_a_hand_there_is_the_slave_with_what_it_measures(meshcat, scenar
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory, scenario, result) -> str:
-    """The film of a folder as `run` leaves it."""
+    """Return the replay of a folder from `run`."""
     run, out = tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("out")
     result.write_part(run / "log.parquet", 0)
     write_scenario(run / "scenario.yaml", scenario)
@@ -112,7 +110,7 @@ def page(tmp_path_factory, scenario, result) -> str:
     return (out / "replay.html").read_text(encoding="utf-8")
 
 
-def test_the_film_is_one_page_that_needs_nothing_else(page):
+def test_replay_is_one_self_contained_page(page):
     assert 1e6 < len(page) < 4e6  # Meshcat itself is inside
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=.?(http|//|/)", page)
     # What the player asks Meshcat for.
@@ -130,7 +128,7 @@ def test_the_film_is_one_page_that_needs_nothing_else(page):
     assert all(f'id="{name}"' in page for name in ("play", "clock", "time", "speed", "readings"))
 
 
-def test_clock_and_newtons_beside_the_film_are_the_logs(page, scenario, result):
+def test_clock_and_readings_equal_the_log(page, scenario, result):
     shown = of_player(page)
     assert shown["title"] == scenario.description
     assert (shown["start"], shown["span"]) == pytest.approx((0.0, 0.04))
@@ -149,8 +147,8 @@ def test_clock_and_newtons_beside_the_film_are_the_logs(page, scenario, result):
         np.testing.assert_allclose(reading["values"][::5], newtons, atol=6e-4)
 
 
-def test_it_begins_anew_at_its_end(page):
-    """What the player shows next is written as Python would write it."""
+def test_replay_restarts_at_its_end(page):
+    """The player's next frame equals a Python implementation."""
     (following,) = re.findall(r"if \(playing\) show\((.*)\);", page)
     film = SimpleNamespace(span=0.04)
     for now, expected in ((0.01, 0.012), (0.039, 0.001)):
@@ -158,7 +156,7 @@ def test_it_begins_anew_at_its_end(page):
         assert found == pytest.approx(expected)
 
 
-def test_every_field_of_the_scenario_lies_beside_the_log(tmp_path, scenario):
+def test_scenario_file_is_beside_the_log(tmp_path, scenario):
     write_scenario(tmp_path / "scenario.yaml", scenario)
     assert LoadScenario(tmp_path / "scenario.yaml") == scenario
 
@@ -173,12 +171,12 @@ def test_all_logs_of_a_folder_are_replayed(tmp_path, scenario, result, monkeypat
     summary = replay_command(tmp_path, tmp_path / "out", quiet=True)
     films = [tmp_path / "out" / "a.html", tmp_path / "out" / "b.html"]
     assert [entry["film"] for entry in summary["films"]] == [str(film) for film in films]
-    with pytest.raises(DrakeTeleopError, match="does not say of which scenario it is; give --sc"):
+    with pytest.raises(DrakeTeleopError, match="has no scenario beside it; give --sc"):
         replay_command(tmp_path / "logs" / "without_scenario.parquet", tmp_path / "out")
 
 
-def test_what_holds_no_run_is_said(tmp_path, scenario, result):
-    with pytest.raises(DrakeTeleopError, match=r"holds no log of a run; give .* a study keeps"):
+def test_folder_without_run_is_rejected(tmp_path, scenario, result):
+    with pytest.raises(DrakeTeleopError, match=r"contains no log of a run; give .* a study"):
         replay_command(tmp_path, tmp_path)
     wrench = SimulationResult(
         result.t,
@@ -190,10 +188,10 @@ def test_what_holds_no_run_is_said(tmp_path, scenario, result):
 
 
 @pytest.mark.parametrize(("slow_motion", "frames"), [(1.0, 3), (10.0, 21), (50.0, 101)])
-def test_the_film_has_fifty_frames_a_second(
+def test_replay_has_fifty_frames_per_second(
     tmp_path, monkeypatch, scenario, result, slow_motion, frames
 ):
-    """Meshcat keeps a frame for every whole interval that has passed: none may get lost."""
+    """Meshcat stores a frame per whole interval; none may be lost."""
     kept = {}
 
     class Recorder:
@@ -221,8 +219,8 @@ def test_the_film_has_fifty_frames_a_second(
     np.testing.assert_array_equal(list(kept.values()), result["slave_state"][nearest])
 
 
-def test_its_server_is_gone_when_it_returns(tmp_path, result, scenario, monkeypatch):
-    """Collected later, in a thread of the progress bars, Meshcat would abort the program."""
+def test_meshcat_server_is_stopped_after_writing(tmp_path, result, scenario, monkeypatch):
+    """Later collection in a thread of a progress bar would abort the program."""
     ports = []
 
     def remember(params):

@@ -1,4 +1,4 @@
-"""The result object: names, units, round trip, bit-identical files, the canonical log."""
+"""SimulationResult: names, units, round trip, reproducible files, canonical log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def make_result(samples: int = 50, seed: int = 3) -> SimulationResult:
     return SimulationResult(t, arrays, SPECS)
 
 
-def test_signals_are_found_by_name_and_know_their_units():
+def test_signals_are_found_by_name_and_have_units():
     result = make_result()
     assert result.signals == tuple(spec.name for spec in SPECS)
     assert "sigma" in result and "force" not in result
@@ -85,7 +85,7 @@ def test_a_column_can_be_drawn():
     assert (axes.get_ylabel(), len(axes.lines)) == ("N m", 1)
 
 
-def test_one_component_may_be_given_flat():
+def test_single_component_may_be_one_dimensional():
     result = SimulationResult([0.0, 1.0], {"sigma": [0.5, 0.7]}, [SPECS[-1]])
     np.testing.assert_array_equal(result["sigma"], [[0.5], [0.7]])
 
@@ -97,7 +97,7 @@ def test_unknown_name_suggests_the_right_one():
         make_result().plot("nonsense")
 
 
-def test_arrays_are_read_only_but_the_caller_keeps_his():
+def test_arrays_are_read_only_but_not_those_of_the_caller():
     t = np.zeros(2)
     result = SimulationResult(t, {"sigma": np.zeros(2)}, [SPECS[-1]])
     with pytest.raises(ValueError, match="read-only"):
@@ -113,7 +113,7 @@ def test_arrays_are_read_only_but_the_caller_keeps_his():
         ({"sigma": np.zeros((2, 2))}, "shape"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(arrays, message):
+def test_inconsistent_signals_are_rejected(arrays, message):
     with pytest.raises(ValueError, match=message):
         SimulationResult([0.0, 1.0], arrays, [SPECS[-1]])
 
@@ -152,7 +152,7 @@ def test_same_data_same_bytes_other_data_other_bytes(tmp_path):
     assert a != c
 
 
-def test_foreign_and_absent_files_are_one_clear_error(tmp_path):
+def test_other_and_absent_files_give_one_error(tmp_path):
     pl.DataFrame({"t": [0.0]}).write_parquet(tmp_path / "foreign.parquet")
     (tmp_path / "text.parquet").write_text("no table at all")
     names = ["foreign.parquet", "text.parquet", "absent.parquet"]
@@ -176,14 +176,14 @@ def test_sensor_log_is_the_canonical_table():
     np.testing.assert_array_equal(log["t"].to_numpy(), result["sample_time"][:, 0])
 
 
-def test_a_sample_in_several_rows_is_one_row_of_the_sensor_log():
+def test_repeated_rows_are_merged_in_the_sensor_log():
     result = make_result(4)
     arrays = {name: result[name].repeat(2, axis=0) for name in result}
     fast = SimulationResult(np.arange(8) / 16000.0, arrays, SPECS)
     assert fast.sensor_log().equals(result.sensor_log())
 
 
-def test_sensor_log_says_what_was_not_recorded():
+def test_sensor_log_lists_missing_signals():
     result = SimulationResult([0.0], {"sigma": [0.0]}, [SPECS[-1]])
     with pytest.raises(DrakeTeleopError, match="measured_wrench_S"):
         result.sensor_log()

@@ -1,4 +1,4 @@
-"""Warnings of a run: what is planted in its signals is said with its times, and nothing else is."""
+"""Warnings of a run: only planted conditions are reported, with times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,13 @@ from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.run_warnings import behind, hunts, run_warnings, spans_of, turns
+from drake_teleop.station.run_warnings import (
+    find_reversals,
+    find_spans,
+    lag_beyond_delay,
+    oscillates,
+    run_warnings,
+)
 from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
@@ -34,7 +40,7 @@ LATE = 0.05  # s, of the recorded channel, a mean of "internet"
 
 
 def smooth(t):
-    """From 0 to 1 within 0.8 s from 0.5 s on, as hands go."""
+    """Return a smooth step from 0 to 1 between 0.5 s and 1.3 s."""
     u = np.clip((t - 0.5) / 0.8, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
 
@@ -44,7 +50,7 @@ def during(start: float, stop: float):
 
 
 def recorded(**changed):
-    """A run over a network in which all is well: a movement of 7 cm, by joint 2 of 0.2 rad."""
+    """Return a normal run over a network: a movement of 7 cm, or 0.2 rad of joint 2."""
 
     def pose(z):
         return np.column_stack([np.ones_like(T), *np.zeros((5, len(T))), z])
@@ -79,26 +85,27 @@ PLANTED = [
     ("ik_status", (0, 3.0 * during(1, 2)), "OUT_OF_REACH from 1.000 to 2.000 s"),
     ("joint_torque", (4, 1e4 * during(2.5, 2.6)), "joint 5 is at its largest torque"),
     ("joint_command", (0, 0.2 * during(2.0, 2.1)), "joint 1 is at its largest speed"),
-    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "most that it can from 1.000"),
+    ("force_to_master", (2, FORCE_LIMIT * during(1, 2)), "its largest force or torque from 1.000"),
     ("master_state", (1, 2.1 * during(1, 2)), "at the end of its workspace from 1.000 to 2.000 s"),
-    ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, as nothing comes from"
-     " the slave, from 1.000 to 2.000 s"),
+    ("ports", (4, 0.15 * during(1, 2)), "master's end is in its safe state, no packets arrive"
+     " from the slave, from 1.000 to 2.000 s"),
     ("ports", (5, np.where(during(1, 2), np.inf, 0)), "slave's end is in its safe state"),
     # It stays 4 cm behind: more than is explained from 0.5 s + half of the movement + delay on.
-    ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) holds"
-     " the slave's command back: up to 40.0 mm more than its delay explains, from 0.9"),
+    ("pose_received", (6, 0.04 * smooth(T)), "the channel (two_layer, network internet) delays"
+     " the slave's command: up to 40.0 mm more than its delay explains, from 0.9"),
     ("pose_received", (3, 0.1 * during(2, 2.5)), "11.5 degrees more"),
     ("slave_state", (5, 0.01 * during(1, 1.5)), "joint 6 is up to 0.6 degrees behind"),
-    ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave hunts"),
-    ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand hunts"),
-    ("pose_master", (1, 0.005 * np.sin(190 * T) * during(2, 3)), "the hand hunts: it is shaken to"
-     " and fro from 2.0"),
-    ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "lets the slave hunt"),
+    ("slave_state", (3, 0.004 * np.sin(40 * T) * during(1, 2)), "the slave oscillates"),
+    ("pose_master", (5, 0.002 * np.sin(15 * T) * during(1, 3)), "the hand oscillates"),
+    ("pose_master", (1, 0.005 * np.sin(190 * T) * during(2, 3)), "the hand oscillates while its"
+     " intent does not, from 2.0"),
+    ("pose_received", (2, 0.005 * np.sin(40 * T) * during(2, 3)), "makes the slave's command"
+     " oscillate"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "change", "said"), PLANTED, ids=[said for *_, said in PLANTED])
-def test_what_is_planted_is_said_and_nothing_else(name, change, said):
+def test_only_the_planted_condition_is_reported(name, change, said):
     (warning,) = run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM)
     assert said in warning
 
@@ -116,16 +123,16 @@ def test_what_is_planted_is_said_and_nothing_else(name, change, said):
     ],
     ids=["display", "silence", "channel", "joint", "ringing", "tremble"],
 )
-def test_what_is_over_soon_or_small_is_not_said(name, change):
+def test_short_or_small_deviations_are_not_reported(name, change):
     assert run_warnings(recorded(**{name: change}), OVER_NETWORK, ARM) == []
 
 
-def test_a_run_that_went_well_has_no_warnings():
+def test_normal_run_has_no_warnings():
     assert run_warnings(recorded(), OVER_NETWORK, ARM) == []
 
 
-def test_a_ledger_says_that_its_reserve_holds_the_slave_back_and_what_would_pay():
-    """The hand moves at 0.164 m/s at most; 0.02 J let the slave go at 0.091 m/s."""
+def test_ledger_reserve_warning_gives_the_required_energy():
+    """The hand moves at up to 0.164 m/s; 0.02 J allow 0.091 m/s of the slave."""
     scenario = replace(
         Scenario(),
         channel=Channel(delay=LATE),
@@ -136,8 +143,8 @@ def test_a_ledger_says_that_its_reserve_holds_the_slave_back_and_what_would_pay(
     slower = {"pose_received": (6, -held)}
     found = [x for x in run_warnings(recorded(**slower), scenario, ARM) if "reserve" in x]
     (warning,) = found
-    assert warning.startswith("the ledger's reserve lets the slave go at 0.091 m/s, and the hand")
-    assert "wants up to 0.16: " in warning
+    assert warning.startswith("the ledger's reserve limits the slave to 0.091 m/s, and the hand")
+    assert "moves at up to 0.16: " in warning
     # What it was told within the last 50 ms is no further away than this.
     far = float(warning.split("command is up to ")[1].split(" mm")[0])
     assert 0.0 < 1e3 * np.abs(held).max() - far < 50 * 0.164
@@ -147,7 +154,7 @@ def test_a_ledger_says_that_its_reserve_holds_the_slave_back_and_what_would_pay(
     assert not any("reserve" in x for x in run_warnings(recorded(**slower), quiet, ARM))
 
 
-def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():
+def test_wrist_motor_limit_uses_the_device_axes():
     q, J = np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]), np.empty((6, 6))
     jacobian_into.py_func(q, J)
     posture = (slice(0, 6), q - HOME)
@@ -159,24 +166,24 @@ def test_a_wrist_motor_at_its_limit_is_found_with_the_axes_of_the_device():
             recorded(force_to_master=full, master_state=posture), OVER_NETWORK, ARM
         )
         assert len(found) == warnings
-        assert all("the device displays the most that it can from 1.000" in x for x in found)
+        assert all("the device displays its largest force or torque from 1.000" in x for x in found)
 
 
-def test_spans_close_gaps_and_leave_out_what_is_short():
+def test_spans_close_gaps_and_skip_short_spans():
     happened = during(0.5, 0.6) | during(0.62, 1.0) | during(2.0, 2.1)
-    assert spans_of(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
-    assert spans_of(T, happened, 0.2) == [(0.5, 1.0)]
-    assert spans_of(T, 0 * T > 1) == []
+    assert find_spans(T, happened) == [(0.5, 1.0), (2.0, 2.1)]
+    assert find_spans(T, happened, 0.2) == [(0.5, 1.0)]
+    assert find_spans(T, 0 * T > 1) == []
 
 
-def test_many_times_are_counted():
+def test_further_times_are_counted():
     happened = np.sin(2 * np.pi * 2 * T) > 1e-9
     (warning,) = run_warnings(recorded(saturated=(0, happened)), OVER_NETWORK, ARM)
     assert warning.count("from") == 3
     assert warning.endswith(" and 3 more times")
 
 
-def test_a_joint_that_slides_is_behind_by_millimetres():
+def test_lag_of_prismatic_joint_is_in_millimetres():
     sliding = dataclasses.replace(ARM, table=ARM.table.copy())
     sliding.table[5, SLIDES] = 1.0
     late = recorded(slave_state=(5, 0.01 * during(1, 1.5)))
@@ -188,36 +195,36 @@ def test_a_joint_that_slides_is_behind_by_millimetres():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.1, 0.3])
-def test_behind_is_what_neither_delay_nor_a_low_pass_explains(delay):
+def test_lag_excludes_delay_and_low_pass(delay):
     command = np.column_stack([np.sin(5 * T), np.cos(3 * T)])
     late = np.column_stack([np.sin(5 * (T - delay)), np.cos(3 * (T - delay))])
     late[delay > T] = command[0]
-    assert behind(T, command, late, 0.3 + 1e-9).max() < 1e-9
+    assert lag_beyond_delay(T, command, late, 0.3 + 1e-9).max() < 1e-9
     slow = command.copy()
     for k in range(1, len(T)):
         slow[k] = slow[k - 1] + 0.001 / 0.05 * (command[k - 1] - slow[k - 1])
-    assert behind(T, command, slow, 0.3).max() < 2 * np.exp(-6)
+    assert lag_beyond_delay(T, command, slow, 0.3).max() < 2 * np.exp(-6)
     step = np.where(T > 1.0 + 1e-9, 1.0, 0.0)[:, np.newaxis] * [3.0, 4.0]
-    found = behind(T, step, 0 * step, 0.2)
+    found = lag_beyond_delay(T, step, 0 * step, 0.2)
     np.testing.assert_allclose(found, np.where(T > 1.2 + 1e-9, 5.0, 0.0))
 
 
-def test_turns_are_extremes_that_go_far_enough():
+def test_reversals_are_extremes_beyond_the_swing():
     x = np.sin(2 * np.pi * T) + 0.01 * np.sin(2 * np.pi * 50 * T)
-    np.testing.assert_allclose(T[turns(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
-    assert len(turns(x, 0.005)) > 50
-    assert len(turns(np.zeros(10), 0.1)) == len(turns(T, 0.1)) == 0
+    np.testing.assert_allclose(T[find_reversals(x, 0.1)], np.arange(6) / 2 + 0.25, atol=0.02)
+    assert len(find_reversals(x, 0.005)) > 50
+    assert len(find_reversals(np.zeros(10), 0.1)) == len(find_reversals(T, 0.1)) == 0
 
 
-def test_who_follows_to_and_fro_does_not_hunt():
+def test_following_an_oscillating_command_is_no_oscillation():
     command = 0.066 * np.sin(2 * np.pi * 2.63 * T)[:, np.newaxis]
     follows = 0.06 * np.sin(2 * np.pi * 2.63 * (T - 0.06))[:, np.newaxis]
-    assert not hunts(T, command, follows, 5e-4).any()
-    assert hunts(T, 0 * command, follows, 5e-4).mean() > 0.8
+    assert not oscillates(T, command, follows, 5e-4).any()
+    assert oscillates(T, 0 * command, follows, 5e-4).mean() > 0.8
     slow = 0.02 * np.sin(2 * np.pi * 2 * T)[:, np.newaxis]
     shaken = slow.copy()
     shaken[during(1, 2), 0] += 0.003 * np.sin(2 * np.pi * 20 * T[during(1, 2)])
-    found = T[hunts(T, slow, shaken, 5e-4)]
+    found = T[oscillates(T, slow, shaken, 5e-4)]
     assert 0.95 < found[0] < 1.1
     assert 1.9 < found[-1] < 2.05
     assert len(found) > 800
@@ -232,11 +239,11 @@ def test_the_longest_delay_is_that_of_the_latest_packet(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_slave_follows_however_late_the_wrist_sensor_is():
-    """The accelerations of this sensor are 6 ms late, and with them its sample.
+def test_slave_follows_with_a_late_wrist_sensor():
+    """The accelerations, and so the sample, are 6 ms late.
 
-    Energy that was counted with joint angles of that time emptied the tank of the slave: it came
-    4 cm behind, and without a word.
+    Energy must not be calculated with joint angles of that instant: it would empty the slave's
+    tank, and the slave would lag by 4 cm without a warning.
     """
     move = MinimumJerk(t_start=0.5, duration=0.8, translation=[0.0, 0.0, -0.07])
     scenario = replace(

@@ -1,4 +1,4 @@
-"""What is printed and written about the fields of a scenario is what the code takes."""
+"""Printed and generated descriptions of scenario fields match the code."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def loaded(text: str) -> Scenario:
     return ScenarioFromData(yaml_load(data=text), "printed.yaml")
 
 
-def taken_in(text: str, head: str) -> str:
-    """The text with one block that stands behind # taken in."""
+def uncomment_block(text: str, head: str) -> str:
+    """Return the text with one commented block activated."""
     lines = text.splitlines()
     (first,) = (i for i, line in enumerate(lines) if line.startswith(f"{head}  #"))
     mark = head[: head.index("#") + 1]
@@ -46,7 +46,7 @@ def taken_in(text: str, head: str) -> str:
     return "\n".join(lines)
 
 
-def test_the_docs_say_what_the_code_says() -> None:
+def test_docs_equal_the_generated_reference() -> None:
     """`python docs/make_reference.py` writes them."""
     assert (DOCS / "scenario.md").read_text(encoding="utf-8") == reference()
     assert (DOCS / "scenario.schema.json").read_text(encoding="utf-8") == json_schema()
@@ -77,28 +77,28 @@ def test_a_file_with_a_preset_keeps_it() -> None:
     assert again.wrist_sensor.preset == "ati_gamma_imu"
 
 
-def test_a_preset_can_be_changed_in_what_is_printed() -> None:
+def test_preset_can_be_changed_in_the_printed_scenario() -> None:
     text = commented(Scenario()).replace("preset: custom", "preset: ati_gamma_imu")
     assert loaded(text).wrist_sensor == PRESETS["ati_gamma_imu"]
 
 
-def test_what_stands_behind_a_sign_can_be_taken_in() -> None:
+def test_commented_blocks_can_be_activated() -> None:
     text = commented(Scenario())
-    assert loaded(taken_in(text, "# slot:")).slot == Slot()
-    assert loaded(taken_in(text, "  # task: !Press")).operator.task == Press()
-    assert loaded(taken_in(text, "  # intent:")).operator.intent == [MinimumJerk(), Sine()]
-    assert loaded(taken_in(text, "  # backward:")).channel.backward == NetworkConfig()
+    assert loaded(uncomment_block(text, "# slot:")).slot == Slot()
+    assert loaded(uncomment_block(text, "  # task: !Press")).operator.task == Press()
+    assert loaded(uncomment_block(text, "  # intent:")).operator.intent == [MinimumJerk(), Sine()]
+    assert loaded(uncomment_block(text, "  # backward:")).channel.backward == NetworkConfig()
 
 
-def test_without_a_name_the_shipped_ones_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_shipped_scenarios_are_listed_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["scenario"])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ScenarioNames()
 
 
-def as_an_editor_sees_it(text: str) -> Any:
-    """Parsed, without the tags, which no schema knows of."""
+def parse_without_tags(text: str) -> Any:
+    """Parse the text without tags, which schemas do not support."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -112,13 +112,13 @@ SCHEMA = jsonschema.Draft202012Validator(json.loads(json_schema()))
 
 
 @pytest.mark.parametrize("name", ScenarioNames())
-def test_the_schema_takes_what_is_shipped(name: str) -> None:
+def test_schema_accepts_shipped_scenarios(name: str) -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA.schema)
-    SCHEMA.validate(as_an_editor_sees_it((scenarios_dir() / f"{name}.yaml").read_text()))
+    SCHEMA.validate(parse_without_tags((scenarios_dir() / f"{name}.yaml").read_text()))
 
 
-def test_the_schema_takes_every_field() -> None:
-    SCHEMA.validate(as_an_editor_sees_it(commented(Scenario())))
+def test_schema_accepts_every_field() -> None:
+    SCHEMA.validate(parse_without_tags(commented(Scenario())))
 
 
 @pytest.mark.parametrize(
@@ -137,14 +137,14 @@ def test_the_schema_takes_every_field() -> None:
         ("slot: 1", ["slot"]),
     ],
 )
-def test_the_schema_refuses_what_the_library_refuses(text: str, field: list[str | int]) -> None:
+def test_schema_rejects_what_the_library_rejects(text: str, field: list[str | int]) -> None:
     with pytest.raises(DrakeTeleopError):
         loaded(text)
-    (error,) = SCHEMA.iter_errors(as_an_editor_sees_it(text))
+    (error,) = SCHEMA.iter_errors(parse_without_tags(text))
     assert list(error.absolute_path) == field
 
 
-def test_a_scenario_that_would_be_read_as_another_is_not_written(
+def test_scenario_that_reads_back_differently_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = LoadScenario("free_motion_force")

@@ -1,4 +1,4 @@
-"""The shipped scenarios: they load, and what happens in them is possible."""
+"""The shipped scenarios load, and their motions are feasible."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLOWER = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0)
 
 
 def run(name: str, **changes):
-    """The scenario with a perfectly known load."""
+    """Run the scenario with the true load."""
     scenario = replace(LoadScenario(name), **changes)
     estimate = np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
     station = MakeTeleopStation(scenario, load_estimate=estimate)
@@ -29,7 +29,7 @@ def margin(values, lower, upper):
     return np.minimum(values - lower, upper - values).min(axis=0)
 
 
-def test_these_are_shipped_and_say_what_they_are():
+def test_shipped_scenarios_have_descriptions():
     assert ScenarioNames() == sorted(
         [*MOVEMENTS, *TASKS, "ideal_sensor", "identification", "push_block"]
     )
@@ -39,7 +39,7 @@ def test_these_are_shipped_and_say_what_they_are():
         assert scenario.description
 
 
-def test_the_ideal_sensor_sees_the_vertical_movement():
+def test_ideal_sensor_measures_the_vertical_motion():
     ideal, realistic = LoadScenario("ideal_sensor"), LoadScenario("free_motion_force")
     assert ideal == replace(realistic, description=ideal.description, wrist_sensor__ideal=True)
 
@@ -66,7 +66,7 @@ def test_arm_and_sensor_stay_within_their_limits(movement):
 
 @pytest.mark.slow
 @ALL
-def test_the_master_stays_well_inside_its_workspace_and_its_force(movement):
+def test_master_stays_within_workspace_and_force(movement):
     _, result = movement
     q = result["master_state"][:, :6]
     assert np.all(margin(q, phantom.JOINT_LOWER, phantom.JOINT_UPPER) > np.radians(30))
@@ -77,8 +77,8 @@ def test_the_master_stays_well_inside_its_workspace_and_its_force(movement):
 
 
 @pytest.mark.parametrize("name", MOVEMENTS)
-def test_everything_starts_where_it_stays(name):
-    """The hand's intent begins at 0.1 s; until then nothing has a reason to move."""
+def test_station_is_at_rest_before_the_intent_starts(name):
+    """The intent starts at 0.1 s."""
     _, result = run(name, simulation__settle=0.0, simulation__duration=0.1)
     q = result["slave_state"][:, :6]
     assert np.abs(q - q[0]).max() < 2e-4  # rad: the sensor's noise reaches the hand
@@ -86,7 +86,7 @@ def test_everything_starts_where_it_stays(name):
 
 
 @pytest.mark.parametrize("movement", ["contact_transition"], indirect=True)
-def test_the_contact_is_one_touch_of_a_leaf_that_bends_little(movement):
+def test_contact_is_one_touch_with_small_deflection(movement):
     scenario, result = movement
     bend = np.abs(result["sheet_state"][:, 0]).max()
     assert 0.002 < bend < 0.5 * scenario.sheet_spring.largest_small_deflection

@@ -1,4 +1,4 @@
-"""The three sides: their written contract, sides of one's own, an intent from outside."""
+"""The three sides: documented ports, custom sides, external intent."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from operator_motion import intent_at
 from pydrake.systems.framework import BasicVector, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -17,7 +18,7 @@ from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel_side import MakeChannel
 from drake_teleop.station.estimation.contact_detection import ContactDetectionConfig
 from drake_teleop.station.master_side import MakeMasterSide
-from drake_teleop.station.operator.operator import OperatorConfig, Sine, intent_at
+from drake_teleop.station.operator.operator import OperatorConfig, Sine
 from drake_teleop.station.operator.task import Touch
 from drake_teleop.station.scenario import LoadScenario, Scenario, Simulation, replace
 from drake_teleop.station.signals import SIGNALS
@@ -61,7 +62,7 @@ def written(name: str, direction: str, without: tuple[str, ...] = ()) -> dict[st
 
 
 @pytest.mark.parametrize("direct", [True, False], ids=["direct", "network"])
-def test_the_ports_are_those_of_the_written_contract(direct):
+def test_ports_equal_the_documented_ports(direct):
     scenario = replace(LoadScenario("contact_transition"), operator__task=Touch())
     absent = ("over a network",)
     if not direct:
@@ -82,8 +83,8 @@ def test_the_ports_are_those_of_the_written_contract(direct):
             assert port not in SIGNALS or size == len(SIGNALS[port].components)
 
 
-def test_the_pages_own_sides_work(tmp_path, monkeypatch):
-    """A master in thirty lines and a recorded log for a slave, as docs/station.md shows them."""
+def test_custom_sides_of_the_docs_work(tmp_path, monkeypatch):
+    """Custom master and recorded slave of docs/station.md."""
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     for block in CODE:
@@ -110,7 +111,7 @@ def test_the_pages_own_sides_work(tmp_path, monkeypatch):
 
 
 class Intent(LeafSystem):
-    """The scenario's own intent, from outside."""
+    """The scenario's intent as an external block."""
 
     def __init__(self, segments, start) -> None:
         super().__init__()
@@ -126,7 +127,7 @@ class Intent(LeafSystem):
         output.SetFromVector(intent_at(self._segments, self._start, context.get_time())[1][0])
 
 
-def test_an_intent_from_a_port_moves_the_station_as_the_scenarios_own_does():
+def test_intent_from_port_equals_intent_of_scenario():
     sine = Sine(
         duration=10.0, ramp=0.05, frequency=3.0, translation=[0.01, 0.02, 0.015],
         rotation=[0.1, -0.2, 0.1],
@@ -150,7 +151,7 @@ def test_an_intent_from_a_port_moves_the_station_as_the_scenarios_own_does():
     assert np.abs(own["pose_master"][-1] - own["pose_master"][0]).max() > 1e-3
 
 
-def test_without_a_twist_the_damping_holds_the_hand_back_and_nonsense_is_refused():
+def test_intent_without_twist_lags_and_invalid_intent_is_rejected():
     station = MakeTeleopStation(Scenario())
     simulator = MakeSimulator(station, SHORT)
     context, port = simulator.get_mutable_context(), station.GetInputPort("intended_pose")
@@ -170,7 +171,7 @@ def test_without_a_twist_the_damping_holds_the_hand_back_and_nonsense_is_refused
 
 
 class Silent(LeafSystem):
-    """A side with ports of given sizes that put out zeros."""
+    """Side with ports of given sizes that output zeros."""
 
     def __init__(self, inputs: dict[str, int], outputs: dict[str, int]) -> None:
         super().__init__()
@@ -190,13 +191,13 @@ class Silent(LeafSystem):
         ({"slave": ({"pose_command": 7}, {"wrench_B": 3})}, "'wrench_B' has 3 numbers.* 6"),
     ],
 )
-def test_a_side_without_its_ports_is_one_clear_error(options, message):
+def test_side_without_required_port_gives_one_error(options, message):
     own = {name: Silent(*sizes) for name, sizes in options.items()}
     with pytest.raises(DrakeTeleopError, match=rf"{message}.*docs/station\.md"):
         MakeTeleopStation(Scenario(), **own)
 
 
-def test_a_network_needs_more_of_a_slave_of_ones_own():
+def test_network_requires_more_ports_of_a_custom_slave():
     scenario = replace(Scenario(), channel=Channel(delay=0.01))
     slave = Silent({"pose_command": 7}, {"wrench_B": 6})
     with pytest.raises(DrakeTeleopError, match="slave_side: there is no output port 'pose_slave'"):
@@ -205,13 +206,13 @@ def test_a_network_needs_more_of_a_slave_of_ones_own():
     assert "pose_received" in simulate(MakeTeleopStation(scenario, slave=whole), SHORT)
 
 
-def test_blocks_are_found_in_whichever_side_they_are():
+def test_blocks_are_found_in_all_sides():
     station = MakeTeleopStation(Scenario())
     for name in ("operator", "master_device", "slave_plant", "force_scaling", "monitor"):
         assert GetBlock(station, name).get_name() == name
 
 
-def test_a_channel_of_two_wires_is_left_out_of_the_station():
+def test_direct_wires_replace_an_ideal_channel():
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
     far = replace(Scenario(), channel=Channel(delay=0.01))
     assert not MakeTeleopStation(Scenario()).HasSubsystemNamed("channel")
@@ -220,7 +221,7 @@ def test_a_channel_of_two_wires_is_left_out_of_the_station():
     assert station.HasSubsystemNamed("channel") and station.HasOutputPort("contact_at_hand")
 
 
-def test_a_direct_channel_is_wires():
+def test_direct_channel_passes_values_through():
     builder = DiagramBuilder()
     channel = builder.AddSystem(MakeChannel(Scenario()))
     pose, wrench = np.arange(1.0, 8.0), np.arange(-3.0, 3.0)

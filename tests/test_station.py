@@ -1,4 +1,4 @@
-"""The whole station of Fig. 4 against rigid-body mechanics and the paper's statements."""
+"""The station of Fig. 4 compared with rigid-body mechanics and the paper."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def true_estimate(slave, offset=(0.0,) * 6) -> np.ndarray:
 
 
 def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
-    """An ideal loop in a steady vertical oscillation: no friction, no sensor errors."""
+    """Return an ideal loop in a vertical oscillation: no friction, no sensor errors."""
     sine = Sine(
         t_start=0.0, duration=100.0, ramp=0.5, frequency=frequency, translation=[0, 0, amplitude]
     )
@@ -87,8 +87,8 @@ def vertical(amplitude: float, frequency: float, **changes) -> Scenario:
     ],
     ids=["free", "leaf", "slot"],
 )
-def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, touched, at_once):
-    """What the sensor samples is what the plant says the weld transmits in the same state."""
+def test_wrist_wrench_equals_drakes_reaction_force(slave, touched, at_once):
+    """Compare the sample with the reaction force of the weld in the same state."""
     scenario = vertical(0.07, 2.5, simulation__settle=0.0, **touched)
     simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
     simulator.Initialize()
@@ -120,8 +120,8 @@ def test_the_wrist_wrench_is_the_reaction_force_of_the_sensors_joint(slave, touc
 @pytest.mark.parametrize(
     ("name", "most"), [("free_motion_force", 1e-6), ("contact_transition", 0.15)]
 )
-def test_samples_between_the_steps_are_those_of_short_steps(name, most):
-    """The 8 kHz samples in steps of 500 us (in contact, less) against a run in steps of 40 us."""
+def test_samples_between_steps_equal_those_of_short_steps(name, most):
+    """Steps of 500 us compared with steps of 40 us."""
     scenario = replace(
         LoadScenario(name),
         wrist_sensor__ideal=True,
@@ -142,7 +142,7 @@ def test_samples_between_the_steps_are_those_of_short_steps(name, most):
     assert off < most
 
 
-def test_a_push_that_the_sensor_is_not_told_of_is_an_error(slave):
+def test_unknown_force_on_the_slave_is_an_error(slave):
     scenario = vertical(0.0, 1.0, simulation__settle=0.0, force_scaling__force_scale=0.0)
     simulator = MakeSimulator(MakeTeleopStation(scenario), scenario.simulation)
     station, root = simulator.get_system(), simulator.get_mutable_context()
@@ -164,13 +164,13 @@ def test_a_push_that_the_sensor_is_not_told_of_is_an_error(slave):
 
 
 def first_harmonic(signal: np.ndarray, t: np.ndarray, frequency: float) -> complex:
-    """Over a whole number of periods."""
+    """Return the amplitude over a whole number of periods."""
     return 2 * np.mean(signal * np.exp(-2j * np.pi * frequency * t))
 
 
 @pytest.fixture(scope="module")
 def felt(slave):
-    """Per sigma: hand force, acceleration of the master and of the slave at 1 Hz, vertical."""
+    """Return hand force and accelerations of master and slave at 1 Hz, vertical, per sigma."""
     responses = {}
     for sigma in (0.0, 0.5, 1.0, 1.5):
         scenario = vertical(0.03, 1.0, force_scaling__sigma=sigma)
@@ -188,8 +188,8 @@ def felt(slave):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.5, 1.0, 1.5])
-def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt, sigma):
-    """Apparent mass m_a = sigma m (section V), here / 17.5 and times the slave's tracking."""
+def test_apparent_mass_is_device_plus_sigma_times_load(felt, sigma):
+    """m_a = sigma m (section V), here / 17.5 and times the slave's tracking."""
     hand_0, acceleration_0, _ = felt[0.0]
     hand, acceleration, slave_acceleration = felt[sigma]
     tracking = slave_acceleration / acceleration
@@ -198,8 +198,8 @@ def test_the_operator_feels_sigma_times_the_loads_mass_on_top_of_the_device(felt
 
 
 @pytest.mark.slow
-def test_with_sigma_0_the_operator_feels_the_device_alone(felt):
-    """The device's own mass, from its closed forms, and the hand's."""
+def test_apparent_mass_is_the_device_with_sigma_0(felt):
+    """Mass of the device from closed forms, plus the hand's."""
     hand, acceleration, _ = felt[0.0]
     q = phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, 0.27, 0, 0.03]))
     grip = OperatorConfig(grip="firm").hand
@@ -210,11 +210,8 @@ def test_with_sigma_0_the_operator_feels_the_device_alone(felt):
     assert (hand / acceleration).real == pytest.approx(mass, rel=0.02)
 
 
-def test_energy_of_the_ideal_loop_is_accounted_for(slave):
-    """What hand and motors put in is what the bodies hold, on both sides.
-
-    Wrenches and torques are held over a period, so that their work over it is known exactly.
-    """
+def test_energy_balance_of_the_ideal_loop(slave):
+    """Held wrenches and torques have exactly known work over a period."""
     scenario = vertical(
         0.04, 1.5, rates__log_hz=2000.0, rates__sensor_hz=2000.0, simulation__settle=0.0
     )
@@ -251,8 +248,8 @@ def test_energy_of_the_ideal_loop_is_accounted_for(slave):
     assert np.ptp(stored) > 1.0
 
 
-def test_what_the_station_puts_out_is_what_the_plain_functions_say(slave):
-    """The blocks are thin shells: the same kernel on the log gives the same wrench."""
+def test_station_outputs_equal_the_plain_functions(slave):
+    """The blocks call these functions, so equal inputs give equal outputs."""
     scenario = vertical(0.05, 2.0, force_scaling__sigma=0.5, wrist_sensor__ideal=False)
     estimate = true_estimate(slave, scenario.wrist_sensor.offset)
     result = simulate(MakeTeleopStation(scenario, load_estimate=estimate), scenario.simulation)
@@ -270,7 +267,7 @@ def test_what_the_station_puts_out_is_what_the_plain_functions_say(slave):
     np.testing.assert_array_equal(result["scaled_wrench_S"], wrench)
 
 
-def test_ideal_sensor_and_true_load_leave_nothing(slave):
+def test_ideal_sensor_and_true_load_give_zero_contact_wrench(slave):
     scenario = vertical(0.06, 2.5, force_scaling__sigma=0.0)
     result = simulate(
         MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
@@ -328,8 +325,8 @@ def test_an_open_clutch_stops_the_slave(slave):
 
 
 @pytest.mark.slow
-def test_scales_change_while_running_without_a_step_of_the_force(slave):
-    """From the whole inertia at 1/17.5 to none at 1/10, in the middle of a fast movement."""
+def test_scales_change_during_a_run_without_force_step(slave):
+    """From sigma 1 at 1/17.5 to 0 at 1/10 during a fast movement."""
     scenario = vertical(0.03, 1.0)
     station = MakeTeleopStation(scenario, load_estimate=true_estimate(slave))
     block = GetBlock(station, "force_scaling")
@@ -393,8 +390,8 @@ def test_a_start_out_of_reach_is_one_clear_error():
         MakeTeleopStation(replace(Scenario(), slave__position=[1.4, 0.0, 0.45]))
 
 
-def test_a_command_far_out_of_reach_is_survived_and_reported(slave):
-    """The inverse kinematics clamps the command: no joint leaves its range, nothing is lost."""
+def test_command_far_out_of_reach_is_clamped_and_reported(slave):
+    """No joint leaves its range."""
     sine = Sine(duration=100.0, ramp=0.5, frequency=0.4, translation=[0.0, 0.06, 0.0])
     scenario = replace(
         Scenario(),
@@ -416,19 +413,19 @@ def trajectory_of_joint_5(slave, amplitude: float) -> FourierTrajectory:
     return FourierTrajectory.at_rest(home, np.zeros((6, 4)), cosine, 0.5)
 
 
-def test_eliminating_a_load_that_nobody_identified_is_refused():
+def test_elimination_without_load_estimate_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* not known; .*identify_load"):
         MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0))
     MakeTeleopStation(replace(Scenario(), force_scaling__sigma=0.0, load_estimator__enabled=True))
     MakeTeleopStation(Scenario())
     seen = replace(Scenario(), contact_detection=ContactDetectionConfig())
-    with pytest.raises(DrakeTeleopError, match=r"detected, but the load is not known"):
+    with pytest.raises(DrakeTeleopError, match=r"contact detection needs a load estimate"):
         MakeTeleopStation(seen)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.0])
-def test_a_load_that_was_never_learnt_is_refused(sigma):
-    """Everything would be contact: the weight and inertia of the tool, 96 N."""
+def test_empty_load_estimate_is_rejected(sigma):
+    """Otherwise weight and inertia of the tool (96 N) would count as contact."""
     scenario = replace(Scenario(), force_scaling__sigma=sigma)
     offsets_alone = np.repeat([1.0, 0.0], [6, 10])
     with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* never learnt; identify it"):
@@ -438,7 +435,7 @@ def test_a_load_that_was_never_learnt_is_refused(sigma):
     MakeTeleopStation(learning, load_estimate=offsets_alone)
 
 
-def test_a_station_that_knows_no_load_does_not_call_anything_contact():
+def test_station_without_load_has_no_contact_wrench():
     unknown, learning = Scenario(), replace(Scenario(), load_estimator__enabled=True)
     for scenario, told in ((unknown, False), (learning, True)):
         station = MakeTeleopStation(scenario)
@@ -447,12 +444,12 @@ def test_a_station_that_knows_no_load_does_not_call_anything_contact():
         assert station.HasOutputPort("load_estimate") == told
 
 
-def test_identifying_without_learning_is_refused_at_once():
+def test_identification_without_estimator_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"load_estimator\.enabled: .*call identified_load"):
         identify_load(LoadScenario("contact_transition"))
 
 
-def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave):
+def test_joint_range_violation_ends_the_simulation(slave):
     scenario = replace(LoadScenario("identification"), simulation=Simulation(duration=2.0))
     station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 6.0))
     left = r"joint 5 of the slave left its range at \d\.\d+ s"
@@ -463,8 +460,8 @@ def test_leaving_the_joints_range_ends_the_simulation_with_a_clear_message(slave
     assert replace(scenario, **{way.replace(".", "__"): servo}).joint_control.servo == servo
 
 
-def test_identification_leaves_the_teleoperation_station_alone(slave):
-    """Stations do not share state: building one does not change the next."""
+def test_identification_does_not_change_the_station(slave):
+    """Stations do not share state."""
     short = Simulation(duration=0.02)
     scenario = replace(LoadScenario("identification"), simulation=short)
     station = MakeIdentificationStation(scenario, trajectory_of_joint_5(slave, 0.1))
@@ -473,8 +470,8 @@ def test_identification_leaves_the_teleoperation_station_alone(slave):
 
 
 @pytest.mark.slow
-def test_a_station_that_nobody_holds_is_no_more(slave):
-    """Thousands of stations in one process, one after the other, need the memory of one."""
+def test_unreferenced_stations_are_freed(slave):
+    """Thousands of stations in one process need the memory of one."""
     short = Simulation(duration=0.02)
     identification = replace(LoadScenario("identification"), simulation=short)
     trajectory = trajectory_of_joint_5(slave, 0.1)

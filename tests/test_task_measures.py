@@ -1,4 +1,4 @@
-"""The measures of a task against closed forms, on a log that was made by hand."""
+"""Task measures compared with closed forms on a synthetic log."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.operator.decision import (
     FEELING,
     MOVING,
@@ -20,7 +19,7 @@ from drake_teleop.station.operator.decision import (
     WAITING,
 )
 from drake_teleop.station.operator.operator import OperatorConfig
-from drake_teleop.station.operator.task import Insert, Press, Reach, Touch
+from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario, replace
 from drake_teleop.station.signals import SIGNALS
@@ -42,9 +41,9 @@ def measures(task, **log):
 
 
 def run(task, *, done: float = 1.0, force: float = 6.0, early: bool = False, phase: int = MOVING):
-    """A hand of 2 N that goes to and fro at 0.1 m/s, and a contact from CONTACT on.
+    """Return a log of a hand force of 2 N at 0.1 m/s back and forth, with contact from CONTACT on.
 
-    The tool stays where it was at the start.
+    The tool stays at its start.
     """
     state = np.zeros((len(T), STATE))
     state[T >= START, 0] = phase
@@ -69,7 +68,7 @@ def run(task, *, done: float = 1.0, force: float = 6.0, early: bool = False, pha
     return result, replace(Scenario(), operator=operator, simulation__settle=SETTLE)
 
 
-def test_of_a_touch():
+def test_measures_of_a_touch():
     found = measures(Touch(t_start=START + SETTLE))
     assert tuple(found) == TASK_MEASURES
     assert found["success"] == 1.0
@@ -84,15 +83,15 @@ def test_of_a_touch():
     assert measures(Touch(t_start=START + SETTLE), early=True)["false_notices"] == 1.0
 
 
-def test_of_a_press():
+def test_measures_of_a_press():
     found = measures(Press(t_start=START + SETTLE, force=5.0, tolerance=2.0, hold=1.0))
     assert found["success"] == 1.0
     assert found["contact_force_overshoot_N"] == pytest.approx(1.0)
     assert found["press_error_N"] == pytest.approx(1.0)
 
 
-def test_a_task_that_failed_has_no_merits():
-    """Neither one that is given up, nor one that only the operator believes to be done."""
+def test_failed_task_has_nan_measures():
+    """Given up, or finished without success."""
     for found in (
         measures(Press(force=5.0, tolerance=0.5)),
         measures(Press(force=5.0, tolerance=2.0), done=-1.0),
@@ -102,7 +101,7 @@ def test_a_task_that_failed_has_no_merits():
         assert missing == set(TASK_MEASURES) - {"success", "detection_time_s", "false_notices"}
 
 
-def test_of_a_task_that_was_given_up():
+def test_measures_of_a_given_up_task():
     found = measures(Touch(), done=-1.0, force=0.0)
     assert found["success"] == 0.0
     assert math.isnan(found["task_time_s"]) and math.isnan(found["detection_time_s"])
@@ -122,16 +121,16 @@ FAILURES = {
     # It gives up.
     f"at 3.00 s, after the 2.5 s of its timeout, while pressing, {FAR}, 6.0 N at the tool instead"
     " of 8 N": (Press(**AT, timeout=2.5), {"done": -1.0, "phase": PRESSING}),
-    f"at 3.00 s, for it saw the tool far beyond the surface and felt nothing, {FAR}, 0.0 N": (
+    f"at 3.00 s: it saw the tool far beyond the surface and detected no contact, {FAR}, 0.0 N": (
         Touch(**AT),
         {"done": -1.0, "phase": FEELING, "force": 0.0},
     ),
     # The log ends before.
-    f"after 3.50 s of the task, while the operator was seeking the way into the slot, {FAR}": (
+    f"after 3.50 s of the task, while the operator was searching for the slot, {FAR}": (
         Insert(**AT),
         {"done": 0.0, "phase": SEEKING},
     ),
-    f"on its way to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
+    f"moving to the target, {FAR}; set a longer": (Reach(**AT), {"done": 0.0}),
     "begins at 7 s, when the simulation has ended": (
         Reach(t_start=7.0),
         {"done": 0.0, "phase": WAITING},
@@ -140,13 +139,13 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("said", FAILURES)
-def test_a_task_that_failed_says_why(said):
+def test_failure_text_gives_the_reason(said):
     task, log = FAILURES[said]
     result, scenario = run(task, **log)
     assert said in task_failure(result, scenario)
     assert task_measures(result, scenario)["success"] == 0.0
 
 
-def test_a_task_that_was_done_says_nothing():
+def test_successful_task_has_no_failure_text():
     for task in (Touch(), Press(force=5.0, tolerance=2.0), Reach(translation=[0, 0, 0])):
         assert task_failure(*run(task)) == ""

@@ -8,10 +8,10 @@ Where a curve turns up, averaging for longer makes it worse: take the offset (ta
 
 import matplotlib.pyplot as plt
 import numpy as np
+from sensor_noise import predicted_allan_deviation  # docs/_ext/sensor_noise.py
 
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.sensor.sensor_chain import without
-from drake_teleop.station.sensor.sensor_noise import predicted_allan_deviation
 
 rates = {"jr3_85m35a3": 8000, "ati_gamma_imu": 698, "bota_sensone": 800, "robotiq_ft300": 100}
 figure, axes = plt.subplots(figsize=(7, 4))

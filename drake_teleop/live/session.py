@@ -146,7 +146,7 @@ class _Station:
         copy_state(other.station, other.context, self.station, self.context, excluded)
         if other.scenario.wrist_sensor != self.scenario.wrist_sensor:
             sensor, context = self.block("wrist_sensor")
-            sensor.bring_up_to_date(context)
+            sensor.reset_queue(context)
         wait_s = fill_time(self.scenario) if channel_anew else 0.0
         cross_fade, context = self.block("cross_fade")
         rendered = other.value("force_to_master")

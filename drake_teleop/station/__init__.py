@@ -1,1 +1,1 @@
-"""Fig. 4 of the paper as a Drake Diagram: a subpackage for each block, its scenario and result."""
+"""Teleoperation station of the paper's Fig. 4 as a Drake Diagram, with scenario and result."""

@@ -1,4 +1,4 @@
-"""The channel: what lies between master and slave; nothing, or a network and a passivity method."""
+"""The channel between master and slave: direct wires, or a network with a passivity method."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ Array = NDArray[np.float64]
 
 
 def MakeChannel(scenario: Scenario) -> Diagram:
-    """The network with the method that keeps the station passive at both of its ends.
+    """Build the channel of a scenario.
 
-    An ideal network without a method is nothing but wires.
+    An ideal network without a method consists of wires only; "network" below means all other cases.
 
     .. pydrake_system::
 
         name: channel
         input_ports:
         - pose_command: (7,) X_WS, from the master side
-        - wrench_B: (6,) F_E_B, what the hand should feel, from the slave side [N, N m]
-        - contact: (1,) the flag of the slave's detector (with contact detection)
-        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (over a network)
-        - pose_slave: (7,) X_WS of the slave, actual (over a network)
-        - saturated: (1,) 1 while the wrench is not to be trusted (over a network)
-        - load_wrench_B: (6,) what of wrench_B is the load's weight and inertia; read by `ledger`,
-          may be left unconnected (over a network)
+        - wrench_B: (6,) F_E_B, wrench to render, from the slave side [N, N m]
+        - contact: (1,) flag of the slave's detector (with contact detection)
+        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (network)
+        - pose_slave: (7,) actual X_WS of the slave (network)
+        - saturated: (1,) 1 while the wrench is invalid (network)
+        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; only `ledger`
+          reads it; may stay unconnected (network)
         output_ports:
-        - pose_to_slave: (7,) X_WS that the slave shall follow
-        - wrench_to_master: (6,) F_E_B that the hand shall feel [N, N m]
+        - pose_to_slave: (7,) X_WS, setpoint of the slave
+        - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
         - contact_at_hand: signal (with contact detection)
-        - pose_received, ports: signals (over a network)
+        - pose_received, ports: signals (network)
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
@@ -60,7 +60,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         "channel",
         TeleopChannel(
             scenario.channel,
-            _told_of_the_device(scenario, told_of_the_arm(scenario)),
+            _limit_to_device(scenario, passivity_with_arm_mass(scenario)),
             RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
             np.array([scaling.translation_scale, scaling.rotation_scale]),
             scenario.force_scaling.force_scale,
@@ -86,10 +86,10 @@ def MakeChannel(scenario: Scenario) -> Diagram:
     return builder.Build()
 
 
-def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """A method's limits at the hand are no larger than what the device displays.
+def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
+    """Limit the method's wrench to the largest wrench of the device.
 
-    Otherwise an account would hold a wrench that the hand does not feel.
+    Otherwise the energy balance would contain a wrench that the device does not display.
     """
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
@@ -99,11 +99,12 @@ def _told_of_the_device(scenario: Scenario, passivity: PassivityConfig) -> Passi
     )
 
 
-def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
-    """A scenario's method; `ledger`, whose promise rests on the mass, is told the arm's.
+def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
+    """Return the scenario's method; add mass and servo of the arm for `ledger`.
 
     Raises:
-        DrakeTeleopError: for an arm of less than six joints, which has none in some direction.
+        DrakeTeleopError: if the arm has fewer than six joints, so that its mass is unbounded in
+            some direction.
     """
     passivity = scenario.passivity
     if passivity.method != "ledger" or passivity.slave_mass is not None:
@@ -111,9 +112,9 @@ def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
     slave = NominalSlave(scenario.slave)
     if slave.arm.num_joints < 6:
         raise DrakeTeleopError(
-            f"an arm of {slave.arm.num_joints} joints gives way in no direction but those",
+            f"an arm of {slave.arm.num_joints} joints has no mass in some directions",
             where="passivity.method",
-            remedy="take another method, or give passivity.slave_mass with its servo yourself",
+            remedy="choose another method, or set passivity.slave_mass and the servo explicitly",
         )
     servo = servo_at_tool(slave.arm, slave.start, scenario.joint_control)
     return dataclasses.replace(
@@ -125,9 +126,9 @@ def told_of_the_arm(scenario: Scenario) -> PassivityConfig:
 
 
 def power_scale(scenario: Scenario) -> Array:
-    """(2,) the master's power units over the slave's, of translation and rotation.
+    """Return (2,) master power units per slave power unit, for translation and rotation.
 
-    Where motion is scaled to zero there is no energy, and any unit will do.
+    A motion scale of zero counts as 1: there is no energy then.
     """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])

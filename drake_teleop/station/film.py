@@ -1,7 +1,7 @@
-"""Films: one HTML file with Meshcat and a player in it, to be opened in any browser, offline.
+"""3D replay: one HTML file with Meshcat and a player, which works offline in any browser.
 
-The player (`pages/player.html.j2`) has the film's clock, play and pause, a slider, speeds, numbers
-and their curves. The film repeats itself.
+The player (`pages/player.html.j2`) has a clock, play and pause, a slider, speeds, readings and
+their curves. The replay repeats.
 """
 
 from __future__ import annotations
@@ -34,43 +34,42 @@ from drake_teleop.common.writing import make_folder, write_text
 
 Array = NDArray[np.float64]
 Show = Callable[[float, int], None]
-"""Shows a frame, by its number, at a time of the recording [s]."""
+"""Function that shows a frame (index) at a time of the recording [s]."""
 
 FRAMES_PER_SECOND = 50
-# A longer film has fewer frames a second, which the browser interpolates: 3 kB each.
-_MOST_FRAMES = 2000
-_SHORTEST = 6.0  # a film that nobody said how slow to make lasts that long at least [s]
-_SLOWER = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds that the player has
+# A longer replay has a lower frame rate; a frame takes 3 kB and the browser interpolates.
+_MAX_FRAMES = 2000
+_MIN_DURATION_S = 6.0  # shortest replay with the default speed [s]
+_SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds of the player
 
-_SHAFT, _HEAD = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
-_METRES_PER_NEWTON = 0.003
-_GREY = Rgba(0.9, 0.9, 0.9)  # Drake's own default
-_BACK = RotationMatrix.MakeXRotation(np.pi)
-# Meshcat's page has none of the first: a telephone lays it out as if it were 980 pixels wide.
+_SHAFT_RADIUS_M, _HEAD_LENGTH_M = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
+_ARROW_M_PER_N = 0.003
+_DEFAULT_COLOUR = Rgba(0.9, 0.9, 0.9)  # Drake's own default
+_R_FLIPPED = RotationMatrix.MakeXRotation(np.pi)
+# Meshcat's page has no viewport: a telephone would use a width of 980 pixels.
 _POLICY = '<meta http-equiv="Content-Security-Policy" content="{}">'
 _TITLE = '<meta name="viewport" content="width=device-width, initial-scale=1"><title>drake_teleop<'
 
 
 class Canvas(Protocol):
-    """Receives where things are: Meshcat, or what has its methods."""
+    """Receiver of poses and properties: Meshcat or an object with the same methods."""
 
     def SetTransform(self, path: str, X_ParentPath: RigidTransform, time: float) -> None:
-        """Set the pose of what is at `path`, at a time of the recording [s]."""
+        """Set the pose of the object at `path`, at a time of the recording [s]."""
 
     def SetProperty(self, path: str, property: str, value: Any, time: float) -> None:
-        """Set a property, such as "scale"."""
+        """Set a property, such as "scale", at a time of the recording [s]."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A number beside the film.
+    """Number displayed beside the replay.
 
     Args:
-        name: what it is.
-        unit: of it.
-        values: (F,) one for each frame; NaN where there is none.
-        colour: of its curve, "#rrggbb"; without one it has none. Curves share one scale.
-        arrow: whether arrows of this colour show it.
+        name, unit: label.
+        values: (F,) one value per frame; NaN if there is none.
+        colour: colour of its curve, "#rrggbb"; "" for no curve. All curves share one scale.
+        arrow: whether arrows of this colour represent it.
     """
 
     name: str
@@ -80,7 +79,7 @@ class Reading:
     arrow: bool = False
 
     def for_page(self) -> dict[str, object]:
-        """What the player reads."""
+        """Return the data that the player reads."""
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -94,17 +93,17 @@ class Reading:
 
 @dataclass(frozen=True)
 class Film:
-    """What a film is of.
+    """Contents of a replay.
 
     Args:
         title: one line.
-        times: (F,) of its frames, evenly spaced, at least two [s].
-        slow_motion: seconds of the film for one second of what it shows, to begin with.
-        readings: numbers beside it.
-        shaded: spans of `times` that its curves mark.
-        notes: further lines beside it.
-        clock: what the times are.
-        curves: what its curves are; "{top}" is where they end.
+        times: (F,) times of the frames, evenly spaced, at least two [s].
+        slow_motion: initial speed: seconds of replay per second of `times`.
+        readings: numbers beside the replay.
+        shaded: intervals of `times` that the curves mark.
+        notes: further lines of text.
+        clock: label of the times.
+        curves: label of the curves; "{top}" is replaced by the largest value.
     """
 
     title: str
@@ -117,34 +116,33 @@ class Film:
     curves: str = ""
 
     def write(self, path: Path, make_scene: Callable[[Meshcat], Show]) -> None:
-        """Writes the film.
+        """Write the replay.
 
         Args:
-            path: of the HTML file.
-            make_scene: puts what is to be seen into Meshcat, and gives what shows a frame.
+            path: HTML file.
+            make_scene: adds the objects to Meshcat and returns the function that shows one frame.
         """
-        # Meshcat may be destroyed by no other thread than the one that made it, and Drake's objects
-        # hold on to each other until the garbage collector comes, in whichever thread: it comes
-        # here.
+        # Only the thread that created Meshcat may destroy it, and reference cycles keep Drake's
+        # objects until garbage collection, which may run in any thread: so collect here.
         collects = gc.isenabled()
         gc.disable()
         try:
-            page = self._recorded(make_scene)
+            page = self._record_scene(make_scene)
             gc.collect()
         finally:
             if collects:
                 gc.enable()
         make_folder(path.parent)
-        write_text(path, self._with_player(page))
+        write_text(path, self._add_player(page))
 
-    def _recorded(self, make_scene: Callable[[Meshcat], Show]) -> str:
-        with quiet_drake():  # nobody is to connect to its server
+    def _record_scene(self, make_scene: Callable[[Meshcat], Show]) -> str:
+        with quiet_drake():  # no client connects to its server
             meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
         show = make_scene(meshcat)
         interval = self._span / (len(self.times) - 1)
         meshcat.StartRecording(1 / interval, set_visualizations_while_recording=False)
         for frame in range(len(self.times)):
-            # Meshcat counts whole intervals, and 29 x 0.02 is a little less than 29 of them.
+            # Meshcat counts whole intervals: 29 x 0.02 rounds to less than 29 of them.
             show((frame + 0.5) * interval, frame)
         meshcat.StopRecording()
         meshcat.PublishRecording()
@@ -154,7 +152,7 @@ class Film:
     def _span(self) -> float:
         return max(float(self.times[-1] - self.times[0]), 1e-3)
 
-    def _with_player(self, page: str) -> str:
+    def _add_player(self, page: str) -> str:
         start = float(self.times[0])
         film = {
             "title": self.title,
@@ -175,25 +173,28 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """The instants that a film shows, and how slow it is.
+    """Return frame times and slow motion.
 
     Args:
-        start, stop: what it shows [s].
-        slow_motion: seconds of the film for one second of that; by default the least of the
-            player's speeds with which the film lasts 6 s.
+        start, stop: interval [s].
+        slow_motion: seconds of replay per second; by default the player's lowest speed factor
+            with which the replay lasts 6 s.
 
     Returns:
-        (F,) times [s], 50 for each second of the film but no more than 2001, and the slow motion.
+        (F,) times [s], 50 per second of replay and at most 2001; the slow motion.
     """
     span = stop - start
     if slow_motion is None:
-        slow_motion = next((s for s in _SLOWER if s * span >= _SHORTEST), _SLOWER[-1])
-    frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MOST_FRAMES)
+        slow_motion = next(
+            (s for s in _SLOW_MOTION_FACTORS if s * span >= _MIN_DURATION_S),
+            _SLOW_MOTION_FACTORS[-1],
+        )
+    frames = min(math.ceil(span * slow_motion * FRAMES_PER_SECOND - 1e-6), _MAX_FRAMES)
     return np.linspace(start, stop, max(frames, 1) + 1), slow_motion
 
 
-def plain_room(meshcat: Meshcat) -> None:
-    """Light background, no grid, no axes."""
+def set_plain_background(meshcat: Meshcat) -> None:
+    """Set a light background without grid and axes."""
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.97, 0.98, 1.0])
@@ -205,9 +206,9 @@ def add_shapes(
     path: str,
     inspector: SceneGraphInspector,
     shapes: Iterable[GeometryId],
-    colour: Rgba = _GREY,
+    colour: Rgba = _DEFAULT_COLOUR,
 ) -> None:
-    """Add the shapes of a body below its path, in the model's colours, or else in `colour`."""
+    """Add a body's shapes below its path, in the model's colours or else in `colour`."""
     for shape in shapes:
         seen = inspector.GetIllustrationProperties(shape)
         own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)
@@ -217,40 +218,40 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
-    """Drake's colour of "#rrggbb"."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
 class Arrow:
-    """A force at a place; its length follows the force, 3 mm a newton."""
+    """Arrow of a force, 3 mm long per newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
         self._path = f"/forces/{name}"
-        meshcat.SetObject(f"{self._path}/shaft/scaled", Cylinder(_SHAFT, 1.0), rgba(colour))
-        # The cone's tip is at its origin and it widens along its z axis.
-        head = MeshcatCone(_HEAD, 0.4 * _HEAD, 0.4 * _HEAD)
+        meshcat.SetObject(
+            f"{self._path}/shaft/scaled", Cylinder(_SHAFT_RADIUS_M, 1.0), rgba(colour)
+        )
+        # The cone's tip is at its origin; its axis is z.
+        head = MeshcatCone(_HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M, 0.4 * _HEAD_LENGTH_M)
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
     def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Shows (3,) `force` [N] at (3,) `place` [m], both in W, at a time of the recording [s]."""
-        length = _METRES_PER_NEWTON * float(np.linalg.norm(force))
-        shaft = max(length - _HEAD, 1e-3)
+        """Show `force` (3,) [N] at `place` (3,) [m], both in W, at a recording time [s]."""
+        length = _ARROW_M_PER_N * float(np.linalg.norm(force))
+        shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()
         R = along.matrix()
-        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD) * R[:, 2]
-        back = along @ _BACK
+        middle, tip = place + 0.5 * shaft * R[:, 2], place + (shaft + _HEAD_LENGTH_M) * R[:, 2]
+        back = along @ _R_FLIPPED
         put = canvas.SetTransform
         put(f"{self._path}/shaft", RigidTransform(along, middle), film_time)
         put(f"{self._path}/head", RigidTransform(back, tip), film_time)
         scale = canvas.SetProperty
-        size = min(1.0, length / _HEAD)
+        size = min(1.0, length / _HEAD_LENGTH_M)
         scale(f"{self._path}/shaft/scaled", "scale", [size, size, shaft], film_time)
         scale(f"{self._path}/head/scaled", "scale", [size, size, size], film_time)
 
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
-    """Drake's notes, such as where Meshcat listens, are not printed meanwhile."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

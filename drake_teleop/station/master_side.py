@@ -1,4 +1,4 @@
-"""The master side: the operator holds the haptic device, whose motion is scaled for the slave."""
+"""The master side: operator, haptic device and kinematic scaling."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from drake_teleop.station.channel.network import mean_delay
 from drake_teleop.station.master.device import AddDevice
 from drake_teleop.station.master.dynamics import HapticDevice
-from drake_teleop.station.master.electronics import Encoders, Held
+from drake_teleop.station.master.electronics import Encoders, SampleHold
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.operator.decision import Training
 from drake_teleop.station.operator.operator import Operator
@@ -20,37 +20,36 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 from drake_teleop.station.slave.plant import NominalSlave, start_pose
 from drake_teleop.station.wiring import export
 
-#: How often the clutch is looked at [s]; an event at 2 kHz would cost time.
+#: Sampling period of the clutch [s]; 2 kHz events would cost time.
 CLUTCH_PERIOD = 0.01
 
 
 def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diagram:
-    """Operator, haptic device, kinematic scaling and force display.
+    """Build operator, haptic device, kinematic scaling and force display.
 
     .. pydrake_system::
 
         name: master_side
         input_ports:
-        - wrench_command: (6,) F_E_B, what the hand shall feel [N, N m]
-        - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
-        - intended_pose: (7,) X_BE that the operator wants, in place of the scenario's intent; may
-          be left unconnected
-        - intended_twist: (6,) its twist [v; omega] in B; unconnected zero
-        - slave_state: [q; v] of the slave, whose tool the operator sees (with a task)
+        - wrench_command: (6,) F_E_B, wrench to render [N, N m]
+        - clutch: (1,) engaged if above 0.5; engaged if unconnected
+        - intended_pose: (7,) X_BE that replaces the scenario's intent; may stay unconnected
+        - intended_twist: (6,) its twist [v; omega] in B; zero if unconnected
+        - slave_state: [q; v] of the slave, for the operator's view of the tool (with a task)
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
-        - leader_joints: (n,) setpoint of its joints (of a leader that leads them) [rad]
+        - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]
         - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
         - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
-        - displayed_and_fault: the last two side by side, for the log
+        - displayed_and_fault: the last two in one port, for the log
         - task_state: signal (with a task)
 
     Args:
-        scenario: what the station is made of.
-        operator: who holds the device, "live_hand"; None for the scenario's operator.
+        scenario: configuration of the station.
+        operator: custom operator, added as "live_hand"; None for the scenario's operator.
 
     Raises:
-        DrakeTeleopError: for a value that cannot be right.
+        DrakeTeleopError: for an invalid scenario.
     """
     check_scenario(scenario)
     hand, scaling = scenario.operator.hand, scenario.kinematic_scaling
@@ -59,7 +58,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     builder = DiagramBuilder()
 
     name = "operator" if operator is None else "live_hand"
-    operator = builder.AddNamedSystem(name, operator or _operator(scenario, start_B))
+    operator = builder.AddNamedSystem(name, operator or _make_operator(scenario, start_B))
     period, model = 1 / scenario.rates.hand_hz, scenario.master.device(hand.mass, hand.inertia)
     q_start = model.inverse_kinematics(start_B)
     device, display = AddDevice(builder, period, model, q_start)
@@ -92,8 +91,8 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         read = encoders.get_output_port()
     own_period = scenario.master.own_period(scenario.rates.hand_hz)
     if own_period is not None:
-        held_pose = builder.AddNamedSystem("held_pose", Held(own_period, start_B))
-        held_wrench = builder.AddNamedSystem("held_wrench", Held(own_period, np.zeros(6)))
+        held_pose = builder.AddNamedSystem("held_pose", SampleHold(own_period, start_B))
+        held_wrench = builder.AddNamedSystem("held_wrench", SampleHold(own_period, np.zeros(6)))
         builder.Connect(read, held_pose.get_input_port())
         builder.Connect(held_wrench.get_output_port(), command)
         read, command = held_pose.get_output_port(), held_wrench.get_input_port()
@@ -111,8 +110,7 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
     return builder.Build()
 
 
-def _operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
-    """The operator; for a task it sees the tool, and has been trained on this station."""
+def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator:
     if scenario.operator.task is None:
         return Operator(scenario.operator, start_B)
     scaling, forces = scenario.kinematic_scaling, scenario.force_scaling

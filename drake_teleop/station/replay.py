@@ -1,12 +1,10 @@
-"""A simulation as a film: `replay.html` of a run, and `drake-teleop replay` of any logged run.
+"""3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`.
 
-The slave at its bench, the haptic device on a table beside it, and forces as arrows. Blue at wrist
-and stylus: what the wrist sensor measures, which is what the hand would feel. Orange at the tool's
-tip and at the stylus: the calculated contact force. All are drawn in the size that they have at the
-slave, 3 mm a newton.
+Forces are arrows of 3 mm per newton, in the slave's scale. Blue at wrist and stylus: force measured
+by the wrist sensor. Orange at tool tip and stylus: calculated contact force.
 
-`replay` finds the scenario of a log beside it: `scenario.yaml` beside `log.parquet`, which `run`
-writes, or the YAML file of the log's own name, as in the folder `logs` of `reproduce`.
+The scenario of a log is `scenario.yaml` beside `log.parquet` (`run`), or the YAML file with the
+log's name (folder `logs` of `reproduce`).
 """
 
 from __future__ import annotations
@@ -37,7 +35,7 @@ from drake_teleop.station.film import (
     Show,
     add_shapes,
     frame_times,
-    plain_room,
+    set_plain_background,
 )
 from drake_teleop.station.master.data_sheets import PHANTOM
 from drake_teleop.station.master.leader_model import Leader
@@ -58,47 +56,50 @@ Array = NDArray[np.float64]
 Signals = Mapping[str, Array]
 
 _TABLE_TOP = 0.60
-# Where the haptic device stands: origin of its base frame B in W [m].
-_P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # the device's foot is 0.28 m below B
+# Origin of the haptic device's base frame B in W [m].
+_P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # B is 0.28 m above the foot
 _CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_WITHOUT_MASTER = np.array([-0.3, 0.0, 0.0])  # where both are then
+_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target
 
 
 _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
-_GRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_WRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
-# In arm and tool themselves an arrow would be hidden.
-_BESIDE_WRIST_W, _BESIDE_TIP_W = np.array([0.07, -0.09, 0.0]), np.array([-0.06, 0.0, 0.0])
+_P_EGRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
+_P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
+# Arrows inside arm and tool would be hidden.
+_WRIST_ARROW_OFFSET_W, _TIP_ARROW_OFFSET_W = (
+    np.array([0.07, -0.09, 0.0]),
+    np.array([-0.06, 0.0, 0.0]),
+)
 
-# Signals without which there is nothing to see, and those that are shown if they were recorded.
-_NEEDED = ("slave_state", "measured_wrench_S", "load_estimate")
-_SHOWN = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
+# Required signals, and signals that are shown if they were recorded.
+_REQUIRED_SIGNALS = ("slave_state", "measured_wrench_S", "load_estimate")
+_OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "sheet_state")
 
 
 def replay_command(
     run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Writes the films of logged runs and summary.json, which says where they are.
+    """Write the replays of logged runs, and summary.json with their paths.
 
     Args:
-        run: a folder that `run` or `reproduce` wrote, or a log in it.
-        out: the folder of the films: replay.html, or for several runs one by the name of each log.
-        scenario: of the log, a shipped one or a YAML file; by default what lies beside it.
-        quiet: prints nothing.
+        run: folder written by `run` or `reproduce`, or a log in it.
+        out: output folder: replay.html, or one file per log for several logs.
+        scenario: shipped scenario or YAML file; by default the scenario beside the log.
+        quiet: print nothing.
 
     Returns:
         The summary.
 
     Raises:
-        DrakeTeleopError: if there is no log of a run, or not its scenario.
+        DrakeTeleopError: if there is no log or no scenario.
     """
-    logs = _logs(run)
+    logs = _find_logs(run)
     films = []
     with output_folder(out):
         for log in logs:
             path = out / ("replay.html" if len(logs) == 1 else f"{log.stem}.html")
             result = SimulationResult.scan_parquet(log)
-            write_replay(path, result, LoadScenario(scenario or _scenario_of(log)))
+            write_replay(path, result, LoadScenario(scenario or _find_scenario(log)))
             films.append({"log": str(log), "film": str(path), "duration_s": float(result.t[-1])})
             if not quiet:
                 print(f"written {path} ({path.stat().st_size / 1e6:.1f} MB): open it in a browser")
@@ -110,31 +111,31 @@ def replay_command(
 def write_replay(
     path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float | None = None
 ) -> None:
-    """Writes the film of a run.
+    """Write the replay of a run.
 
     Args:
-        path: of the HTML file.
-        result: with slave_state, measured_wrench_S, load_estimate and, for all that there is to
-            see, master_state, contact_wrench_S, force_to_master and sheet_state.
-        scenario: that was run.
-        slow_motion: seconds of the film for one second of the run, to begin with; by default as
-            many as make it last 6 s.
+        path: HTML file.
+        result: needs slave_state, measured_wrench_S, load_estimate; also shows master_state,
+            contact_wrench_S, force_to_master and sheet_state.
+        scenario: scenario of the run.
+        slow_motion: initial speed: seconds of replay per second of the run; by default the
+            replay lasts at least 6 s.
 
     Raises:
-        DrakeTeleopError: if signals are missing.
+        DrakeTeleopError: if required signals are missing.
     """
-    missing = [name for name in _NEEDED if name not in result]
+    missing = [name for name in _REQUIRED_SIGNALS if name not in result]
     if missing or not len(result.t):
         raise DrakeTeleopError(
-            f"cannot be shown: it holds no {', '.join(missing) or 'samples'}",
+            f"cannot be shown: it contains no {', '.join(missing) or 'samples'}",
             where="replay",
             remedy="give the log of a station with its own slave",
         )
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
-    rows = _nearest(result.t, times)
-    # Of a log on the disk each signal is read once, and no more of it is kept than is shown.
+    rows = _nearest_rows(result.t, times)
+    # Read each signal of a log on disk once, and keep only the displayed rows.
     moving = [name for name in result.signals if name.startswith(POSE_OF)]
-    shown = [name for name in (*_NEEDED, *_SHOWN, *moving) if name in result]
+    shown = [name for name in (*_REQUIRED_SIGNALS, *_OPTIONAL_SIGNALS, *moving) if name in result]
     signals = {name: result[name][rows] for name in shown}
     contact = np.zeros(len(result.t), dtype=bool)
     if "true_contact_wrench_W" in result:
@@ -156,8 +157,7 @@ def write_replay(
     film.write(path, make_scene)
 
 
-def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
-    """The rows of sorted (N,) `t` that are nearest to `times`."""
+def _nearest_rows(t: Array, times: Array) -> NDArray[np.int64]:
     after = np.clip(np.searchsorted(t, times), 1, max(len(t) - 1, 1))
     after = np.minimum(after, len(t) - 1)
     before = np.maximum(after - 1, 0)
@@ -166,21 +166,23 @@ def _nearest(t: Array, times: Array) -> NDArray[np.int64]:
 
 def _readings(signals: Signals) -> list[Reading]:
     measured = signals["measured_wrench_S"][:, :3] - signals["load_estimate"][:, :3]
-    readings = [Reading("Measured at the wrist", "N", _norm(measured), BLUE, arrow=True)]
+    readings = [Reading("Measured at the wrist", "N", _row_norms(measured), BLUE, arrow=True)]
     if "contact_wrench_S" in signals:
-        contact = _norm(signals["contact_wrench_S"][:, :3])
+        contact = _row_norms(signals["contact_wrench_S"][:, :3])
         readings.append(Reading("Contact, calculated", "N", contact, VERMILION, arrow=True))
     if "force_to_master" in signals:
-        readings.append(Reading("Shown to the hand", "N", _norm(signals["force_to_master"][:, :3])))
+        readings.append(
+            Reading("Shown to the hand", "N", _row_norms(signals["force_to_master"][:, :3]))
+        )
     return readings
 
 
-def _norm(vectors: Array) -> Array:
+def _row_norms(vectors: Array) -> Array:
     return np.linalg.norm(vectors, axis=1)
 
 
-def _logs(run: Path) -> list[Path]:
-    """The logs with a scenario beside them in a folder, or the log itself."""
+def _find_logs(run: Path) -> list[Path]:
+    """Return the log itself, or the logs in a folder that have a scenario."""
     if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
     if run.suffix == ".parquet":
@@ -190,36 +192,35 @@ def _logs(run: Path) -> list[Path]:
     logs = sorted(log for log in run.glob("logs/*.parquet") if log.with_suffix(".yaml").exists())
     if not logs:
         raise DrakeTeleopError(
-            "holds no log of a run",
+            "contains no log of a run",
             where=str(run),
-            remedy="give a folder that drake-teleop run or reproduce wrote, or a log.parquet; a"
-            " study keeps measures, no logs: run one of its points as a scenario",
+            remedy="give a folder from drake-teleop run or reproduce, or a log.parquet; a study"
+            " stores measures only: run one of its points as a scenario",
         )
     return logs
 
 
-def _scenario_of(log: Path) -> Path:
+def _find_scenario(log: Path) -> Path:
     for path in (log.with_suffix(".yaml"), log.parent / "scenario.yaml"):
         if path.exists():
             return path
     raise DrakeTeleopError(
-        "does not say of which scenario it is",
+        "has no scenario beside it",
         where=str(log),
         remedy="give --scenario, a shipped one or a YAML file",
     )
 
 
 class ReplayScene:
-    """Everything that is seen in a replay; shows one sample after the other.
+    """Objects of a replay; shows one sample at a time.
 
     Attributes:
-        plant: slave, what it touches and haptic device, for their shapes and kinematics only.
-        context: of the plant, in the posture that was shown last.
-        canvas: receives poses and sizes; Meshcat, unless it is replaced.
+        plant: slave, surroundings and haptic device, for shapes and kinematics only.
+        context: the plant's context, with the positions of the sample shown last.
+        canvas: receiver of poses and sizes; Meshcat by default.
     """
 
     def __init__(self, meshcat: Meshcat, scenario: Scenario, recorded: Container[str]) -> None:
-        """What was not `recorded` is not shown."""
         self.canvas: Canvas = meshcat
         self.plant, self._shapes = MultibodyPlant(time_step=0.0), SceneGraph()
         self.plant.RegisterAsSourceForSceneGraph(self._shapes)
@@ -236,11 +237,13 @@ class ReplayScene:
         if "master_state" in recorded:
             self._master = _add_master(self.plant, scenario)
         finalize(self.plant)
-        self._moving = {POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()}
+        self._moving_bodies = {
+            POSE_OF + k: body for k, body in MovingBodies(self.plant, touched).items()
+        }
         self.context = self.plant.CreateDefaultContext()
         self._bodies = dict(self._add_bodies(meshcat))
-        _furnish(meshcat, scenario, with_table=self._master is not None)
-        # The device's base stands along the world's axes here, whatever its alignment in the run.
+        _add_room(meshcat, scenario, with_table=self._master is not None)
+        # The replay shows the device's base parallel to W, for any alignment in the run.
         alignment = RollPitchYaw(scenario.kinematic_scaling.alignment)
         self._R_BW = alignment.ToRotationMatrix().inverse().matrix()
         kinds = (("measured", "wrist", BLUE), ("contact", "tip", VERMILION))
@@ -252,7 +255,6 @@ class ReplayScene:
         ]
 
     def _add_bodies(self, meshcat: Meshcat) -> Iterator[tuple[str, RigidBody]]:
-        """Adds the shapes of all bodies; yields path and body of each that moves."""
         plant, inspector = self.plant, self._shapes.model_inspector()
         for body in (plant.get_body(BodyIndex(k)) for k in range(plant.num_bodies())):
             path = f"/station/{int(body.index())}_{body.name()}"
@@ -264,7 +266,7 @@ class ReplayScene:
                 yield path, body
 
     def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Shows a sample (its index) of signals of a run, at a time of the recording [s]."""
+        """Show one sample of the signals at a time of the recording [s]."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -273,21 +275,21 @@ class ReplayScene:
             plant.SetPositions(context, self._master.instance, q)
         if self._sheet is not None:
             plant.SetPositions(context, self._sheet, signals["sheet_state"][sample, :1])
-        for name, body in self._moving.items():
+        for name, body in self._moving_bodies.items():
             if name in signals:
-                self._move(body, signals[name][sample])
+                self._set_body_pose(body, signals[name][sample])
         for path, body in self._bodies.items():
             self.canvas.SetTransform(path, plant.EvalBodyPoseInWorld(context, body), film_time)
         if not self._arrows:
             return
-        forces, places = self._forces(signals, sample), self._places()
+        forces, places = self._contact_forces_W(signals, sample), self._arrow_positions_W()
         for force, place, arrow in self._arrows:
             f_W = forces[force]
             f_W = self._R_BW @ f_W if place == "stylus" else f_W
             arrow.show(self.canvas, film_time, places[place], f_W)
 
-    def _move(self, index: BodyIndex, pose: Array) -> None:
-        """Puts a body of the surroundings where it was, after those that it hangs on."""
+    def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
+        """Set the pose of a free body of the surroundings; its parents must be set before."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
@@ -298,8 +300,8 @@ class ReplayScene:
         q[first : first + joint.num_positions()] = moved
         self.plant.SetPositions(self.context, q)
 
-    def _forces(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
-        """In W. Eq. (1) is what the sensor exerts on the load; these are what the load exerts."""
+    def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
+        """Return forces of the load on the sensor in W, opposite in sign to Eq. (1)."""
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
@@ -307,13 +309,11 @@ class ReplayScene:
             forces["contact"] = -R_WS @ signals["contact_wrench_S"][sample, :3]
         return forces
 
-    def _places(self) -> dict[str, Array]:
-        """Where arrows begin, in W."""
-
+    def _arrow_positions_W(self) -> dict[str, Array]:
         X_WS = self._sensor.CalcPoseInWorld(self.context)
         places = {
-            "wrist": X_WS @ _WRIST_S + _BESIDE_WRIST_W,
-            "tip": X_WS @ self._tip + _BESIDE_TIP_W,
+            "wrist": X_WS @ _P_SWRIST_S + _WRIST_ARROW_OFFSET_W,
+            "tip": X_WS @ self._tip + _TIP_ARROW_OFFSET_W,
         }
         if self._master is not None:
             places["stylus"] = self._master.hand.CalcPoseInWorld(self.context) @ self._master.grip
@@ -321,14 +321,12 @@ class ReplayScene:
 
 
 class _Device(NamedTuple):
-    """The haptic device in the plant.
+    """Haptic device in the plant.
 
     Attributes:
-        instance: of its joints.
-        hand: its frame in the hand.
-        grip: (3,) where in that the hand is [m].
-        positions: of its joints in the plant, from those of its state.
-        folder: of converted meshes, to be kept as long as shapes are looked at.
+        hand: frame at the stylus; the hand holds it at `grip` (3,) [m].
+        positions: converts joint positions of the device state to those of the plant.
+        folder: folder of converted meshes, kept while shapes are in use.
     """
 
     instance: ModelInstanceIndex
@@ -347,11 +345,10 @@ def _add_master(plant: MultibodyPlant, scenario: Scenario) -> _Device:
     base = plant.GetFrameByName("base", master)
     plant.WeldFrames(plant.world_frame(), base, RigidTransform(_P_WB))
     positions = serial_joint_angles if is_phantom else np.copy
-    return _Device(master, plant.GetFrameByName("stylus", master), _GRIP_E, positions)
+    return _Device(master, plant.GetFrameByName("stylus", master), _P_EGRIP_E, positions)
 
 
 def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
-    """The leader, whose base stands on the table here, wherever B is."""
     order = leader.device([0.0, 0.0, 0.0], 0.0, 0.0).arm.position_index
     parsed = leader.parse(plant, RigidTransform([*_P_WB[:2], _TABLE_TOP]))
 
@@ -363,9 +360,7 @@ def _add_leader(plant: MultibodyPlant, leader: Leader) -> _Device:
     return _Device(parsed.instance, parsed.sensor_frame, np.zeros(3), positions, parsed.folder)
 
 
-def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
-    """Floor, the device's table, the plinth below what is touched, light and camera."""
-
+def _add_room(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
     def box(name: str, size: tuple[float, float, float], centre: tuple[float, ...], colour: Rgba):
         meshcat.SetObject(f"/room/{name}", Box(*size), colour)
         meshcat.SetTransform(f"/room/{name}", RigidTransform(np.array(centre)))
@@ -383,6 +378,6 @@ def _furnish(meshcat: Meshcat, scenario: Scenario, *, with_table: bool) -> None:
         if stand is not None and stand.height > 0:
             size, centre = (stand.along_x, stand.along_y, stand.height), (stand.x, stand.y)
             box(f"plinth_{k}" if k else "plinth", size, (*centre, stand.height / 2), _STEEL)
-    plain_room(meshcat)
-    aside = np.zeros(3) if with_table else _WITHOUT_MASTER
+    set_plain_background(meshcat)
+    aside = np.zeros(3) if with_table else _CAMERA_SHIFT_W
     meshcat.SetCameraPose(_CAMERA + aside, _TARGET + aside)

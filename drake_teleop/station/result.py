@@ -1,4 +1,4 @@
-"""What a simulation gives back: named signals that know their units, plot and save themselves."""
+"""Result of a simulation: named signals with units, plots and Parquet files."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 _METADATA_KEY = "drake_teleop.signals"
-# A part of a log is named after the number of its first row.
-# More points than this on a line are drawn as the least and the largest of their neighbours.
-_DRAWN = 20_000
-# The canonical log (README, "Logs"): which signal fills which columns.
-_CANONICAL = {
+# Longer curves are drawn as minimum and maximum of blocks.
+_MAX_CURVE_POINTS = 20_000
+# Columns of the canonical log (README, "Logs") for each signal.
+_CANONICAL_COLUMNS = {
     "sample_time": ("t",),
     "measured_wrench_S": ("f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"),
     "specific_force_S": ("s_x", "s_y", "s_z"),
@@ -40,16 +39,16 @@ _CANONICAL = {
 
 @dataclass(frozen=True)
 class Signal:
-    """What a signal is.
+    """Description of a signal.
 
     Args:
-        name: the port it comes from, in the paper's words ("measured_wrench_S").
-        components: the name of each of its k components ("f_x", ...).
-        units: the unit of each component; one string if all have the same ("1" for none).
-        description: one line for people.
+        name: name of its port, such as "measured_wrench_S".
+        components: name of each of the k components ("f_x", ...).
+        units: unit of each component, or one string for all ("1" for dimensionless).
+        description: one line.
 
     Raises:
-        DrakeTeleopError: if there are not as many units as components.
+        DrakeTeleopError: if the numbers of units and components differ.
     """
 
     name: str
@@ -71,24 +70,24 @@ class Signal:
 
     @property
     def columns(self) -> list[str]:
-        """Its columns' names in a table: "measured_wrench_S.f_x" and so on."""
+        """Column names in a table, such as "measured_wrench_S.f_x"."""
         return [f"{self.name}.{component}" for component in self.components]
 
 
 class SimulationResult:
-    """Sampled signals of one simulation, on one time base.
+    """Sampled signals of one simulation on one time base.
 
-    ``result["measured_wrench_S"]`` is an (N, k) array; a column of the data frame, by its own name,
-    is an (N,) one: ``result["measured_wrench_S.f_x"]``, ``result["t"]``. ``len(result)`` and
-    iteration speak of the signals' names. Arrays are read-only.
+    ``result["measured_wrench_S"]`` is an (N, k) array; ``result["measured_wrench_S.f_x"]`` and
+    ``result["t"]`` are (N,) columns. ``len(result)`` and iteration refer to the signals' names.
+    Arrays are read-only.
 
     Args:
         t: (N,) sample times [s].
-        signals: the arrays by name, (N, k) or (N,) for one component.
-        specs: what each signal is; the result keeps their order.
+        signals: arrays by name, (N, k), or (N,) for one component.
+        specs: descriptions; they define the order.
 
     Raises:
-        DrakeTeleopError: if names, lengths or numbers of components do not fit together.
+        DrakeTeleopError: if names, lengths or numbers of components are inconsistent.
     """
 
     def __init__(
@@ -103,9 +102,9 @@ class SimulationResult:
         if isinstance(signals, _SignalsOnDisk):
             self._values = signals
         else:
-            self._values = {name: self._checked(name, signals[name]) for name in self._specs}
+            self._values = {name: self._checked_values(name, signals[name]) for name in self._specs}
 
-    def _checked(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
+    def _checked_values(self, name: str, values: ArrayLike) -> NDArray[np.float64]:
         array = numbers(name, values)
         shape = (len(self._t), len(self._specs[name].components))
         if array.ndim == 1:
@@ -121,17 +120,17 @@ class SimulationResult:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The signals' names."""
+        """Names of the signals."""
         return tuple(self._specs)
 
     @property
     def specs(self) -> tuple[Signal, ...]:
-        """What each signal is, in the order of `signals`."""
+        """Descriptions, in the order of `signals`."""
         return tuple(self._specs.values())
 
     @property
     def units(self) -> dict[str, dict[str, str]]:
-        """Per signal, the unit of each component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
+        """Unit per signal and component: ``units["measured_wrench_S"]["f_x"] == "N"``."""
         return {
             spec.name: dict(zip(spec.components, spec.units, strict=True)) for spec in self.specs
         }
@@ -149,7 +148,7 @@ class SimulationResult:
             raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
 
     def _column(self, name: object) -> tuple[str, int] | None:
-        """Of a column of the data frame, its signal and the number of its component."""
+        """Return signal and component index of a table column, or None."""
         signal = str(name).partition(".")[0]
         if signal not in self._specs or name not in self._specs[signal].columns:
             return None
@@ -169,10 +168,10 @@ class SimulationResult:
         return ["t", *self._specs, *columns]
 
     def to_pandas(self) -> pd.DataFrame:
-        """`to_dataframe` as pandas has it, which comes with the extra `notebook`.
+        """Return `to_dataframe` as a pandas frame.
 
         Raises:
-            DrakeTeleopError: if pandas is not installed.
+            DrakeTeleopError: if pandas (extra `notebook`) is not installed.
         """
         try:
             return self.to_dataframe().to_pandas()
@@ -184,7 +183,7 @@ class SimulationResult:
             ) from None
 
     def to_dataframe(self) -> pl.DataFrame:
-        """One row per sample: ``t``, then a column ``signal.component`` for every component."""
+        """Return one row per sample: ``t`` and a column ``signal.component`` per component."""
         import polars as pl
 
         columns = {"t": self._t}
@@ -193,18 +192,18 @@ class SimulationResult:
         return pl.DataFrame(columns)
 
     def sensor_log(self) -> pl.DataFrame:
-        """The wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
+        """Return the wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
 
-        Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S
-        and SI units, wrench with the sign of Eq. (1). ``t`` is when the sample was taken. A sample
-        that was recorded in several rows, by a log faster than the sensor, is one row.
+        Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
+        SI units, with the sign of Eq. (1). ``t`` is the sampling instant. Repeated rows of one
+        sample (log faster than the sensor) are merged.
 
         Raises:
             DrakeTeleopError: if the sensor's signals were not recorded.
         """
         import polars as pl
 
-        missing = [name for name in _CANONICAL if name not in self]
+        missing = [name for name in _CANONICAL_COLUMNS if name not in self]
         if missing:
             raise DrakeTeleopError(
                 f"this result holds no {', '.join(missing)}",
@@ -212,33 +211,33 @@ class SimulationResult:
                 remedy="record the wrist sensor's signals",
             )
         columns: dict[str, NDArray[np.float64]] = {}
-        for name, names in _CANONICAL.items():
+        for name, names in _CANONICAL_COLUMNS.items():
             columns |= dict(zip(names, self[name].T, strict=True))
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
     def write_parquet(self, path: str | Path) -> None:
-        """Writes `to_dataframe` with names, units and descriptions in the file's metadata.
+        """Write `to_dataframe`, with names, units and descriptions as metadata.
 
-        The same data give the same bytes.
+        Equal data give equal bytes.
         """
         self._write(Path(path))
 
     def _write(self, path: Path, aside: Path | None = None) -> None:
         specs = [asdict(spec) for spec in self.specs]
-        # Fixed row groups: polars' default may follow the number of threads.
+        # Fixed row groups: polars' default may depend on the number of threads.
         metadata = {_METADATA_KEY: json.dumps(specs)}
         table = self.to_dataframe()
         write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
 
     def write_part(self, folder: Path, first_row: int) -> None:
-        """Writes these rows of a longer log into its folder; `write_parquet` has the format.
+        """Write these rows as one part of a longer log, in the format of `write_parquet`.
 
-        The folder is one table for polars, DuckDB and others, whenever a process dies: a part is
-        complete or absent. The same rows written again replace themselves.
+        The folder is a valid table at any time: a part is complete or absent. The same rows
+        written again replace the part.
 
         Args:
-            folder: that `remove_log` has seen.
-            first_row: number of the first of these rows in the whole log.
+            folder: folder of the log, prepared by `remove_log`.
+            first_row: index of the first of these rows in the whole log.
         """
         part = part_of_log(folder, first_row)
         if len(self.t) or not part.exists():
@@ -247,51 +246,47 @@ class SimulationResult:
 
     @classmethod
     def read_parquet(cls, path: str | Path) -> SimulationResult:
-        """Reads what `write_parquet` or `simulate` wrote.
-
-        Args:
-            path: a file, or a folder of parts.
+        """Read a file, or a folder of parts, from `write_parquet` or `simulate`.
 
         Raises:
-            DrakeTeleopError: if it is something else, or absent.
+            DrakeTeleopError: if it is absent or has another format.
         """
         on_disk = cls.scan_parquet(path)
         return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Opens what `write_parquet` or `simulate` wrote, for logs that would fill the memory.
+        """Open a log that may exceed the memory.
 
-        Only the times are read now. A signal is read each time it is asked for and not kept here.
+        Only the times are read now. Each access to a signal reads it from the disk.
 
         Args:
-            path: a file, or a folder of parts.
+            path: file or folder of parts, from `write_parquet` or `simulate`.
 
         Raises:
-            DrakeTeleopError: if it is something else, or absent.
+            DrakeTeleopError: if it is absent or has another format.
         """
         import polars as pl
 
         expect((str, Path), path, "result")
         path = Path(path)
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
-        parts = _parts(path)
+        parts = _log_parts(path)
         for part in parts:
             with reading(part, remedy, "is not a simulation result"):
                 check_parquet(part)
         with reading(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
-            t = _columns_of_numbers(path, ["t"])[:, 0]
+            t = _read_columns(path, ["t"])[:, 0]
         return cls(t, _SignalsOnDisk(path, specs), specs)
 
     def plot(self, *names: str, contact: ArrayLike | None = None) -> Figure:
-        """Draws signals over time, one subplot for each signal and unit.
+        """Plot signals over time, one subplot per signal and unit.
 
         Args:
-            names: the signals, or columns such as "contact_wrench_S.f_z"; all signals if none is
-                named.
-            contact: (N,) booleans; the time in contact is shaded.
+            names: signals, or columns such as "contact_wrench_S.f_z"; default: all signals.
+            contact: (N,) booleans; times in contact are shaded.
 
         Raises:
             KeyError: for an unknown name.
@@ -305,7 +300,7 @@ class SimulationResult:
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):
                 components, values = self._specs[name].components, self._values[name]
                 for index in indices:
-                    axes.plot(*_drawn(self._t, values[:, index]), label=components[index])
+                    axes.plot(*_reduce_curve(self._t, values[:, index]), label=components[index])
                 if contact is not None:
                     shade_contact(axes, self._t, contact)
                 axes.set_title(name)
@@ -316,7 +311,6 @@ class SimulationResult:
         return figure
 
     def _panels(self, name: str) -> list[tuple[str, str, list[int]]]:
-        """The subplots of a signal: its components, neighbours of the same unit together."""
         if (found := self._column(name)) is not None:
             signal, index = found
             return [(signal, self._specs[signal].units[index], [index])]
@@ -326,21 +320,21 @@ class SimulationResult:
         groups = groupby(range(len(units)), key=lambda index: units[index])
         return [(name, unit, list(indices)) for unit, indices in groups]
 
-    def _span(self) -> str:
+    def _time_range_text(self) -> str:
         if not len(self._t):
             return "no samples"
         return f"{len(self._t)} samples, {self._t[0]:g} to {self._t[-1]:g} s"
 
     def __repr__(self) -> str:
         width = max((len(name) for name in self.signals), default=0)
-        lines = [f"SimulationResult: {self._span()}"]
-        lines += [f"  {spec.name:{width}}  {_describe(spec)}" for spec in self.specs]
+        lines = [f"SimulationResult: {self._time_range_text()}"]
+        lines += [f"  {spec.name:{width}}  {_signal_text(spec)}" for spec in self.specs]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td style='text-align:left'><code>{html.escape(spec.name)}</code></td>"
-            f"<td style='text-align:left'>{html.escape(_components(spec))}</td>"
+            f"<td style='text-align:left'>{html.escape(_components_text(spec))}</td>"
             f"<td style='text-align:left'>{html.escape(spec.description)}</td></tr>"
             for spec in self.specs
         )
@@ -349,21 +343,19 @@ class SimulationResult:
             for title in ("signal", "components [unit]", "what it is")
         )
         return (
-            f"<b>SimulationResult</b>: {self._span()}"
+            f"<b>SimulationResult</b>: {self._time_range_text()}"
             f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
         )
 
 
 class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
-    """Arrays by the signal's name, read when they are asked for."""
-
     def __init__(self, path: Path, specs: Sequence[Signal]) -> None:
         self._path, self._columns = path, {spec.name: spec.columns for spec in specs}
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         columns = self._columns[name]
         with reading(self._path, "write it again"):
-            return _read_only(_columns_of_numbers(self._path, columns))
+            return _read_only(_read_columns(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
         return name in self._columns
@@ -375,11 +367,11 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
         return len(self._columns)
 
 
-def _drawn(
+def _reduce_curve(
     t: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A line of N points, or of about _DRAWN that look the same: no peak is lost."""
-    length = 2 * len(t) // _DRAWN
+    """Reduce a curve to about _MAX_CURVE_POINTS points: minimum and maximum of each block."""
+    length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values
     starts = np.arange(0, len(t), length)
@@ -387,29 +379,28 @@ def _drawn(
     return np.repeat(t[starts], 2), np.ravel(extremes, order="F")
 
 
-def _components(spec: Signal) -> str:
-    """ "f_x, f_y, f_z [N], tau_x [N m]": neighbours of the same unit share it."""
+def _components_text(spec: Signal) -> str:
+    """Return text such as "f_x, f_y, f_z [N], tau_x [N m]"."""
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
 
 
-def _describe(spec: Signal) -> str:
-    text = _components(spec)
+def _signal_text(spec: Signal) -> str:
+    text = _components_text(spec)
     return f"{text}  {spec.description}" if spec.description else text
 
 
-def _parts(path: Path) -> list[Path]:
-    """The parts of a log in order; of a log in one file that file."""
+def _log_parts(path: Path) -> list[Path]:
     return sorted(path.glob(PARTS_OF_LOG)) or [path]
 
 
-def _columns_of_numbers(path: Path, columns: list[str]) -> NDArray[np.float64]:
-    """(N, k) the columns of a Parquet file; whatever goes wrong is for `reading`."""
+def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
+    """Return (N, k) columns of a Parquet file; the caller converts errors with `reading`."""
     import polars as pl
 
     refuse_fork()
-    table = pl.read_parquet(_parts(path), columns=columns)
+    table = pl.read_parquet(_log_parts(path), columns=columns)
     if not all(dtype.is_numeric() for dtype in table.dtypes):
         raise ValueError(f"{', '.join(columns)} hold no numbers")
     return table.to_numpy()

@@ -1,28 +1,24 @@
-"""What was not as it should be in a run, and when, from its recorded signals.
+"""Warnings about a run from its recorded signals.
 
-============== =================================================================================
-saturated      the wrist sensor says so
-fault          numbers in the loop that cannot be, see `drake_teleop.common.fault`
-unreachable    the inverse kinematics say so
-clipped        a joint asks for its largest speed, or its motor gives its largest torque; the device
-               displays its largest force or torque
-leaf           it bends further than its model goes
-safe state     an end of the channel has heard nothing for longer than the channel's timeout
-behind         the command that leaves the channel, or a joint, is not within the range of what it
-               was asked for within the time that delay and bandwidth explain
-reserve        the command that leaves a `ledger` is behind a hand that is faster than the ledger's
-               reserve pays for
-hunting        the hand, the command that leaves the channel or a joint goes to and fro, while what
-               it was asked for does not
-============== =================================================================================
+============== ===================================================================================
+saturated      the wrist sensor is saturated
+fault          invalid numbers in the loop, see `drake_teleop.common.fault`
+unreachable    the inverse kinematics have no solution
+clipped        a joint speed or motor torque, or the displayed force or torque, is at its limit
+leaf           the deflection is outside the validity of its model
+safe state     an end of the channel receives no packets for longer than the channel's timeout
+behind         a pose or joint lags its command by more than delay and bandwidth explain
+reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
+oscillation    hand, command or joint oscillates (limit cycle) while its command does not
+============== ===================================================================================
 
-The first five are said however short they were, the others if they last for longer than 0.2 s; the
-reserve's in all, because a hand that swings overtakes what is behind it.
+The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +27,7 @@ from drake_teleop.common.fault import MEANINGS, Fault
 from drake_teleop.common.style import contact_spans
 from drake_teleop.load.regressor import LOST
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
-from drake_teleop.station.channel_side import power_scale, told_of_the_arm
+from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.passivity.ledger import fastest
@@ -44,91 +40,85 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Spans = list[tuple[float, float]]
 
-LASTING = 0.2
-"""What is over sooner [s] may be a movement's own."""
-# What comes again sooner than this has not been away [s].
-_GAP = 0.05
-# As good as at a limit, which is reached by a product that rounds.
-_AT_LIMIT = 1 - 1e-9
-# How far behind is behind: command [m], its turn [rad], joint [rad], 3 mm at a reach of 1 m.
-_FAR, _TURNED, _JOINT_FAR = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
-# After so long a ledger's command is where it was told to be [s], if energy is not short.
-_GENERATOR = 0.05
-_DEGREES = 180 / np.pi
-# To and fro by more than this is hunting: hand and command [m], their turn [rad], joint [rad].
-_SWING, _TURN_SWING, _JOINT_SWING = 5e-4, np.deg2rad(0.5), np.deg2rad(0.1)
-NEAR = 0.25
-"""So near to a turn of the command [s] a turn is that one's."""
-# So many turns make it hunting, each within this time of the one before [s].
-_TURNS, _SLOWEST = 4, 0.5
-# After so many time constants of the position loop a command has been met to 0.3 %.
-_TIME_CONSTANTS = 6.0
-# More times than this are counted, not listed.
-_LISTED = 3
+_MIN_DURATION_S = 0.2
+"""Shortest reported duration [s]; a normal motion may cause shorter ones."""
+# Shorter gaps are closed [s].
+_MAX_GAP_S = 0.05
+# Tolerance for rounding at a limit.
+_LIMIT_SHARE = 1 - 1e-9
+# Smallest reported lag: command [m], its orientation [rad], joint [rad] (3 mm at 1 m).
+_MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
+# Settling time of a ledger's command with sufficient energy [s].
+_SETTLING_TIME_S = 0.05
+_DEGREES_PER_RAD = 180 / np.pi
+# Smallest reported amplitude: hand and command [m], their orientation [rad], joint [rad].
+_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD, _MIN_JOINT_AMPLITUDE_RAD = (
+    5e-4,
+    np.deg2rad(0.5),
+    np.deg2rad(0.1),
+)
+_REVERSAL_WINDOW_S = 0.25
+"""A reversal within this time of a command's reversal is explained by it [s]."""
+# Reversals of an oscillation, and longest time between two of them [s].
+_MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
+# Time constants of the position loop until the error is 0.3 %.
+_SETTLING_TIME_CONSTANTS = 6.0
+# Further times are only counted.
+_MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """One sentence for each thing of the table above that happened, with its times.
+    """Return one sentence for each condition of the table above that occurred, with times.
 
     Args:
-        result: of a run; what was not recorded is not looked at.
-        scenario: that was run.
-        arm: the slave's, with its limits.
+        result: result of a run; checks whose signals were not recorded are skipped.
+        scenario: scenario of the run.
+        arm: model of the slave's arm, with limits.
     """
-    return [
-        f"{what} {_when(spans)}"
-        for found in (_faults(result), _limits(result, scenario, arm), _channel(result, scenario),
-                      _joints(result, scenario, arm), _hand(result))
-        for what, spans in found
-        if spans
-    ]  # fmt: skip
+    found = chain(
+        _check_faults(result),
+        _check_limits(result, scenario, arm),
+        _check_channel(result, scenario),
+        _check_joints(result, scenario, arm),
+        _check_hand(result),
+    )
+    return [f"{condition} {_times_text(spans)}" for condition, spans in found if spans]
 
 
-def spans_of(t: Array, happened: Flags, least: float = 0.0) -> Spans:
-    """From when to when something was so, if for at least so long; short gaps are closed.
-
-    Args:
-        t: (N,) [s].
-        happened: (N,).
-        least: [s].
-    """
+def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
+    """Return spans of at least `least` [s] with `happened` (N,); gaps below 50 ms are closed."""
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
-        if spans and start - spans[-1][1] < _GAP:
+        if spans and start - spans[-1][1] < _MAX_GAP_S:
             start = spans.pop()[0]
         spans.append((start, stop))
     return [(start, stop) for start, stop in spans if stop - start >= least]
 
 
-def behind(t: Array, command: Array, actual: Array, window: float) -> Array:
-    """(N,) how far the actual motion is from all that was commanded within the last time `window`.
+def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> Array:
+    """Return (N,) distance of the actual motion from the range of recent commands.
 
-    A delay gives what was commanded earlier, and a loop that does not overshoot a weighted mean of
-    it: both are in the range of those commands. What is outside it is explained by neither.
+    A delay reproduces earlier commands; a loop without overshoot returns a weighted mean of them.
+    Both stay inside the range of the commands in `window`.
 
     Args:
-        t: (N,) [s], evenly.
+        t: (N,) evenly spaced [s].
         command, actual: (N, k) in one unit.
-        window: [s].
+        window: time before now whose commands count [s].
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
-    above = actual - _largest_of_last(command, rows)
-    below = -_largest_of_last(-command, rows) - actual
+    above = actual - _running_maximum(command, rows)
+    below = -_running_maximum(-command, rows) - actual
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
 
 
-def turns(x: Array, swing: float) -> NDArray[np.intp]:
-    """Where a signal turns: its extremes, each further than `swing` from the one before.
-
-    Args:
-        x: (N,).
-        swing: in its unit.
-    """
+def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
+    """Return indices of local extremes that differ by more than `swing` from the previous one."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
     high = low = 0
-    rising = 0  # unknown, until it has gone far enough from its start
+    rising = 0  # 0: unknown
     for k in [*near, len(x) - 1]:
         high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
         if rising >= 0 and x[high] - x[k] > swing:
@@ -140,33 +130,36 @@ def turns(x: Array, swing: float) -> NDArray[np.intp]:
     return np.array(found, dtype=np.intp)
 
 
-def hunts(t: Array, command: Array, actual: Array, swing: float, near: float = NEAR) -> Flags:
-    """(N,) whether the actual motion goes to and fro while the commanded one does not.
+def oscillates(
+    t: Array, command: Array, actual: Array, swing: float, near: float = _REVERSAL_WINDOW_S
+) -> Flags:
+    """Return (N,) whether the actual motion oscillates while the commanded one does not.
 
-    Four turns or more, each within 0.5 s of the one before. A turn that is near one of the command
-    is its answer; but only one for each.
+    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
+    of the command explains one reversal of the motion within `near`.
 
     Args:
         t: (N,) [s].
-        command, actual: (N, k) in one unit; a turn of any component of the command counts.
-        swing: in that unit.
+        command, actual: (N, k) in one unit.
+        swing: smallest amplitude, in that unit.
         near: [s].
     """
-    asked = np.sort(np.concatenate([t[turns(x, swing)] for x in command.T]))
-    hunting = np.zeros(len(t), dtype=bool)
+    asked = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
+    oscillating = np.zeros(len(t), dtype=bool)
     for x in actual.T:
-        mine = turns(x, swing)
+        mine = find_reversals(x, swing)
         for time in asked:
             if len(mine) and abs(t[mine] - time).min() < near:
                 mine = np.delete(mine, abs(t[mine] - time).argmin())
-        for chain in np.split(mine, np.flatnonzero(np.diff(t[mine]) > _SLOWEST) + 1):
-            if len(chain) >= _TURNS:
-                hunting[chain[0] : chain[-1] + 1] = True
-    return hunting
+        gaps = np.flatnonzero(np.diff(t[mine]) > _MAX_REVERSAL_INTERVAL_S)
+        for series in np.split(mine, gaps + 1):
+            if len(series) >= _MIN_REVERSALS:
+                oscillating[series[0] : series[-1] + 1] = True
+    return oscillating
 
 
-def _faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
-    """Of the slave; and of the hand what does not come from there."""
+def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+    """Yield slave faults, and operator-side faults that no slave fault explains."""
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -176,18 +169,18 @@ def _faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     for fault, meaning in MEANINGS.items():
         if fault != Fault.RESUMING:
             happened = (slave == fault) | ((hand == fault) & (slave == 0))
-            yield f"a fault: {meaning},", spans_of(t, happened)
+            yield f"a fault: {meaning},", find_spans(t, happened)
 
 
-def _limits(
+def _check_limits(
     result: SimulationResult, scenario: Scenario, arm: ArmModel
 ) -> Iterator[tuple[str, Spans]]:
     t = result.t
-    yield "the wrist sensor saturates", spans_of(t, _saturated(result))
+    yield "the wrist sensor saturates", find_spans(t, _saturated(result))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
-            yield f"inverse kinematics: {status.name}", spans_of(t, happened)
+            yield f"inverse kinematics: {status.name}", find_spans(t, happened)
     control = scenario.joint_control
     asked, fastest = control.speed_gain * _joint_error(result), arm.velocity_limit
     if control.position_interface is not None:
@@ -196,24 +189,27 @@ def _limits(
         ("speed", asked, fastest),
         ("torque", result["joint_torque"], arm.effort_limit),
     ):
-        clipped = np.abs(values) >= _AT_LIMIT * limit
+        clipped = np.abs(values) >= _LIMIT_SHARE * limit
         for joint in np.flatnonzero(clipped.any(axis=0)):
-            yield f"joint {joint + 1} is at its largest {what}", spans_of(t, clipped[:, joint])
+            yield f"joint {joint + 1} is at its largest {what}", find_spans(t, clipped[:, joint])
     if "force_to_master" in result:
         shown, device = result["force_to_master"], scenario.master.device(0.0, 0.0)
-        full = np.linalg.norm(shown[:, :3], axis=1) >= _AT_LIMIT * device.peak_force
+        full = np.linalg.norm(shown[:, :3], axis=1) >= _LIMIT_SHARE * device.peak_force
         if isinstance(device, LeaderDevice):
-            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _AT_LIMIT * device.peak_torque[0]
+            full |= np.linalg.norm(shown[:, 3:], axis=1) >= _LIMIT_SHARE * device.peak_torque[0]
         elif device.peak_torque.all():
-            full |= _full_torque(shown[:, 3:], result["master_state"], device)
-        yield "the device displays the most that it can", spans_of(t, full, LASTING)
+            full |= _torque_at_limit(shown[:, 3:], result["master_state"], device)
+        yield (
+            "the device displays its largest force or torque",
+            find_spans(t, full, _MIN_DURATION_S),
+        )
         ended = device.at_an_end(result["master_state"][:, : device.num_joints])
-        yield "the device is at the end of its workspace", spans_of(t, ended)
+        yield "the device is at the end of its workspace", find_spans(t, ended)
     if scenario.leaf is not None and "sheet_state" in result:
         bent = scenario.leaf.largest_small_deflection
         yield (
-            f"the leaf bends by more than {1e3 * bent:.0f} mm, where its model is no longer good,",
-            spans_of(t, np.abs(result["sheet_state"][:, 0]) > bent),
+            f"the deflection of the leaf exceeds {1e3 * bent:.0f} mm, the limit of its model,",
+            find_spans(t, np.abs(result["sheet_state"][:, 0]) > bent),
         )
 
 
@@ -222,118 +218,138 @@ def _saturated(result: SimulationResult) -> Flags:
     return (flag > 0) & (flag < LOST)
 
 
-def _channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
+def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if "ports" not in result:
         return
     t, timeout = result.t, scenario.channel.silent_after(1.0 / scenario.rates.hand_hz)
     for end, other in (("master", "slave"), ("slave", "master")):
         silent = result[f"ports.{end}_silent"] > timeout
         yield (
-            f"the {end}'s end is in its safe state, as nothing comes from the {other},",
-            spans_of(t, silent, LASTING),
+            f"the {end}'s end is in its safe state, no packets arrive from the {other},",
+            find_spans(t, silent, _MIN_DURATION_S),
         )
-    # An end that hears nothing goes by the last packet until `timeout`.
+    # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.lines()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
-    far = behind(t, sent[:, 4:], received[:, 4:], window)
-    turned = behind(t, _turned(sent, sent), _turned(received, sent), window)
+    far = lag_beyond_delay(t, sent[:, 4:], received[:, 4:], window)
+    turned = lag_beyond_delay(t, _rotation(sent, sent), _rotation(received, sent), window)
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
     for values, least, unit, scale in (
-        (far, _FAR, "mm", 1e3),
-        (turned, _TURNED, "degrees", _DEGREES),
+        (far, _MIN_LAG_M, "mm", 1e3),
+        (turned, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
     ):
-        spans = spans_of(t, values > least, LASTING)
+        spans = find_spans(t, values > least, _MIN_DURATION_S)
+        largest = _maximum_within(t, values, spans)
         yield (
-            f"the channel ({by}) holds the slave's command back: up to"
-            f" {scale * _largest_in(t, values, spans):.1f} {unit} more than its delay explains,",
+            f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
+            " more than its delay explains,",
             spans,
         )
-    yield from _reserve(result, scenario)
-    hunting = _sways(t, sent, received, NEAR + window)
-    yield f"the channel ({by}) lets the slave hunt, to and fro", spans_of(t, hunting, LASTING)
+    yield from _check_reserve(result, scenario)
+    oscillating = _pose_oscillates(t, sent, received, _REVERSAL_WINDOW_S + window)
+    yield (
+        f"the channel ({by}) makes the slave's command oscillate",
+        find_spans(t, oscillating, _MIN_DURATION_S),
+    )
 
 
-def _reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
-    """Where `ledger` lets the slave go slower than the hand, for lack of energy."""
+def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if scenario.passivity.method != "ledger" or len(result.t) < 2:
         return
     t, sent, received = result.t, result["pose_command"], result["pose_received"]
     config, row = scenario.passivity.ledger, t[1] - t[0]
-    mass = np.array(told_of_the_arm(scenario).slave_mass) * power_scale(scenario)
+    mass = np.array(passivity_with_arm_mass(scenario).slave_mass) * power_scale(scenario)
     limit = fastest(config, mass)
-    then = t - _ages(t, scenario)
-    window = longest_delay(scenario.channel.lines()[0]) + _GENERATOR
+    then = t - _packet_ages(t, scenario)
+    window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
     for g, per_s, command, actual, least, unit, scale in (
-        (0, "m/s", sent[:, 4:], received[:, 4:], _FAR, "mm", 1e3),
-        (1, "rad/s", _turned(sent, sent), _turned(received, sent), _TURNED, "degrees", _DEGREES),
+        (0, "m/s", sent[:, 4:], received[:, 4:], _MIN_LAG_M, "mm", 1e3),
+        (
+            1,
+            "rad/s",
+            _rotation(sent, sent),
+            _rotation(received, sent),
+            _MIN_LAG_RAD,
+            "degrees",
+            _DEGREES_PER_RAD,
+        ),
     ):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
-        far = behind(t, asked, actual, _GENERATOR)
+        far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
-        speed = _largest_of_last(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
+        speed = _running_maximum(way[:, np.newaxis], round(window / row) + 1)[:, 0] / row
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
-        if held.sum() * row < LASTING:
+        if held.sum() * row < _MIN_DURATION_S:
             continue
         enough = np.array(config.reserve)
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
-            f"the ledger's reserve lets the slave go at {limit[g]:.2g} {per_s}, and the hand wants"
-            f" up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the slave's"
-            f" command is up to {scale * far[held].max():.1f} {unit} from what it was told (move"
-            f" more slowly, or declare the energy: passivity.ledger.reserve {_listed(enough)} and"
-            f" initial {_listed(enough + config.hand_reserve)}),",
-            spans_of(t, held),
+            f"the ledger's reserve limits the slave to {limit[g]:.2g} {per_s}, and the hand moves"
+            f" at up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the slave's"
+            f" command is up to {scale * far[held].max():.1f} {unit} from the received pose (move"
+            f" more slowly, or increase the energy: passivity.ledger.reserve {_list_text(enough)}"
+            f" and initial {_list_text(enough + config.hand_reserve)}),",
+            find_spans(t, held),
         )
 
 
-def _ages(t: Array, scenario: Scenario) -> Array:
-    """(N,) how old the newest packet was at the slave's end, for this network is the run's [s]."""
+def _packet_ages(t: Array, scenario: Scenario) -> Array:
+    """Return (N,) age of the newest packet at the slave's end [s], from the run's network model."""
     period = 1.0 / scenario.rates.hand_hz
     step = np.rint((t + scenario.simulation.settle) / period).astype(int)
     line, seed = scenario.channel.lines()[0], scenario.simulation.seed
     return (step - newest_packets(line, seed, FORWARD, step[-1] + 1, period)[step]) * period
 
 
-def _listed(values: Array) -> str:
+def _list_text(values: Array) -> str:
     return "[" + ", ".join(f"{value:.2g}" for value in values) + "]"
 
 
-def _joints(
+def _check_joints(
     result: SimulationResult, scenario: Scenario, arm: ArmModel
 ) -> Iterator[tuple[str, Spans]]:
     if "joint_command" not in result:
         return
     t, command = result.t, result["joint_command"]
     actual = result["slave_state"][:, : command.shape[1]]
-    window = _TIME_CONSTANTS * scenario.joint_control.lag + 1 / scenario.rates.joint_control_hz
+    window = (
+        _SETTLING_TIME_CONSTANTS * scenario.joint_control.lag + 1 / scenario.rates.joint_control_hz
+    )
     for k in range(command.shape[1]):
-        far = behind(t, command[:, [k]], actual[:, [k]], window)
+        far = lag_beyond_delay(t, command[:, [k]], actual[:, [k]], window)
         slides = arm.table[k, SLIDES] != 0.0
-        spans = spans_of(t, far > (_FAR if slides else _JOINT_FAR), LASTING)
-        largest = _largest_in(t, far, spans)
+        spans = find_spans(t, far > (_MIN_LAG_M if slides else _MIN_JOINT_LAG_RAD), _MIN_DURATION_S)
+        largest = _maximum_within(t, far, spans)
         way = f"{1e3 * largest:.1f} mm" if slides else f"{np.rad2deg(largest):.1f} degrees"
         yield f"joint {k + 1} is up to {way} behind its command", spans
-    hunting = hunts(t, command, actual, _JOINT_SWING)
-    yield "the slave hunts: it goes to and fro uncommanded", spans_of(t, hunting, LASTING)
+    oscillating = oscillates(t, command, actual, _MIN_JOINT_AMPLITUDE_RAD)
+    yield (
+        "the slave oscillates while its command does not,",
+        find_spans(t, oscillating, _MIN_DURATION_S),
+    )
 
 
-def _hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
-        hunting = _sways(result.t, result["intent"], result["pose_master"], NEAR)
-        yield "the hand hunts: it is shaken to and fro", spans_of(result.t, hunting, LASTING)
+        oscillating = _pose_oscillates(
+            result.t, result["intent"], result["pose_master"], _REVERSAL_WINDOW_S
+        )
+        yield (
+            "the hand oscillates while its intent does not,",
+            find_spans(result.t, oscillating, _MIN_DURATION_S),
+        )
 
 
-def _sways(t: Array, command: Array, actual: Array, near: float) -> Flags:
-    """(N,) whether a pose (N, 7) hunts, by its place or its orientation."""
-    turned, wanted = (_turned(pose, command) for pose in (actual, command))
-    swaying = hunts(t, command[:, 4:], actual[:, 4:], _SWING, near)
-    return swaying | hunts(t, wanted, turned, _TURN_SWING, near)
+def _pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
+    turned, wanted = (_rotation(pose, command) for pose in (actual, command))
+    swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
+    return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
 
 
-def _turned(pose: Array, reference: Array) -> Array:
-    """(N, 4) of which a small change is as large as the turn [rad]: twice the quaternion.
+def _rotation(pose: Array, reference: Array) -> Array:
+    """Return (N, 4) twice the quaternion: its small changes equal the rotation [rad].
 
-    Its sign is that of the first pose of the reference.
+    The sign is that of the first pose of `reference`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
@@ -346,18 +362,16 @@ def _joint_error(result: SimulationResult) -> Array:
     return command - result["slave_state"][:, : command.shape[1]]
 
 
-def _full_torque(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
-    """(N,) whether a wrist motor of the device gives its largest torque."""
-    full, peak = np.zeros(len(torque), dtype=bool), _AT_LIMIT * device.peak_torque
-    # A motor's torque is the component about its axis: no larger than the torque.
+def _torque_at_limit(torque: Array, master_state: Array, device: HapticDevice) -> Flags:
+    full, peak = np.zeros(len(torque), dtype=bool), _LIMIT_SHARE * device.peak_torque
+    # A motor's torque is a component of the torque, so it is not larger.
     for k in np.flatnonzero(np.linalg.norm(torque, axis=1) >= peak.min()):
         turned = np.abs(torque[k] @ device.jacobian(master_state[k, :6])[3:, 3:])
         full[k] = (turned >= peak).any()
     return full
 
 
-def _largest_of_last(x: Array, rows: int) -> Array:
-    """(N, k) the largest of the last so many rows, by doubling."""
+def _running_maximum(x: Array, rows: int) -> Array:
     largest, done = x.copy(), 1
     while done < min(rows, len(x)):
         step = min(done, rows - done)
@@ -366,16 +380,16 @@ def _largest_of_last(x: Array, rows: int) -> Array:
     return largest
 
 
-def _largest_in(t: Array, values: Array, spans: Spans) -> float:
+def _maximum_within(t: Array, values: Array, spans: Spans) -> float:
     return max((float(values[(t >= a) & (t <= b)].max()) for a, b in spans), default=0.0)
 
 
-def _when(spans: Spans) -> str:
+def _times_text(spans: Spans) -> str:
     listed = [
         f"from {start:.3f} to {stop:.3f} s" if stop > start else f"at {start:.3f} s"
-        for start, stop in spans[:_LISTED]
+        for start, stop in spans[:_MAX_LISTED_TIMES]
     ]
-    more = len(spans) - _LISTED
+    more = len(spans) - _MAX_LISTED_TIMES
     if more > 0:
         listed.append(f"{more} more time{'s' if more > 1 else ''}")
     return " and ".join([", ".join(listed[:-1]), listed[-1]] if len(listed) > 1 else listed)

@@ -1,7 +1,6 @@
-"""Scenarios: what a station is made of and what happens in it, as dataclasses from YAML.
+"""Scenarios: configuration of a station as dataclasses, read from YAML.
 
-Every field has a unit and a plausible range; a file that cannot be right is refused with one
-message that names file and field. Times are in s, rates in Hz, lengths in m.
+Every field has a unit and a plausible range; an error names file and field. Units: s, Hz, m.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -46,7 +45,7 @@ from drake_teleop.station.slave.joint_control import JointControlConfig, default
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
 
-#: All kinds of things that `environment` may list.
+#: Types of objects in `environment`.
 Thing: TypeAlias = (
     Wall
     | Box
@@ -55,8 +54,8 @@ Thing: TypeAlias = (
     | Slot
     | Scene
 )  # fmt: skip
-#: What fixed steps need in contact [s]: ball on leaf vibrate at up to 700 Hz.
-_CONTACT_STEP = 1.25e-4
+#: Longest fixed step in contact [s]: ball and leaf vibrate at up to 700 Hz.
+_CONTACT_STEP_S = 1.25e-4
 
 
 @settings
@@ -76,9 +75,9 @@ class Rates:
 @settings
 @dataclass
 class Simulation:
-    """How long, and with which integrator.
+    """Duration and integrator of a simulation.
 
-    The log begins after the settling time, with t = 0; the operator's intent counts its times from
+    The log starts with t = 0 after the settling time. The operator's intent counts its times from
     the start of the simulation, `settle` earlier.
     """
 
@@ -107,7 +106,7 @@ class Simulation:
 @settings
 @dataclass
 class Scenario:
-    """One complete setup of the station of the paper's Fig. 4."""
+    """Complete configuration of the station in the paper's Fig. 4."""
 
     description: str = plain("", "what the scenario is about")
     simulation: Simulation = field(default_factory=Simulation)
@@ -132,36 +131,36 @@ class Scenario:
 
     @property
     def surroundings(self) -> Environment | None:
-        """What there is to touch; `Several`, if it is that."""
-        things = self._things
+        """All objects to touch as one `Environment`, or None."""
+        things = self._objects
         if not things:
             return None
         return things[0] if len(things) == 1 else Several(things)
 
     @property
     def leaf(self) -> SheetSpring | None:
-        """The sheet spring, wherever it stands."""
-        return next((thing for thing in self._things if isinstance(thing, SheetSpring)), None)
+        """The sheet spring, from `sheet_spring` or `environment`."""
+        return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
 
     @property
-    def _things(self) -> list[Environment]:
+    def _objects(self) -> list[Environment]:
         own = (thing for thing in (self.sheet_spring, self.slot) if thing is not None)
         return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
-        """The same with nothing to touch."""
+        """Return a copy without objects to touch."""
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
     def is_direct(self) -> bool:
-        """Whether nothing but wires lies between master and slave."""
+        """Whether master and slave are connected by wires only."""
         return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
-        """Checks every value.
+        """Check all values.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
@@ -173,7 +172,7 @@ class Scenario:
         for index, thing in enumerate(self.environment):
             thing.check(f"{where}:environment[{index}]")
         for kind, name in ((SheetSpring, "sheet spring"), (Slot, "slot")):
-            if sum(isinstance(thing, kind) for thing in self._things) > 1:
+            if sum(isinstance(thing, kind) for thing in self._objects) > 1:
                 raise DrakeTeleopError(
                     f"there is more than one {name}",
                     where=f"{where}:environment",
@@ -185,10 +184,10 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Checks that it is a scenario, and every value of it.
+    """Check the type of a scenario and all its values.
 
     Raises:
-        DrakeTeleopError: as `Scenario.check`, or for something else, such as a scenario's name.
+        DrakeTeleopError: as `Scenario.check`, or for an object that is not a Scenario.
     """
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
@@ -198,17 +197,16 @@ def check_scenario(scenario: Any) -> None:
 
 
 def ScenarioNames() -> list[str]:
-    """The names of the scenarios that are shipped."""
     return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
 
 
 def LoadScenario(name_or_path: str | Path) -> Scenario:
-    """Loads a scenario that is shipped, by its name, or a YAML file.
+    """Load a shipped scenario by name, or a YAML file.
 
-    Fields that the file leaves out keep their defaults. Files of models are found from its folder.
+    Missing fields keep their defaults. Paths of models are relative to the file's folder.
 
     Raises:
-        DrakeTeleopError: if there is no such scenario, or naming file and field of what is wrong.
+        DrakeTeleopError: if there is no such scenario or a value is invalid; with file and field.
     """
     data, where = ReadScenario(name_or_path)
     scenario = ScenarioFromData(data, where)
@@ -223,7 +221,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
 
 
 def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
-    """What stands in the file of a scenario, not checked, and the file's name for messages.
+    """Return the unchecked data of a scenario file, and the file's name for messages.
 
     Raises:
         DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
@@ -232,7 +230,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     path, names = scenarios_dir() / f"{name_or_path}.yaml", ScenarioNames()
     if str(name_or_path) not in names:
         path = Path(name_or_path)
-    if not os.path.isfile(path):  # nor for a name that no file can have
+    if not os.path.isfile(path):  # False also for invalid file names
         raise DrakeTeleopError(
             f"there is no scenario '{name_or_path}'",
             remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
@@ -241,10 +239,10 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
-    """The scenario of a parsed YAML file; `where` is the place for messages.
+    """Return the scenario of parsed YAML data; `where` is the place for messages.
 
     Raises:
-        DrakeTeleopError: naming the field of what is wrong.
+        DrakeTeleopError: with the invalid field.
     """
     check_structure(Scenario, data, where)
     defaults = Scenario(
@@ -258,14 +256,15 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:
-    """A copy with some fields changed; `a__b` names field b of block a.
+    """Return a copy with changed fields; `a__b` is field b of block a.
 
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
+    Values are checked when the scenario is used, or by `Scenario.check`.
+
     Raises:
-        DrakeTeleopError: if there is no such block or field; values are checked by `Scenario.check`
-            and by all that takes a scenario.
+        DrakeTeleopError: if there is no such block or field.
     """
     expect(Scenario, scenario, "scenario")
     for name, value in changes.items():
@@ -287,7 +286,7 @@ def _check_task(scenario: Scenario, where: str) -> None:
     check_task(scenario.operator.task, f"{where}:operator.task")
     if scenario.kinematic_scaling.translation_scale == 0.0:
         raise DrakeTeleopError(
-            "a hand that does not move the tool cannot do a task",
+            "a task needs a hand that moves the tool",
             where=f"{where}:kinematic_scaling.translation_scale",
             remedy="set it above 0, or operator.task: null",
         )
@@ -296,11 +295,15 @@ def _check_task(scenario: Scenario, where: str) -> None:
 def _check_steps(scenario: Scenario, where: str) -> None:
     simulation = scenario.simulation
     controlled = simulation.integrator == "runge_kutta3"
-    if scenario.surroundings is not None and not controlled and simulation.max_step > _CONTACT_STEP:
+    if (
+        scenario.surroundings is not None
+        and not controlled
+        and simulation.max_step > _CONTACT_STEP_S
+    ):
         raise DrakeTeleopError(
             f"steps of {simulation.max_step:g} s are too long for contact",
             where=f"{where}:simulation.max_step",
-            remedy=f"set it to {_CONTACT_STEP:g}, or integrator: runge_kutta3, which finds its own",
+            remedy=f"set it to {_CONTACT_STEP_S:g}, or integrator: runge_kutta3",
         )
 
 
@@ -312,15 +315,15 @@ def _check_channel(scenario: Scenario, where: str) -> None:
             raise DrakeTeleopError(
                 f"{timeout:g} s are less than two packets of {line.rate_hz:g} Hz",
                 where=f"{where}:channel.timeout",
-                remedy="raise timeout or rate_hz, or the station is in its safe state all the time",
+                remedy="raise timeout or rate_hz; otherwise the station stays in its safe state",
             )
     if scenario.master.leads_joints and not (
         scenario.is_direct and scenario.contact_detection is None
     ):
         raise DrakeTeleopError(
-            "a channel carries poses, not joints",
+            "a channel transmits poses, not joint positions",
             where=f"{where}:master.leader.leads",
-            remedy="lead by the pose, or without network, passivity and contact_detection",
+            remedy="set it to pose, or remove network, passivity and contact_detection",
         )
     scaling = scenario.kinematic_scaling
     scales = (scaling.translation_scale, scaling.rotation_scale)

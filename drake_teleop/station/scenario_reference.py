@@ -1,7 +1,7 @@
-"""What a scenario can say, for people and for editors, made from the dataclasses themselves.
+"""Reference, JSON schema and commented YAML of a scenario, generated from the dataclasses.
 
-`reference` is docs/scenario.md, `json_schema` docs/scenario.schema.json (python
-docs/make_reference.py writes both), `commented` what `drake-teleop scenario NAME` prints.
+docs/make_reference.py writes docs/scenario.md (`reference`) and docs/scenario.schema.json
+(`json_schema`); `drake-teleop scenario NAME` prints `commented`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 
-_COLUMN = 34  # at which the comments of a block begin, if its values leave them that place
+_COMMENT_COLUMN = 34  # column of the comments, unless a value is longer
 
 _HEAD = """\
 # Every field: its value, [what it may be] and what it means. What you leave out has its default.
@@ -51,18 +51,18 @@ and sections are those of the paper; (E) marks an estimate of ours, where the pa
 
 
 def commented(scenario: Scenario) -> str:
-    """The scenario as YAML with every field and its meaning; it loads back to the same scenario."""
+    """Return the scenario as YAML with every field and its meaning."""
     return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
-def _words(value: Any) -> list[str]:
-    """Return all texts in a scenario: what a wrong emitter would change."""
+def _all_texts(value: Any) -> list[str]:
+    """Return all texts in a scenario, which an incorrect YAML writer would change."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
         value = [*value, *value.values()]
     if isinstance(value, (list, tuple)):
-        return [word for each in value for word in _words(each)]
+        return [word for each in value for word in _all_texts(each)]
     return [str(value)] if isinstance(value, (str, Path)) and str(value) else []
 
 
@@ -70,30 +70,29 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
     """Write every field of a scenario to a YAML file, for `LoadScenario`.
 
     Raises:
-        DrakeTeleopError: if the text would be read as another scenario, or cannot be written.
+        DrakeTeleopError: if the file would be read as another scenario, or cannot be written.
     """
     text, where = commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
-    if scenario.master.figures is None:  # which are read from the data sheet then
+    if scenario.master.figures is None:  # read from the data sheet
         found.master = dataclasses.replace(found.master, figures=None)
-    if found != scenario and _words(found) != _words(scenario):
+    if found != scenario and _all_texts(found) != _all_texts(scenario):
         raise DrakeTeleopError("the scenario cannot be written to YAML", where=where)
     write_text(path, text)
 
 
 def reference() -> str:
-    """Markdown with a table for each block: field, default, range and meaning."""
+    """Return Markdown with a table per block: field, default, range and meaning."""
     return _REFERENCE + "".join(_sections(Scenario(), ""))
 
 
 def json_schema() -> str:
-    """The JSON schema of a scenario file, as text."""
+    """Return the JSON schema of a scenario file as text."""
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"}
     return json.dumps(schema | _object_schema(Scenario()), indent=1) + "\n"
 
 
-def _takes(entry: FieldInfo) -> str:
-    """What may stand there, for people."""
+def _allowed_values(entry: FieldInfo) -> str:
     words = entry.range if entry.unit or entry.choices else entry.kind
     if entry.lists:
         words = f"{entry.length or 'any number'} of {words}"
@@ -101,15 +100,14 @@ def _takes(entry: FieldInfo) -> str:
 
 
 def _comment(entry: FieldInfo) -> str:
-    return f"[{_takes(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
+    return f"[{_allowed_values(entry)}] {entry.meaning}" if entry.kind != "block" else entry.meaning
 
 
 def _block_lines(config: Any) -> list[str]:
-    """The fields of a block and of what is in it, each on a line, not indented."""
     entries = fields_of(config)
     starts = {entry.name: f"{entry.name}: {yaml_scalar(entry.default)}"
               for entry in entries if entry.kind != "block"}  # fmt: skip
-    column = min(_COLUMN, max(map(len, starts.values()), default=0))
+    column = min(_COMMENT_COLUMN, max(map(len, starts.values()), default=0))
     preset = preset_of({"preset": config.preset}) if isinstance(config, WristSensorConfig) else None
     lines = []
     for entry in entries:
@@ -123,23 +121,22 @@ def _block_lines(config: Any) -> list[str]:
 
 
 def _inner_lines(entry: FieldInfo) -> list[str]:
-    """A block or a list of blocks; if there is none, all that could be there, behind #."""
+    """Return the lines of inner blocks; blocks that are not set are commented out."""
     if entry.default:
         return _named_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]
     if entry.lists:
-        return _out(_named_lines(entry, blocks))
-    return [line for block in blocks for line in _out(_named_lines(entry, block))]
+        return _commented_out(_named_lines(entry, blocks))
+    return [line for block in blocks for line in _commented_out(_named_lines(entry, block))]
 
 
 def _named_lines(entry: FieldInfo, value: Any) -> list[str]:
-    """`name:` and, indented, what is in it."""
     if not entry.lists:
         head = f"{entry.name}:{_tag(entry, value)}  # {entry.meaning}"
-        return [head, *_indented(_block_lines(value))]
+        return [head, *_indent(_block_lines(value))]
     lines = [f"{entry.name}:  # {entry.meaning}"]
     for item in value:
-        lines += [f"  -{_tag(entry, item)}", *_indented(_indented(_block_lines(item)))]
+        lines += [f"  -{_tag(entry, item)}", *_indent(_indent(_block_lines(item)))]
     return lines
 
 
@@ -147,21 +144,20 @@ def _tag(entry: FieldInfo, config: Any) -> str:
     return f" !{type(config).__name__}" if len(entry.blocks) > 1 else ""
 
 
-def _indented(lines: list[str]) -> list[str]:
+def _indent(lines: list[str]) -> list[str]:
     return [f"  {line}" for line in lines]
 
 
-def _out(lines: list[str]) -> list[str]:
+def _commented_out(lines: list[str]) -> list[str]:
     return [f"# {line}" for line in lines]
 
 
 def _sections(config: Any, path: str) -> Iterator[str]:
-    """The table of a block, then those of the blocks in it."""
     entries = fields_of(config)
     yield "\n| field | default | takes | meaning |\n|---|---|---|---|\n"
     for entry in entries:
         default = yaml_scalar(entry.default) if entry.kind != "block" or not entry.default else ""
-        takes = _links(entry, path) if entry.kind == "block" else _takes(entry)
+        takes = _links(entry, path) if entry.kind == "block" else _allowed_values(entry)
         cells = (f"`{entry.name}`", default, takes, entry.meaning)
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |\n"
     for entry in entries:
@@ -173,7 +169,6 @@ def _sections(config: Any, path: str) -> Iterator[str]:
 
 
 def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
-    """Of the sections of the blocks that may stand there."""
     several = len(entry.blocks) > 1
     return [
         (f"{path}{entry.name}{f': !{block.__name__}' if several else ''}", block)
@@ -182,7 +177,6 @@ def _titles(entry: FieldInfo, path: str) -> list[tuple[str, type]]:
 
 
 def _links(entry: FieldInfo, path: str) -> str:
-    """To these sections, in a table."""
     several = len(entry.blocks) > 1
     links = [
         f"[{f'!{block.__name__}' if several else 'block'}](#{_anchor(title)})"

@@ -1,10 +1,10 @@
-"""The signals that a station records: name, components, units, meaning."""
+"""Signals that a station records: name, components, units, meaning."""
 
 from __future__ import annotations
 
 from drake_teleop.station.result import Signal
 
-#: Name of the one log sink in a station; it holds the station's output ports side by side.
+#: Name of the station's log sink; its rows are the output ports in one vector.
 LOG = "log"
 
 
@@ -13,7 +13,7 @@ def _signal(name: str, components: str, units: str, description: str) -> Signal:
     return Signal(name, tuple(components.split()), unit[0] if len(unit) == 1 else unit, description)
 
 
-#: Before the name of a body of the surroundings that moves: its pose is a signal of its own.
+#: Prefix of the pose signals of moving bodies of the surroundings.
 POSE_OF = "pose_of_"
 
 _WRENCH = ("f_x f_y f_z tau_x tau_y tau_z", "N,N,N,N m,N m,N m")
@@ -26,17 +26,17 @@ def _state(joints: int) -> tuple[str, str]:
     return " ".join(names), ",".join(joints * ["rad"] + joints * ["rad/s"])
 
 
-def _joints(joints: int) -> str:
+def _joint_names(joints: int) -> str:
     return " ".join(f"joint_{i + 1}" for i in range(joints))
 
 
 _STATE, _STATE_UNITS = _state(6)
-_JOINTS = _joints(6)
-# Those of the slave have as many components as its arm has joints; so has a leader's state.
-_OF_JOINTS = ("joint_position", "joint_torque", "joint_command")
+_JOINTS = _joint_names(6)
+# Their number of components follows the number of joints, as that of the states does.
+_JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
 
 
-#: Everything that a station can record, in the order of the log; of an arm with six joints.
+#: All signals in the order of the log, for an arm with six joints.
 SIGNALS = {
     signal.name: signal
     for signal in (
@@ -112,17 +112,17 @@ SIGNALS = {
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """The signal of that name in a station whose port has so many components.
+    """Return the description of a signal for a port with `size` components.
 
-    Where a joint slides, rad stands for m and N m for N.
+    For prismatic joints, read m instead of rad and N instead of N m.
     """
     if name.startswith(POSE_OF):
         return _signal(name, *_POSE, f"where the body {name.removeprefix(POSE_OF)} is, in W, at t")
     signal = SIGNALS[name]
     if size == len(signal.components):
         return signal
-    if name in _OF_JOINTS:
-        return _signal(name, _joints(size), signal.units[0], signal.description)
+    if name in _JOINT_SIGNALS:
+        return _signal(name, _joint_names(size), signal.units[0], signal.description)
     if name in ("slave_state", "master_state"):
         return _signal(name, *_state(size // 2), signal.description)
     return signal

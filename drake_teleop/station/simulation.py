@@ -1,4 +1,4 @@
-"""Running a station: simulate, and get named signals back."""
+"""Simulation of a station with named signals as result."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation
 from drake_teleop.station.signals import LOG, signal_of
 
-# In milliseconds; long enough to keep progress cheap, short enough to look alive.
-_PROGRESS_STEP = 20
-# A part of a log on disk: some seconds of a station, some MB.
+# Interval of progress updates [ms].
+_PROGRESS_INTERVAL_MS = 20
+# Rows of a part of a log on disk: some seconds, some MB.
 _PART_ROWS = 8192
 
 
@@ -34,25 +34,23 @@ def simulate(
     progress: bool | Progress = True,
     log: str | Path | None = None,
 ) -> SimulationResult:
-    """Runs a station through its settling time and its duration.
+    """Simulate a station for its settling time and duration.
 
     Args:
-        diagram: a station, as `MakeTeleopStation` makes it.
+        diagram: station from `MakeTeleopStation`.
         simulation: duration, settling time, integrator and seed.
-        progress: whether a bar is shown if it takes longer than a second; or what is called with
-            the fraction done, 0 to 1.
-        log: a folder that the log goes to while the station runs, in parts of some seconds
-            (`SimulationResult.scan_parquet`): a long run then needs no more memory than a short
-            one. What was recorded before Ctrl-C or an error is in it, and all but the last part
-            if the process is killed. A log that is there already is replaced.
+        progress: whether to show a bar after one second; or a function of the completed fraction.
+        log: folder for the log, which is written during the run in parts of some seconds, so that
+            memory does not grow (`SimulationResult.scan_parquet`). After Ctrl-C or an error it
+            contains all samples; a killed process loses the last part. An old log is replaced.
 
     Returns:
-        The recorded signals; t = 0 is the end of the settling time. With `log` they are read
-        when they are asked for.
+        The recorded signals; t = 0 at the end of the settling time. With `log`, signals are read
+        at each access.
 
     Raises:
-        DrakeTeleopError: if an argument cannot be used, a joint of the slave leaves its range,
-            the folder holds other files, or at a fault (`Simulation.on_fault`).
+        DrakeTeleopError: if an argument is invalid, a joint of the slave leaves its range, the
+            folder contains other files, or at a fault (`Simulation.on_fault`).
     """
     expect(Diagram, diagram, "diagram", "make one: MakeTeleopStation(scenario)")
     expect(Simulation, simulation, "simulation", "pass scenario.simulation")
@@ -67,9 +65,8 @@ def simulate(
     stops, rows = simulation.on_fault == "stop", 0
     simulator.Initialize()
     try:
-        # Products, as Drake's event times are: what differs by rounding alone would be a step of
-        # its own, of 1e-17 s, with samples that are due at its start or at its end.
-        milliseconds = np.arange(_PROGRESS_STEP, 1e3 * end - 1, _PROGRESS_STEP)
+        # Products, as Drake's event times are: a rounding difference would be a step of 1e-17 s.
+        milliseconds = np.arange(_PROGRESS_INTERVAL_MS, 1e3 * end - 1, _PROGRESS_INTERVAL_MS)
         for time in np.append(1e-3 * milliseconds, end):
             advance(simulator, time)
             if stops:
@@ -97,10 +94,10 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Looks at what was recorded after so many rows; returns how many there are now.
+    """Check the rows recorded since row `rows`; return the new number of rows.
 
     Raises:
-        DrakeTeleopError: for the first fault among them.
+        DrakeTeleopError: for the first fault.
     """
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
@@ -118,20 +115,20 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
 
 
 def columns(station: Diagram) -> dict[str, slice]:
-    """Where the station's signals stand in its log, by name."""
+    """Return the log's rows of each signal, by name."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
 
 
 class LogOnDisk:
-    """Moves the log of a running station into a folder of parts.
+    """Writer that moves the log of a running station into a folder of parts.
 
     Args:
-        folder: of the log; one that is there is replaced.
-        simulator: of the station.
-        start: the time that is called 0 [s].
-        form: brings the rows into a form that all parts of the log have.
+        folder: folder of the log; an old log is replaced.
+        simulator: simulator of the station.
+        start: time that becomes t = 0 [s].
+        form: converts the rows to the common form of all parts.
     """
 
     def __init__(
@@ -146,20 +143,20 @@ class LogOnDisk:
         self.follow(simulator)
 
     def follow(self, simulator: Simulator) -> None:
-        """The next rows are of this one; those of the last one have been taken."""
+        """Continue with another simulator; call `take` for the previous one before."""
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
     def waiting(self) -> int:
-        """The rows that are in memory."""
+        """Return the number of rows in memory."""
         return int(self._sink.num_samples())
 
     def take(self) -> None:
-        """Writes them as the next part and forgets them.
+        """Write the rows in memory as the next part, and remove them from memory.
 
-        After an interrupt anywhere in here it may be called once more: that replaces the part by
-        the same rows, or has none to write.
+        After an interrupt inside this method it may be called again: it rewrites the same part or
+        writes nothing new.
         """
         part = self._read()
         self._write(part)
@@ -167,7 +164,7 @@ class LogOnDisk:
         self._rows += len(part.t)
 
     def keep(self) -> None:
-        """Writes them, and keeps them: the next `take` writes the same part with more rows."""
+        """Write the rows but keep them: the next `take` rewrites this part with more rows."""
         self._write(self._read())
 
     def _write(self, part: SimulationResult) -> None:
@@ -178,7 +175,7 @@ class LogOnDisk:
 
 
 def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
-    """A simulator with the scenario's integrator, its random sources seeded, at t = 0."""
+    """Return a simulator at t = 0 with the scenario's integrator and seed."""
     context = diagram.CreateDefaultContext()
     diagram.SetRandomContext(context, RandomGenerator(simulation.seed))
     simulator = Simulator(diagram, context)
@@ -189,10 +186,9 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance(simulator: Simulator, time: float) -> None:
-    """`simulator.AdvanceTo(time)` without Python's cyclic garbage collector.
+    """Call `simulator.AdvanceTo(time)` with garbage collection disabled.
 
-    The blocks make no cycles, but thousands of short-lived arrays, each of which brings the
-    collector's next round nearer: 7 % of the time.
+    The blocks create many short-lived arrays but no cycles, so that collection only costs time.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -204,7 +200,7 @@ def advance(simulator: Simulator, time: float) -> None:
 
 
 def read_log(simulator: Simulator, start: float) -> SimulationResult:
-    """The recorded signals from `start` [s] on, with t = 0 there."""
+    """Return the recorded signals from time `start` [s] on, with t = 0 there."""
     diagram = simulator.get_system()
     log = diagram.GetSubsystemByName(LOG).FindLog(simulator.get_context())
     t = log.sample_times() - start

@@ -1,4 +1,4 @@
-"""The slave side: the arm follows a pose, and its wrist sensor tells contact from the tool."""
+"""The slave side: arm with inverse kinematics, wrist sensor and load elimination."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from drake_teleop.station.wiring import export
 
 Array = NDArray[np.float64]
 
-#: How often the monitor looks [s]; an event at 2 kHz would cost time.
+#: Sampling period of the monitor [s]; 2 kHz events would cost time.
 MONITOR_PERIOD = 0.01
 # See `_check_friction`.
-_LARGEST_FRICTION_STEP = 2.0
+_MAX_FRICTION_STEP = 2.0
 
 
 def MakeSlaveSide(
@@ -52,42 +52,40 @@ def MakeSlaveSide(
     load_covariance: Array | None = None,
     noise_floor: NoiseFloor | None = None,
 ) -> Diagram:
-    """Inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
+    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
 
     .. pydrake_system::
 
         name: slave_side
         input_ports:
-        - pose_command: (7,) X_WS that it shall follow; or leader_joints: (n,) [rad], if a leader
-          leads joint by joint
+        - pose_command: (7,) X_WS, setpoint; or leader_joints: (n,) [rad] (leader arm in joint mode)
         output_ports:
-        - wrench_B: (6,) F_E_B, what the hand should feel, in the master's base [N, N m]; not a
-          number while there is a fault
-        - load_wrench_B: (6,) what of that is the load's weight and inertia
-        - pose_slave: (7,) X_WS, actual, of the joint angles now (over a network)
-        - saturated: (1,) 1 while the wrench is not to be trusted; a signal too
-        - contact: (1,) 1 in contact; a signal too (with contact detection)
+        - wrench_B: (6,) F_E_B, wrench to render, in the master's base [N, N m]; NaN during a fault
+        - load_wrench_B: (6,) its part from weight and inertia of the load
+        - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
+        - saturated: (1,) 1 while the wrench is invalid; also a signal
+        - contact: (1,) 1 in contact; also a signal (with contact detection)
         - the parts of a sample (`sample_parts`), slave_state, joint_torque, joint_command,
           ik_status, scaled_wrench_S, fault: signals
-        - load_estimate, contact_wrench_S (if the load is known or learnt): signals
-        - load_state (if the load is watched), true_contact_wrench_W (with something to touch),
-          sheet_state (with a sheet spring), pose_of_NAME (of each other body of the surroundings
-          that moves): signals
-        - sample, scaled_contact_and_fault: several of these side by side, for the log
+        - load_estimate, contact_wrench_S (if the load is identified or estimated online): signals
+        - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
+          sheet_state (with a sheet spring), pose_of_NAME (of each moving body of the
+          surroundings): signals
+        - sample, scaled_contact_and_fault: several of these in one port, for the log
 
     Args:
         scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
 
     Raises:
-        DrakeTeleopError: for a value that cannot be right, a start out of reach, scales that mean
-            something only if the load is known while it is not, or detection without its floor.
+        DrakeTeleopError: for an invalid value, an unreachable start, scales that need a load
+            estimate without one, or contact detection without noise floor.
     """
     check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)
     if load_covariance is not None:
         checked("load_covariance", load_covariance, 16, 16)
     builder = DiagramBuilder()
-    body = _add_body(builder, scenario, load_estimate, load_covariance)
+    body = _add_slave_blocks(builder, scenario, load_estimate, load_covariance)
     arm = body.slave.arm
 
     start, led = body.slave.start, scenario.master.leads_joints
@@ -120,7 +118,7 @@ def MakeSlaveSide(
     builder.Connect(body.sample["sample"], force_scaling.GetInputPort("sample"))
     builder.Connect(estimate, force_scaling.GetInputPort("load_estimate"))
     export(builder, force_scaling, "wrench_B", "load_wrench_B", "scaled_wrench_S", "fault")
-    if _is_known(scenario, load_estimate):
+    if _has_load_estimate(scenario, load_estimate):
         export(builder, force_scaling, "contact_wrench_S", "scaled_contact_and_fault")
 
     if not scenario.is_direct:
@@ -132,9 +130,9 @@ def MakeSlaveSide(
     if scenario.contact_detection is not None:
         if noise_floor is None:
             raise DrakeTeleopError(
-                "nobody knows how large the contact wrench is in free motion",
+                "no noise floor given",
                 where="contact_detection",
-                remedy="pass the noise_floor of identify_load, as load_estimate",
+                remedy="pass noise_floor=identify_load(...).noise_floor",
             )
         expect(NoiseFloor, noise_floor, "noise_floor", "pass that of identify_load")
         detection = builder.AddNamedSystem(
@@ -150,14 +148,14 @@ def MakeSlaveSide(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """The slave without a master: its joints run through an excitation trajectory (section IV).
+    """Build the slave without master: its joints follow an excitation trajectory (section IV).
 
-    It starts at the trajectory's start; `trajectory` runs once, after the settling time. Its ports
-    are those signals of `MakeSlaveSide` that need no command and no elimination.
+    The arm starts at the trajectory's start; `trajectory` runs once after the settling time.
+    Output ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
-    body = _add_body(builder, scenario, q_start=start)
+    body = _add_slave_blocks(builder, scenario, q_start=start)
     command = builder.AddNamedSystem(
         "joint_trajectory", JointTrajectory(trajectory, scenario.simulation.settle)
     )
@@ -169,32 +167,30 @@ def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> 
 
 
 @dataclass(frozen=True)
-class _Body:
-    """Plant, joint control, wrist sensor, load estimator and monitor, wired to each other."""
-
+class _SlaveBlocks:
     slave: SlavePlant
     joint_control: LeafSystem
     monitor: LeafSystem
     load_estimator: LeafSystem
     sample: dict[str, OutputPort]
-    command_period: float  # in which it takes joint commands [s]
+    command_period: float  # period of joint commands [s]
 
 
-def _add_body(
+def _add_slave_blocks(
     builder: DiagramBuilder,
     scenario: Scenario,
     load_estimate: Array | None = None,
     load_covariance: Array | None = None,
     q_start: Array | None = None,
-) -> _Body:
-    """Adds what every slave has; the joint command is left open."""
+) -> _SlaveBlocks:
+    """Add the blocks that every slave has; the joint command stays unconnected."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start = slave.arm, slave.plant, slave.start
     state = plant.get_state_output_port(slave.instance)
     builder.ExportOutput(state, "slave_state")
 
-    samples = 1 if q_start is not None else _samples_within(scenario, slave)
+    samples = 1 if q_start is not None else _servo_samples_per_event(scenario, slave)
     ramps = samples > 1
     control = builder.AddNamedSystem(
         "joint_control",
@@ -251,21 +247,24 @@ def _add_body(
             scenario.force_scaling.gripper_phi,
         ),
     )
-    # Only when it learns or watches: at 8 kHz even a wire that nobody reads costs time.
+    # At 8 kHz even an unused connection costs time.
     if scenario.load_estimator.enabled or scenario.load_estimator.watch:
         builder.Connect(sample["sample"], estimator.GetInputPort("sample"))
-    if _is_known(scenario, load_estimate):
+    if _has_load_estimate(scenario, load_estimate):
         export(builder, estimator, "load_estimate")
     if scenario.load_estimator.watch:
         export(builder, estimator, "load_state")
 
     if slave.can_touch:
         _add_tool_contact(builder, slave, state)
-    return _Body(slave, control, monitor, estimator, sample, held)
+    return _SlaveBlocks(slave, control, monitor, estimator, sample, held)
 
 
-def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
-    """Of the servo for one event; 1 where nothing but the plant itself can foresee its motion."""
+def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
+    """Return servo samples per event.
+
+    It is 1 if only the plant itself predicts its motion (contact by Drake, position interface).
+    """
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.beyond or contact.plant_size or interface is not None:
         return 1
@@ -273,20 +272,20 @@ def _samples_within(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Refuses friction that stops a joint within less than a step [s] of the plant: it would shake.
+    """Reject friction that stops a joint within one step [s] of the plant (numerical instability).
 
-    A step of Runge and Kutta is stable up to 2.5 for (friction's slope / inertia) * step.
+    A Runge-Kutta step is stable for (slope of friction / inertia) * step up to 2.5.
 
     Raises:
-        DrakeTeleopError: if it does, about where the arm starts.
+        DrakeTeleopError: for such friction at the start pose.
     """
     if not slave.friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)
     slope = np.diag(slave.friction / FRICTION_SPEED)
     rate = float(np.linalg.eigvals(np.linalg.solve(mass, slope)).real.max())
-    if rate * step > _LARGEST_FRICTION_STEP:
-        shorter = 0.9 * _LARGEST_FRICTION_STEP / rate
+    if rate * step > _MAX_FRICTION_STEP:
+        shorter = 0.9 * _MAX_FRICTION_STEP / rate
         raise DrakeTeleopError(
             f"the friction stops a joint within {1e3 / rate:.2g} ms, too fast for steps of "
             f"{1e3 * step:g} ms",
@@ -333,20 +332,19 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
             learnt("load_estimate", estimate[6:])
     sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
     needed = not sigma_gripper == sigma_object == gamma
-    if needed and not _is_known(scenario, estimate):
+    if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "sigma and gamma differ, but the load is not known",
+            "sigma and gamma differ, but there is no load estimate",
             where="load_estimate",
             remedy="pass the estimate of identify_load, or set load_estimator.enabled",
         )
-    if scenario.contact_detection is not None and not _is_known(scenario, estimate):
+    if scenario.contact_detection is not None and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
-            "contact is to be detected, but the load is not known",
+            "contact detection needs a load estimate",
             where="load_estimate",
             remedy="pass the estimate of identify_load, as its noise_floor",
         )
 
 
-def _is_known(scenario: Scenario, estimate: Array | None) -> bool:
-    """Whether there is a load estimate, or will be one; without it nobody can tell contact."""
+def _has_load_estimate(scenario: Scenario, estimate: Array | None) -> bool:
     return estimate is not None or scenario.load_estimator.enabled

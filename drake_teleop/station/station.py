@@ -1,10 +1,9 @@
-"""The complete teleoperation system of the paper's Fig. 4 as one Drake Diagram.
+"""The teleoperation system of the paper's Fig. 4 as one Drake Diagram.
 
     operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
           master side        <->      channel       <->          slave side
 
-Read `MakeTeleopStation` beside the figure; each side is one function in `drake_teleop.station`, and
-each of its blocks one file. Either side may be somebody's own: docs/station.md.
+Each side is one function in `drake_teleop.station`. Either side may be custom: docs/station.md.
 """
 
 from __future__ import annotations
@@ -32,29 +31,28 @@ def MakeTeleopStation(
     master: System | None = None,
     slave: System | None = None,
 ) -> Diagram:
-    """Builds the bilateral station: master side, channel, slave side.
+    """Build the bilateral station: master side, channel, slave side.
 
-    A channel that would be two wires and nothing else is left out. The station's output ports are
-    those signals of `drake_teleop.station.signals` that its sides have, and are recorded. Its input
-    ports are those of the master side that the operator's world may drive: clutch, intended_pose,
-    intended_twist; all may be left unconnected.
+    Two direct wires replace a channel without network, method and contact detection. The output
+    ports are the sides' signals (`drake_teleop.station.signals`), which are recorded. The input
+    ports clutch, intended_pose and intended_twist of the master side may stay unconnected.
 
     Args:
-        scenario: what the station is made of.
-        load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, as an identification
-            found it. It may be left out if the estimator learns in the loop, and if sigma = gamma,
-            which needs no estimate; then the station has no `contact_wrench_S`.
-        load_covariance: (16, 16) of the estimate, with which a load that is to be watched
-            (`load_estimator.watch`) need not be learnt first. Of a method that allows for noise in
-            the motion ("total"): that of plain least squares is too small.
-        noise_floor: of the wrench that is left in free motion, which detection of contact needs:
-            `LoadIdentification.noise_floor`, at the rate of the estimator.
-        master: instead of `MakeMasterSide(scenario)`: any system with its ports.
-        slave: instead of `MakeSlaveSide(scenario, ...)`, which alone uses the three above.
+        scenario: configuration of the station.
+        load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an
+            identification. Optional if the estimator runs online or sigma = gamma; without an
+            estimate there is no `contact_wrench_S`.
+        load_covariance: (16, 16) of the estimate: start value of a monitored load
+            (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
+            least squares is too small.
+        noise_floor: of the eliminated wrench in free motion, at the estimator's rate, for contact
+            detection: `LoadIdentification.noise_floor`.
+        master: custom system with the ports of `MakeMasterSide(scenario)`.
+        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; it ignores the three
+            arguments above.
 
     Raises:
-        DrakeTeleopError: for a value that cannot be right, as for the sides, or for a side of
-            one's own without a port that is needed.
+        DrakeTeleopError: for an invalid value, or a custom side without a required port.
     """
     check_scenario(scenario)
     for name, side in (("master", master), ("slave", slave)):
@@ -73,7 +71,7 @@ def MakeTeleopStation(
 
     sides = [master, slave]
     if scenario.is_direct and scenario.contact_detection is None:
-        # A channel of two wires, which as a Diagram would cost 3 % of the time.
+        # A Diagram of two wires would cost 3 % of the time.
         setpoint = "leader_joints" if scenario.master.leads_joints else "pose_command"
         wire(builder, master, setpoint, slave, setpoint)
         wire(builder, slave, "wrench_B", master, "wrench_command")
@@ -84,7 +82,7 @@ def MakeTeleopStation(
         wire(builder, channel, "pose_to_slave", slave, "pose_command")
         wire(builder, slave, "wrench_B", channel, "wrench_B")
         wire(builder, channel, "wrench_to_master", master, "wrench_command")
-        # What a method over a network goes by, and what a detector tells.
+        # Inputs of network methods and of contact detection.
         for source, name in (
             (master, "hand_wrench_E"),
             (slave, "pose_slave"),
@@ -93,7 +91,7 @@ def MakeTeleopStation(
         ):
             if channel.HasInputPort(name):
                 wire(builder, source, name, channel, name)
-        # A slave of one's own may leave it out: then all of its wrench is a contact's.
+        # Optional for a custom slave: then the whole wrench counts as contact.
         if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):
             wire(builder, slave, "load_wrench_B", channel, "load_wrench_B")
     if master.HasInputPort("slave_state"):  # an operator with a task sees the tool
@@ -105,7 +103,7 @@ def MakeTeleopStation(
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Builds the slave alone, on an excitation trajectory: see `MakeSlaveOnTrajectory`."""
+    """Build a station of the slave alone on a trajectory: see `MakeSlaveOnTrajectory`."""
     check_scenario(scenario)
     expect(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
@@ -114,7 +112,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 
 
 def GetBlock(station: Diagram, name: str) -> System:
-    """The block of that name ("force_scaling", "slave_plant", ...), in whichever side it is."""
+    """Return the block with this name ("force_scaling", "slave_plant", ...) from any side."""
     sides = [side for side in station.GetSystems() if isinstance(side, Diagram)]
     (side,) = (side for side in sides if side.HasSubsystemNamed(name))
     return side.GetSubsystemByName(name)

@@ -1,22 +1,19 @@
-"""How well a simulated operator did its task: figures from the log of one run.
+"""Measures of a simulated operator's task, from the log of one run.
 
-============================ ====================================================================
-success                      1 if the operator ended its task, and the truth agrees: the tip is in
-                             the target; the tool touches; the force was held within its tolerance;
-                             the tip is within 2 mm of the slot's floor
-task_time_s                  from the task's start until the operator has done it
-contact_force_overshoot_N    largest contact force at the tool, less the force that was wanted
-effort_Ns                    integral of |force of the hand|: what tires an arm that pushes or holds
-task_work_J                  integral of |power of the hand|: pushing and braking both count
-detection_time_s             from the first contact until the operator answers to it; nan if never
-false_notices                times that contact was noticed before there was one
-press_error_N                root mean square error of the force while it was held; nan if not held
-============================ ====================================================================
+============================ =====================================================================
+success                      1 if the operator finished and the task is achieved: tip in the target;
+                             tool in contact; force in its tolerance; tip within 2 mm of the floor
+task_time_s                  from the task's start until the operator finished
+contact_force_overshoot_N    largest contact force at the tool minus the required force
+effort_Ns                    integral of |force of the hand|
+task_work_J                  integral of |power of the hand|
+detection_time_s             from the first contact to the operator's reaction; nan without one
+false_notices                number of detected contacts before the first contact
+press_error_N                RMS error of the held force; nan if not held
+============================ =====================================================================
 
-All of them are of the time from the task's start until it was done or given up, or the log's end.
-Of a task that failed, also where the operator believes that it is done, there are only the success
-and what was noticed; the others are nan, for little effort in vain is no merit. Why it failed is
-said by `task_failure`.
+The interval ends when the operator finishes or gives up, or with the log. A failed task has only
+success, detection_time_s and false_notices; the others are nan. `task_failure` gives the reason.
 """
 
 from __future__ import annotations
@@ -27,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.station.measure_names import TASK_MEASURES
 from drake_teleop.station.operator.decision import (
     DONE,
     FEELING,
@@ -39,7 +35,7 @@ from drake_teleop.station.operator.decision import (
     STOPPING,
     WAITING,
 )
-from drake_teleop.station.operator.task import Insert, Press, Reach, Task, Touch
+from drake_teleop.station.operator.task import TASK_MEASURES, Insert, Press, Reach, Task, Touch
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import forward_kinematics
@@ -47,22 +43,22 @@ from drake_teleop.station.slave.plant import NominalSlave
 
 Array = NDArray[np.float64]
 
-_ON_THE_FLOOR = 2e-3  # m
-_DOING = {
-    MOVING: "on its way to the target",
-    FEELING: "on its careful way to contact",
-    STOPPING: "at rest after contact",
+_FLOOR_TOLERANCE_M = 2e-3  # m
+_PHASE_TEXTS = {
+    MOVING: "moving to the target",
+    FEELING: "approaching the contact",
+    STOPPING: "stopped after contact",
     PRESSING: "pressing",
-    SEEKING: "seeking the way into the slot",
+    SEEKING: "searching for the slot",
 }
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """The measures above, of one run of a scenario with a task.
+    """Return the measures above for one run.
 
     Args:
-        result: with the signal task_state.
-        scenario: that was run.
+        result: result with the signal task_state.
+        scenario: scenario of the run.
 
     Raises:
         DrakeTeleopError: if the scenario has no task.
@@ -74,20 +70,20 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
             where="operator.task",
             remedy="give the operator a task: !Reach, !Touch, !Press or !Insert",
         )
-    state, t, ended = result["task_state"], result.t, _ended(result)
+    state, t, ended = result["task_state"], result.t, _end_sample(result)
     begun = int(np.argmax(state[:, PHASE] != WAITING))
     span = slice(begun, ended + 1)
     done = state[ended, DONE] > 0.0
     force = contact_force(result)
-    held = _held(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
-    wanted = _wanted_force(task)
+    held = _held_force(t, force, task, ended) if done and isinstance(task, Press) else np.empty(0)
+    wanted = _required_force(task)
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
-    # The log may begin later than the task.
+    # The log may start after the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
-    success = done and not _wrong(result, scenario, task, ended)
-    done_well = {
+    success = done and not _failed_criterion(result, scenario, task, ended)
+    measures_of_success = {
         "task_time_s": taken,
         "contact_force_overshoot_N": max(float(force[span].max()) - wanted, 0.0),
         "effort_Ns": float(np.trapezoid(np.linalg.norm(hand[:, :3], axis=1), t[span])),
@@ -95,34 +91,31 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
         "press_error_N": float(np.sqrt(np.mean((held - wanted) ** 2))) if held.size else math.nan,
     }
     if not success:
-        done_well = dict.fromkeys(done_well, math.nan)
-    figures = done_well | {
+        measures_of_success = dict.fromkeys(measures_of_success, math.nan)
+    figures = measures_of_success | {
         "success": float(success),
         "detection_time_s": detection_time(t[span], touching, noticed),
-        "false_notices": float(_false_notices(touching, noticed)),
+        "false_notices": float(_count_false_detections(touching, noticed)),
     }
     return {name: figures[name] for name in TASK_MEASURES}
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
-    """Why the task failed: out of time, given up, or not as believed; "" if it did not.
+    """Return the reason for failure: timeout, given up, or not achieved; "" after success.
 
-    Times are those of the log.
-
-    Args:
-        result, scenario: as for `task_measures`; the scenario has a task.
+    Times are those of the log. The scenario must have a task.
     """
-    task, state, ended = scenario.operator.task, result["task_state"], _ended(result)
+    task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
     assert task is not None
     at, outcome = float(result.t[ended]), state[ended, DONE]
     if outcome > 0.0:
-        wrong = _wrong(result, scenario, task, ended)
-        return f"the operator believed at {at:.2f} s that it was done, but {wrong}" if wrong else ""
+        wrong = _failed_criterion(result, scenario, task, ended)
+        return f"the operator finished at {at:.2f} s, but {wrong}" if wrong else ""
     phase = int(state[ended if outcome == 0.0 else max(ended - 1, 0), PHASE])
     if phase == WAITING:
         return f"the task begins at {task.t_start:g} s, when the simulation has ended"
     taken = at + scenario.simulation.settle - task.t_start
-    found = f"{_DOING[phase]}, {_force_and_place(result, scenario, task, ended)}"
+    found = f"{_PHASE_TEXTS[phase]}, {_force_and_position_text(result, scenario, task, ended)}"
     if outcome == 0.0:
         return (
             f"the simulation ended after {taken:.2f} s of the task, while the operator was {found};"
@@ -131,35 +124,34 @@ def task_failure(result: SimulationResult, scenario: Scenario) -> str:
     if taken >= task.timeout:
         return (
             f"the operator gave up at {at:.2f} s, after the {task.timeout:g} s of its timeout,"
-            f" while {found}; set a longer operator.task.timeout, or see what held it up"
+            f" while {found}; set a longer operator.task.timeout, or find the cause"
         )
     return (
-        f"the operator gave up at {at:.2f} s, for it saw the tool far beyond the surface and felt"
-        f" nothing, {_force_and_place(result, scenario, task, ended)}"
+        f"the operator gave up at {at:.2f} s: it saw the tool far beyond the surface and detected"
+        f" no contact, {_force_and_position_text(result, scenario, task, ended)}"
     )
 
 
-def _ended(result: SimulationResult) -> int:
-    """The sample at which the operator has done its task or given up, or the last one."""
+def _end_sample(result: SimulationResult) -> int:
     outcome = result["task_state"][:, DONE]
     return int(np.argmax(outcome != 0.0)) if outcome.any() else len(outcome) - 1
 
 
-def _wanted_force(task: Task) -> float:
+def _required_force(task: Task) -> float:
     if isinstance(task, Press):
         return task.force
     return task.push if isinstance(task, Insert) else 0.0
 
 
 def contact_force(result: SimulationResult) -> Array:
-    """(N,) size of the true contact force at the tool [N]; zeros if there is nothing to touch."""
+    """Return (N,) magnitude of the true contact force at the tool [N]; zeros without contact."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t))
     return np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """From the first contact until it is noticed [s]; nan if there is none, or it never is."""
+    """Return the time from first contact to its detection [s]; nan if there is none."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))
@@ -167,21 +159,20 @@ def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bo
     return float(t[contact + int(np.argmax(after))] - t[contact]) if after.any() else math.nan
 
 
-def _false_notices(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
+def _count_false_detections(touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> int:
     before = int(np.argmax(touching)) if touching.any() else len(touching)
     return int(np.count_nonzero(np.diff(noticed[:before].astype(int), prepend=0) == 1))
 
 
-def _held(t: Array, force: Array, task: Press, ended: int) -> Array:
-    """The true force in the time for which the operator believed to hold it."""
+def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
     return force[: ended + 1][t[: ended + 1] >= t[ended] - task.hold]
 
 
-def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    """What is not as the operator believes when it believes that it is done; "" if nothing is."""
+def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
+    """Return the violated success criterion as text, or ""."""
     force = contact_force(result)
     if isinstance(task, Press):
-        held = float(_held(result.t, force, task, ended).mean())
+        held = float(_held_force(result.t, force, task, ended).mean())
         if abs(held - task.force) <= task.tolerance:
             return ""
         return f"the tool pressed with {held:.2f} N, not {task.force:g} ± {task.tolerance:g} N"
@@ -190,7 +181,11 @@ def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int)
     off = _tip_from_target(result, scenario, task, ended)
     if isinstance(task, Insert):
         above = off[2] + task.depth
-        return "" if above <= _ON_THE_FLOOR else f"the tip is {1e3 * above:.1f} mm above the floor"
+        return (
+            ""
+            if above <= _FLOOR_TOLERANCE_M
+            else f"the tip is {1e3 * above:.1f} mm above the floor"
+        )
     away = float(np.linalg.norm(off))
     if isinstance(task, Touch):
         return f"the tool touches nothing, the tip {1e3 * away:.1f} mm from the target"
@@ -199,17 +194,18 @@ def _wrong(result: SimulationResult, scenario: Scenario, task: Task, ended: int)
     return f"the tip is {1e3 * away:.1f} mm from the target, not {500 * task.width:g} mm"
 
 
-def _force_and_place(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
+def _force_and_position_text(
+    result: SimulationResult, scenario: Scenario, task: Task, ended: int
+) -> str:
     away = 1e3 * np.linalg.norm(_tip_from_target(result, scenario, task, ended))
     place = f"the tip {away:.1f} mm from the target"
     if isinstance(task, Reach):
         return place
-    wanted = f" instead of {_wanted_force(task):g} N" if _wanted_force(task) else ""
+    wanted = f" instead of {_required_force(task):g} N" if _required_force(task) else ""
     return f"{place}, {contact_force(result)[ended]:.1f} N at the tool{wanted}"
 
 
 def _tip_from_target(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> Array:
-    """(3,) from the target to the tool's tip, in W [m]."""
     slave = NominalSlave(scenario.slave)
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(

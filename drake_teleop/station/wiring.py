@@ -1,4 +1,4 @@
-"""How ports of blocks and sides are exported, wired and recorded; what is missing is one error."""
+"""Export, connection and recording of ports, with one error for missing ports."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import sample_parts
 from drake_teleop.station.signals import LOG, POSE_OF, SIGNALS
 
-#: Ports that hold several signals side by side, in the order of `SIGNALS`: to read one port takes
-#: less time than to read its parts.
-TOGETHER = {
+#: Ports with several signals, in the order of `SIGNALS`: reading one port is faster than its parts.
+COMBINED_PORTS = {
     "sample": (*sample_parts(0), "sample_time"),
     "scaled_contact_and_fault": ("scaled_wrench_S", "contact_wrench_S", "fault"),
     "displayed_and_fault": ("force_to_master", "fault_at_hand"),
@@ -22,16 +21,16 @@ TOGETHER = {
 
 
 def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
-    """Exports output ports of a block: under their own names, or as `exported="its port"`."""
+    """Export output ports of a block under their own names, or as `exported="its port"`."""
     for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
         builder.ExportOutput(block.GetOutputPort(port), name)
 
 
 def wire(builder: DiagramBuilder, source: System, name: str, target: System, entry: str) -> None:
-    """Connects the output port `name` of one side to the input port `entry` of another.
+    """Connect output port `name` of one side to input port `entry` of another.
 
     Raises:
-        DrakeTeleopError: if a side, which may be somebody's own, lacks it or has another size.
+        DrakeTeleopError: if a side lacks the port or the sizes differ.
     """
     output = source.HasOutputPort(name) and source.GetOutputPort(name)
     port = target.HasInputPort(entry) and target.GetInputPort(entry)
@@ -48,9 +47,9 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 
 
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Exports and records every port that is a signal, in the order of `SIGNALS`, then poses.
+    """Export and record every port that is a signal, in the order of `SIGNALS`, then poses.
 
-    What lies side by side in one port of a side (`TOGETHER`) is recorded from there.
+    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from there.
     """
     outputs = {
         port.get_name(): port
@@ -61,9 +60,11 @@ def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz:
     signals += [name for name in outputs if name.startswith(POSE_OF)]
     for name in signals:
         builder.ExportOutput(outputs[name], name)
-    wide = {part: port for port, parts in TOGETHER.items() if port in outputs for part in parts}
+    wide = {
+        part: port for port, parts in COMBINED_PORTS.items() if port in outputs for part in parts
+    }
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
-    # One wide log: at 8 kHz each further system with events of its own costs time at every step.
+    # One wide log: at 8 kHz each system with own events costs time at every step.
     row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
     for index, port in enumerate(ports):
         builder.Connect(port, row.get_input_port(index))

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from operator_motion import intent_at
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.lab.analysis.frequency_response import (
@@ -14,7 +15,6 @@ from drake_teleop.lab.analysis.frequency_response import (
 )
 from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.identification import slave_arm
-from drake_teleop.station.operator.operator import intent_at
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
 UP = (0.0, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The Phantom's closed forms, its dynamics and its end stops."""
+"""Kinematics, dynamics and end stops of the Phantom."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_FRICTION = JointFriction(coulomb=[0.0] * 6, viscous=[0.0] * 6)
 
 
 def random_postures(count: int, seed: int = 0) -> np.ndarray:
-    """Postures inside the joint limits, the five-bar's included."""
+    """Return postures inside all joint limits, including the five-bar's."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(phantom.JOINT_LOWER, phantom.JOINT_UPPER, (40 * count, 6))
     lower, upper = phantom.FIVE_BAR_RANGE
@@ -36,10 +36,29 @@ def acceleration(q, v, wrench, torque, parameters) -> np.ndarray:
     return vdot
 
 
+def main_mass_matrix(q) -> np.ndarray:
+    """Return the mass matrix (3, 3) of the main axes without wrist, motors and hand."""
+    M = np.empty((6, 6))
+    phantom._main_mass_matrix_into(q, M)
+    return M[:3, :3]
+
+
+def main_gravity(q) -> np.ndarray:
+    """Return the gravity torque (3,) of the main axes without wrist."""
+    return np.array([0.0, phantom._GRAVITY_2 * np.cos(q[1]), phantom._GRAVITY_3 * np.sin(q[2])])
+
+
+def potential_energy(q) -> float:
+    """Return the potential energy of device and wrist [J]."""
+    weight = phantom.WRIST_MASS * phantom.GRAVITY
+    height = (phantom._GRAVITY_2 + weight * phantom.L1) * np.sin(q[1])
+    return height - (phantom._GRAVITY_3 + weight * phantom.L2) * np.cos(q[2])
+
+
 def energy(state, hand_mass=0.0, hand_inertia=0.0) -> float:
     q, v = state[:6], state[6:]
     M = phantom.mass_matrix(q, hand_mass, hand_inertia)
-    return 0.5 * v @ M @ v + phantom.potential_energy(q)
+    return 0.5 * v @ M @ v + potential_energy(q)
 
 
 def advance(state, wrench, torque, parameters, period, steps) -> np.ndarray:
@@ -82,11 +101,11 @@ def test_main_axes_equal_the_closed_forms_of_the_literature():
             g / 2 * (2 * l1 * ma + 2 * l5 * mbe + l1 * mc) * np.cos(q2),
             g / 2 * (l2 * ma + 2 * l3 * mc - 2 * l6 * mdf) * np.sin(q3),
         ]
-        np.testing.assert_allclose(phantom.closed_form_mass_matrix(q), expected, atol=1e-15)
-        np.testing.assert_allclose(phantom.closed_form_gravity(q), gravity, atol=1e-15)
+        np.testing.assert_allclose(main_mass_matrix(q), expected, atol=1e-15)
+        np.testing.assert_allclose(main_gravity(q), gravity, atol=1e-15)
 
 
-def test_home_is_the_stylus_level_and_towards_the_operator():
+def test_stylus_is_level_and_points_to_operator_at_home():
     np.testing.assert_allclose(
         phantom.forward_kinematics(phantom.HOME), [1, 0, 0, 0, 0.215, 0, -0.170], atol=1e-15
     )
@@ -139,7 +158,7 @@ def test_inverse_kinematics_returns_the_joint_angles():
         ([0.05, 0.0, 0.0], "joint 3"),
     ],
 )
-def test_a_start_pose_out_of_reach_is_refused(position, message):
+def test_start_pose_out_of_reach_is_rejected(position, message):
     with pytest.raises(DrakeTeleopError, match=message):
         phantom.inverse_kinematics(np.array([1.0, 0, 0, 0, *position]))
 
@@ -151,7 +170,7 @@ def test_mass_matrix_is_positive_definite_over_the_workspace():
         assert np.linalg.eigvalsh(M)[0] > 1e-5
 
 
-def test_hand_adds_its_kinetic_energy_and_nothing_else():
+def test_hand_adds_only_its_kinetic_energy():
     rng = np.random.default_rng(1)
     for q in random_postures(20):
         v = rng.normal(size=6)
@@ -161,13 +180,13 @@ def test_hand_adds_its_kinetic_energy_and_nothing_else():
         assert v @ added @ v == pytest.approx(expected, rel=1e-12)
 
 
-def test_wrist_is_a_point_mass_and_three_turning_links():
+def test_wrist_is_a_point_mass_and_three_rotating_links():
     rng = np.random.default_rng(2)
     for q in random_postures(20):
         v = rng.normal(size=6)
         J = phantom.jacobian(q)
         main = np.zeros((6, 6))
-        main[:3, :3] = phantom.closed_form_mass_matrix(q)
+        main[:3, :3] = main_mass_matrix(q)
         motors = np.array([13.3, 11.2, 11.2]) ** 2 * 1.08e-6
         expected = v @ main @ v + motors @ v[:3] ** 2 + 0.15 * np.sum((J[:3] @ v) ** 2)
         for last in (4, 5, 6):
@@ -179,17 +198,16 @@ def test_gravity_is_the_gradient_of_the_potential_energy():
     step = 1e-5
     for q in random_postures(20):
         gradient = [
-            (phantom.potential_energy(q + step * e) - phantom.potential_energy(q - step * e))
-            / (2 * step)
+            (potential_energy(q + step * e) - potential_energy(q - step * e)) / (2 * step)
             for e in np.eye(6)
         ]
         np.testing.assert_allclose(phantom.gravity_torque(q), gradient, atol=1e-9)
-        wrist = phantom.gravity_torque(q)[:3] - phantom.closed_form_gravity(q)
+        wrist = phantom.gravity_torque(q)[:3] - main_gravity(q)
         np.testing.assert_allclose(wrist, 0.15 * 9.81 * phantom.jacobian(q)[2, :3], atol=1e-15)
 
 
 def test_coriolis_follows_from_the_mass_matrix():
-    """Christoffel symbols of the whole M, hand and wrist included, differentiated numerically."""
+    """Compare with numerically differentiated Christoffel symbols, with hand and wrist."""
     rng = np.random.default_rng(3)
     hand = (0.25, 2e-4)
     step = 1e-5
@@ -233,7 +251,7 @@ def test_energy_is_conserved_in_free_motion_to_fourth_order():
     assert energy(at_hand_rate) == pytest.approx(energy(free_state()), abs=1e-9)
 
 
-def test_friction_only_takes_energy_away():
+def test_friction_dissipates_energy():
     friction = parameters(friction=JointFriction())
     torque = np.zeros(6)
     state = free_state()
@@ -243,8 +261,8 @@ def test_friction_only_takes_energy_away():
         state = after
 
 
-def test_work_of_held_inputs_becomes_energy():
-    """A constant torque and a constant force in B have potentials: the balance is exact."""
+def test_energy_balance_with_held_inputs():
+    """A constant torque and a constant force in B have potentials, so the balance is exact."""
     rng = np.random.default_rng(5)
     hand = (0.25, 2e-4)
     torque = 0.1 * rng.normal(size=6) * [1, 1, 1, 0.02, 0.02, 0.02]
@@ -258,8 +276,8 @@ def test_work_of_held_inputs_becomes_energy():
     assert gained == pytest.approx(work, abs=1e-9)
 
 
-def test_a_hand_wrench_equals_its_joint_torque():
-    """Virtual work: F at E and J^T F at the joints accelerate the device alike."""
+def test_hand_wrench_equals_its_joint_torque():
+    """Virtual work: F at E and J^T F at the joints give equal accelerations."""
     rng = np.random.default_rng(6)
     for q in random_postures(20):
         v, wrench = rng.normal(size=6), rng.normal(size=6)
@@ -273,7 +291,7 @@ STOPS = [(0, -1), (0, 1), (1, 1), (2, -1), (3, -1), (3, 1), (4, -1), (4, 1), (5,
 
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
-def test_a_joint_stops_at_its_limit(joint, side):
+def test_joint_stops_at_its_limit(joint, side):
     limit = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint]
     q = phantom.HOME.copy()
     q[joint] = limit - side * 0.02
@@ -294,7 +312,7 @@ def test_a_joint_stops_at_its_limit(joint, side):
 
 
 @pytest.mark.parametrize(("joint", "side"), STOPS)
-def test_an_end_stop_pushes_back_and_never_pulls(joint, side):
+def test_end_stop_pushes_but_never_pulls(joint, side):
     q = phantom.HOME.copy()
     q[joint] = (phantom.JOINT_UPPER if side > 0 else phantom.JOINT_LOWER)[joint] + side * 0.01
     if joint in (1, 2):
@@ -357,7 +375,7 @@ def test_ports_agree_with_the_state():
     np.testing.assert_allclose(result["twist_master"], phantom.jacobian(q) @ v, atol=1e-14)
 
 
-def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
+def test_long_period_or_start_beyond_limit_is_rejected():
     with pytest.raises(DrakeTeleopError, match=r"master\.period"):
         device.MasterDevice(2e-3, Master().device(0.1, 1e-4), phantom.HOME)
     with pytest.raises(DrakeTeleopError, match="joint 1"):
@@ -365,8 +383,8 @@ def test_a_slow_period_or_a_start_beyond_a_limit_is_refused():
 
 
 @pytest.mark.parametrize(("name", "slope"), [("viscous", 1.0), ("coulomb", 0.01)])
-def test_friction_that_the_step_cannot_follow_is_refused(name, slope):
-    """The wrist's last joint turns 1.5e-4 kg m^2, of which a step of 0.5 ms follows 0.6 N m s."""
+def test_friction_too_large_for_the_step_is_rejected(name, slope):
+    """The last wrist joint has 1.5e-4 kg m^2: a step of 0.5 ms allows 0.6 N m s."""
 
     def made(last):
         friction = JointFriction(**{name: [*[0.0] * 5, slope * last]})
@@ -378,7 +396,7 @@ def test_friction_that_the_step_cannot_follow_is_refused(name, slope):
         made(0.7)
 
 
-def test_serial_joint_angles_turn_the_outer_link_relative_to_the_inner():
+def test_serial_joint_angles_are_relative_to_the_inner_link():
     q = np.array([[0.1, 0.2, 0.5, 0.4, 0.5, 0.6], [0.0, -0.3, 0.1, 0.0, 0.0, 0.0]])
     expected = [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6], [0.0, -0.3, 0.4, 0.0, 0.0, 0.0]]
     np.testing.assert_allclose(phantom.serial_joint_angles(q), expected, atol=1e-15)

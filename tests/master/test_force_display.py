@@ -1,4 +1,4 @@
-"""J_M^T, the device's limits, the safe state."""
+"""Force display: J_M^T, limits of the device, safe state."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POSTURES = [
 
 
 def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
-    """The block's outputs (motor torque, displayed wrench)."""
+    """Return the block's outputs: motor torque, displayed wrench."""
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     block.GetInputPort("wrench_command").FixValue(context, np.asarray(wrench, dtype=float))
@@ -34,8 +34,8 @@ def display(wrench, q) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("q", POSTURES)
-def test_torque_does_the_virtual_work_of_the_wrench(q):
-    """delta W = F . delta x for small displacements, delta x from the forward kinematics."""
+def test_torque_has_the_virtual_work_of_the_wrench(q):
+    """delta W = F . delta x for small displacements from the forward kinematics."""
     wrench = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
     torque, displayed = display(wrench, q)
     np.testing.assert_array_equal(displayed, wrench)
@@ -53,14 +53,14 @@ def test_torque_does_the_virtual_work_of_the_wrench(q):
 
 
 @pytest.mark.parametrize("q", POSTURES)
-def test_no_command_leaves_the_gravity_compensation(q):
+def test_zero_command_gives_gravity_compensation(q):
     torque, displayed = display(np.zeros(6), q)
     np.testing.assert_allclose(torque, phantom.gravity_torque(q), atol=1e-15)
     np.testing.assert_array_equal(displayed, 0)
 
 
 @pytest.mark.parametrize("q", POSTURES)
-def test_limits_keep_the_direction(q):
+def test_limited_wrench_keeps_its_direction(q):
     wrench = np.array([300.0, -200.0, 500.0, 5.0, -2.0, 3.0])
     torque, displayed = display(wrench, q)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5, rel=1e-12)
@@ -76,7 +76,7 @@ def test_limits_keep_the_direction(q):
     np.testing.assert_array_equal(display(-wrench, q)[1], -displayed)
 
 
-def test_force_and_torque_are_limited_apart():
+def test_force_and_torque_are_limited_separately():
     _, displayed = display([0, 0, 100.0, 0.01, 0, 0], phantom.HOME)
     np.testing.assert_allclose(displayed, [0, 0, 37.5, 0.01, 0, 0], rtol=1e-12)
     _, displayed = display([0, 0, 10.0, 0.34, 0.1, 0], phantom.HOME)
@@ -85,7 +85,7 @@ def test_force_and_torque_are_limited_apart():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("index", range(6))
-def test_a_command_that_is_not_finite_displays_nothing(bad, index):
+def test_command_that_is_not_finite_displays_zero(bad, index):
     wrench = np.ones(6)
     wrench[index] = bad
     torque, displayed = display(wrench, POSTURES[1])
@@ -93,7 +93,7 @@ def test_a_command_that_is_not_finite_displays_nothing(bad, index):
     np.testing.assert_allclose(torque, phantom.gravity_torque(POSTURES[1]), atol=1e-15)
 
 
-def test_the_fault_has_a_port_of_its_own_and_stands_beside_what_is_displayed():
+def test_fault_has_its_own_port_and_a_combined_one():
     block = ForceDisplay(PERIOD, DEVICE)
     context = block.CreateDefaultContext()
     start = initial_display(POSTURES[1], DEVICE.numbers)
@@ -106,7 +106,7 @@ def test_the_fault_has_a_port_of_its_own_and_stands_beside_what_is_displayed():
         np.testing.assert_array_equal(both, [*force, fault])
 
 
-def test_a_huge_command_is_limited_too_and_one_that_is_no_wrench_is_none():
+def test_huge_command_is_limited_and_invalid_command_is_zero():
     _, displayed = display([1e6, 1e6, 0, 0, 0, 1e6], phantom.HOME)
     assert np.linalg.norm(displayed[:3]) == pytest.approx(37.5)
     assert displayed[5] == pytest.approx(0.515)
@@ -117,7 +117,7 @@ WRENCH = np.array([3.0, -2.0, 5.0, 0.05, -0.02, 0.03])
 
 
 def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 7) displayed wrench and fault, (N, 6) torque, one period after the other."""
+    """Return (N, 7) displayed wrench and fault, and (N, 6) torque, per period."""
     device, J, drive = initial_display(POSTURES[1], DEVICE.numbers), np.empty((6, 6)), np.empty(27)
     shown, torque = np.empty((len(commands), 7)), np.empty((len(commands), 6))
     for k, (command, q) in enumerate(zip(commands, angles, strict=True)):
@@ -129,8 +129,8 @@ def displayed_over(commands, angles) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("part", ["wrench", "angles"])
-def test_what_was_displayed_fades_and_comes_back_without_a_step(part):
-    """From 20 to 80 ms one number is none; the hand is pushed by 6 N, held up all the time."""
+def test_wrench_fades_and_returns_without_a_step(part):
+    """One value is NaN from 20 to 80 ms; the command is 6 N."""
     n, bad = 2600, slice(40, 160)
     commands, angles = np.tile(WRENCH, (n, 1)), np.tile(POSTURES[1], (n, 1))
     {"wrench": commands, "angles": angles}[part][bad, 2] = np.nan
@@ -149,8 +149,8 @@ def test_what_was_displayed_fades_and_comes_back_without_a_step(part):
     assert (fault[160:1160] == Fault.RESUMING).all()
 
 
-def test_the_torque_comes_back_to_what_the_strongest_motor_bears():
-    """0.3 N m, which the first wrist motor alone holds: no step when the last is at its limit."""
+def test_torque_returns_to_the_limit_of_the_strongest_motor():
+    """Only the first wrist motor can display 0.3 N m: no step when the last is at its limit."""
     motors = np.array([0.3, 0.0, 0.0])
     torque = np.linalg.solve(phantom.jacobian(POSTURES[1])[3:, 3:].T, motors)
     commands = np.tile(np.r_[np.zeros(3), torque], (2600, 1))

@@ -1,4 +1,4 @@
-"""A leader that leads joint by joint: two arms of the same kinematics, of different sizes."""
+"""Leader arm in joint mode: two arms with equal kinematics and different sizes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SCALE, FORCE = 2.0, 0.25  # lengths, slave over leader; forces, leader over slav
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory):
-    """The slave is the leader's model in twice its size, with motors for that."""
+    """Return a scenario whose slave is the leader's model, twice as large."""
     path = tmp_path_factory.mktemp("arms") / "slave.urdf"
 
     def larger(match):
@@ -63,7 +63,7 @@ def run(scenario):
     return simulate(station, scenario.simulation, progress=False)
 
 
-def test_each_joint_follows_its_own(scenario):
+def test_each_slave_joint_follows_its_leader_joint(scenario):
     move = Sine(duration=1.0, ramp=0.02, frequency=4.0, translation=[0.03, 0.02, 0.03],
                 rotation=[0.2, -0.1, 0.3])  # fmt: skip
     result = run(replace(scenario, operator__intent=[move]))
@@ -77,8 +77,8 @@ def test_each_joint_follows_its_own(scenario):
     np.testing.assert_allclose(moved, SCALE * hand, rtol=1e-6, atol=1e-9)
 
 
-def test_the_hand_feels_sigma_of_the_load_along_the_axes_of_the_tool(scenario):
-    """Scaled, in world axes; and J^T of the leader is that of the slave but for its size."""
+def test_rendered_load_is_scaled_by_sigma_in_tool_axes(scenario):
+    """J^T of the leader equals that of the slave except for its size."""
     result = run(scenario)
     felt, measured = (result[name][-1].copy() for name in ("force_to_master", "measured_wrench_S"))
     slave, device = NominalSlave(scenario.slave), scenario.master.device(0.0, 0.0)
@@ -94,7 +94,7 @@ def test_the_hand_feels_sigma_of_the_load_along_the_axes_of_the_tool(scenario):
     np.testing.assert_allclose(device.jacobian(q), size * J, atol=1e-12)
 
 
-def test_a_clutch_that_is_open_holds_and_one_that_closes_leads_back(scenario):
+def test_open_clutch_holds_and_closed_clutch_returns(scenario):
     slave = NominalSlave(scenario.slave)
     start = slave.start + np.linspace(-0.1, 0.2, 6)
     coupling = JointCoupling(slave.arm, start, np.array(HOME), 0.01)
@@ -111,7 +111,7 @@ def test_a_clutch_that_is_open_holds_and_one_that_closes_leads_back(scenario):
     np.testing.assert_allclose(joints.Eval(context), start + 0.1)
 
 
-def test_the_follower_keeps_limits_and_speeds(scenario):
+def test_follower_respects_position_and_speed_limits(scenario):
     slave = NominalSlave(scenario.slave)
     follower = JointFollower(slave.arm, slave.start, 0.001)
     context = follower.CreateDefaultContext()
@@ -128,15 +128,15 @@ def test_the_follower_keeps_limits_and_speeds(scenario):
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel carries poses"),
+        ({"channel": Channel(delay=0.01)}, "master.leader.leads: a channel transmits poses"),
         ({"slave__sensor_frame": "wrist_2", "slave__home": HOME[:5]}, "has 6 joints, the slave 5"),
     ],
 )
-def test_what_cannot_be_led(scenario, change, expected):
+def test_unsupported_joint_mode_is_rejected(scenario, change, expected):
     with pytest.raises(DrakeTeleopError, match=expected):
         MakeTeleopStation(replace(scenario, **change), load_estimate=true_load(scenario))
 
 
-def test_the_analysis_knows_poses_alone(scenario):
+def test_analysis_rejects_joint_mode(scenario):
     with pytest.raises(DrakeTeleopError, match=r"master\.leader\.leads"):
         linearize(scenario, load_estimate=true_load(scenario))

@@ -1,4 +1,4 @@
-"""A leader arm as a haptic device: its motion, what the hand feels, its limits, its file."""
+"""A leader arm as a haptic device: motion, rendered wrench, limits, file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def leader(hand=HAND, **changes):
 
 
 class Held:
-    """Device and display, wired; one call is one period."""
+    """Connected device and display; one call is one period."""
 
     def __init__(self, device):
         builder = DiagramBuilder()
@@ -67,8 +67,8 @@ class Held:
         return np.array(self.block.GetOutputPort(port).Eval(context))
 
 
-def test_it_moves_as_drakes_plant_of_its_file():
-    """With the same torques, and the hand's force where the hand is; the hand has no mass here."""
+def test_motion_equals_drakes_plant_of_the_file():
+    """Equal torques and hand force; the hand has no mass here."""
     device = leader(hand=(0.0, 0.0), damping=[0.01])
     held = Held(device)
     plant = MultibodyPlant(0.0)
@@ -117,8 +117,8 @@ def test_it_moves_as_drakes_plant_of_its_file():
     np.testing.assert_allclose(pose[:4], turned * np.sign(turned[0]), atol=1e-9)
 
 
-def test_the_hand_holds_what_is_displayed_and_nothing_else():
-    """Neither the arm's weight nor that of its own mass; in any posture of the base."""
+def test_hand_holds_only_the_displayed_wrench():
+    """The hand carries neither the arm's weight nor its own, for any base orientation."""
     held = Held(leader(friction=[0.0]))
     for _ in range(40):
         np.testing.assert_allclose(held.step(-F, F), F, rtol=1e-12)
@@ -129,8 +129,8 @@ def test_the_hand_holds_what_is_displayed_and_nothing_else():
     assert heavy.get("twist_master")[2] < -0.01
 
 
-def test_the_work_of_hand_and_motors_is_its_energy_and_what_friction_takes():
-    """Energy of motion, for the motors carry its weight; loss in the model's damping and this."""
+def test_work_of_hand_and_motors_equals_energy_plus_friction():
+    """Kinetic energy only, because the motors carry the weight."""
     device = leader(friction=[0.01], damping=[0.02])
     held, work, lost = Held(device), 0.0, 0.0
     before = np.zeros(12)
@@ -149,7 +149,7 @@ def test_the_work_of_hand_and_motors_is_its_energy_and_what_friction_takes():
     assert energy + lost == pytest.approx(work, rel=3e-3)
 
 
-def test_beyond_its_motors_it_displays_what_they_give_and_says_so():
+def test_wrench_is_limited_by_the_motors_and_logged():
     device = leader(torque_limit=[0.9])
     held = Held(device)
     shown = held.step(np.zeros(6), 5 * F)
@@ -164,7 +164,7 @@ def test_beyond_its_motors_it_displays_what_they_give_and_says_so():
     assert np.abs(torque).max() == pytest.approx(0.9, rel=1e-9)
 
 
-def test_its_joints_end_in_stops():
+def test_joints_have_end_stops():
     held = Held(leader(hand=(0.2, 1e-3)))
     for _ in range(800):
         held.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.3]), np.zeros(6))
@@ -179,7 +179,7 @@ def test_its_joints_end_in_stops():
     ]
 
 
-def test_its_inverse_kinematics_and_matrices_are_those_of_a_device():
+def test_inverse_kinematics_and_matrices_are_consistent():
     device = leader()
     q = device.home + 0.1
     back = device.inverse_kinematics(device.forward_kinematics(q))
@@ -194,7 +194,7 @@ def test_its_inverse_kinematics_and_matrices_are_those_of_a_device():
     assert (np.linalg.eigvalsh(M - leader(hand=(0.0, 0.0)).mass_matrix(q)) > -1e-12).all()
 
 
-def test_a_station_has_its_ports_and_a_file_is_found_from_the_scenarios(tmp_path):
+def test_station_ports_and_file_path_relative_to_scenario(tmp_path):
     (tmp_path / "arm.urdf").write_bytes((models_dir() / "leader_arm.urdf").read_bytes())
     (tmp_path / "mine.yaml").write_text(
         f"master: {{model: leader, leader: {{file: arm.urdf, hand_frame: hand, home: {HOME}}}}}\n"
@@ -211,7 +211,7 @@ def test_a_station_has_its_ports_and_a_file_is_found_from_the_scenarios(tmp_path
     ("leader", "said"),
     [
         (None, "master.leader: a leader arm and `model: leader` belong together"),
-        (Leader(hand_frame="hand"), "master.leader.file: a leader arm needs it"),
+        (Leader(hand_frame="hand"), "master.leader.file: is required for a leader arm"),
         (dataclasses.replace(LEADER, friction=[-1.0]), "master.leader.friction: has to be"),
         (dataclasses.replace(LEADER, home=[0.0]), "master.leader.home: has 1 numbers"),
         (dataclasses.replace(LEADER, hand_frame="elbow"), "no frames are named 'elbow'"),
@@ -219,7 +219,7 @@ def test_a_station_has_its_ports_and_a_file_is_found_from_the_scenarios(tmp_path
         (dataclasses.replace(LEADER, friction=[1.0]), "the friction stops the device"),
     ],
 )
-def test_what_cannot_be_is_one_error(leader, said):
+def test_invalid_leader_gives_one_error(leader, said):
     scenario = replace(Scenario(), master=Master(model="leader", leader=leader))
     with pytest.raises(DrakeTeleopError, match=re.escape(said)):
         MakeMasterSide(scenario)

@@ -1,4 +1,4 @@
-"""The SDF of the Phantom against the closed forms of the device."""
+"""The SDF of the Phantom compared with the closed forms."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def plant() -> MultibodyPlant:
 
 
 def postures() -> np.ndarray:
-    """Postures clear of the end stops."""
+    """Return postures inside the end stops."""
     return np.random.default_rng(0).uniform(-0.45, [1.0, 0.45, 0.5, 1.5, 1.5, 1.5], (30, 6))
 
 
@@ -43,7 +43,7 @@ def test_sdf_has_the_kinematics_of_the_device(plant):
 
 
 def test_sdf_has_the_mass_matrix_and_coriolis_forces_of_the_device(plant):
-    """Drake's multibody dynamics as an independent check of the closed forms."""
+    """Drake's multibody dynamics check the closed forms independently."""
     rng = np.random.default_rng(1)
     context = plant.CreateDefaultContext()
     no_friction = np.zeros(14)

@@ -1,4 +1,4 @@
-"""A haptic device by its data sheet."""
+"""Haptic devices in task space, by data sheet."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def test_the_jacobian_is_the_derivative_of_the_pose():
     np.testing.assert_allclose(omega.inverse_kinematics(omega.forward_kinematics(Q)), Q, atol=1e-12)
 
 
-def test_free_it_keeps_its_velocity_and_its_angular_velocity():
-    """A body whose inertia is the same about every axis, whatever the angles do."""
+def test_free_device_keeps_velocity_and_angular_velocity():
+    """The inertia is isotropic, for any joint angles."""
     omega = smooth()
     start = np.concatenate([Q, 0.1 * V])
     after = advance(omega, start, np.zeros(6), np.zeros(6), 200)
@@ -69,7 +69,7 @@ def test_free_it_keeps_its_velocity_and_its_angular_velocity():
 
 
 def test_hand_and_motors_accelerate_the_mass_on_the_data_sheet():
-    """F = m a and tau = I alpha at E in B, by the hand and by J^T F of the motors alike."""
+    """F = m a and tau = I alpha at E in B, for the hand and for J^T F of the motors."""
     omega = smooth(apparent_mass=0.3, inertia=2e-4)
     wrench = np.array([0.3, -0.2, 0.1, 1e-3, -2e-3, 3e-3])
     start = np.concatenate([Q, np.zeros(6)])
@@ -82,7 +82,7 @@ def test_hand_and_motors_accelerate_the_mass_on_the_data_sheet():
     np.testing.assert_allclose(omega.mass_matrix(Q), M, atol=1e-15)
 
 
-def test_friction_is_against_the_motion_and_the_same_in_every_direction():
+def test_friction_is_isotropic_and_opposes_motion():
     omega = device(friction=0.3, damping=2.0, friction_torque=1e-3, turning_damping=1e-4)
     rate = np.linalg.solve(omega.jacobian(Q), V)  # twist V
     after = advance(omega, np.concatenate([Q, rate]), np.zeros(6), np.zeros(6), 1, period=1e-5)
@@ -97,7 +97,7 @@ def test_friction_is_against_the_motion_and_the_same_in_every_direction():
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_it_ends_where_the_workspace_ends(axis):
+def test_end_stops_are_at_the_workspace_limits(axis):
     touch = device("geomagic_touch")
     figures, side = FIGURES["geomagic_touch"], (-1.0) ** axis
     end = np.append(0.5 * np.array(figures.size), figures.turn)[axis]
@@ -115,7 +115,7 @@ def test_it_ends_where_the_workspace_ends(axis):
         MasterDevice(PERIOD, touch, centre + 1.01 * side * end * np.eye(6)[axis])
 
 
-def test_the_end_of_the_workspace_is_said_and_no_start_beyond_it():
+def test_end_of_workspace_is_reported_and_start_beyond_rejected():
     fixed, omega = device("omega_3"), device("omega_6")
     inside = np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
     turned, aside = inside + 2.9 * np.eye(6)[5], inside + 0.06 * np.eye(6)[1]
@@ -129,7 +129,7 @@ def test_the_end_of_the_workspace_is_said_and_no_start_beyond_it():
             omega.inverse_kinematics(omega.forward_kinematics(pose))
 
 
-def test_what_is_not_actuated_displays_nothing():
+def test_unactuated_axes_display_zero():
     for model, force, torque in (("geomagic_touch", 3.3, 0.0), ("virtuose_6d", 35.0, 3.1)):
         numbers, q = device(model).numbers, np.array([0.27, 0.0, 0.03, 0.0, 0.0, 0.0])
         start, drive = initial_display(q, numbers), np.empty(27)
@@ -139,7 +139,7 @@ def test_what_is_not_actuated_displays_nothing():
         np.testing.assert_allclose(drive[:6], drive[12:18], atol=1e-12)  # no weight to hold
 
 
-def test_a_file_names_the_device_and_changes_what_it_likes():
+def test_file_selects_device_and_overrides_figures():
     scenario = ScenarioFromData(
         {"master": {"model": "omega_3", "figures": {"friction": 0.1}}}, "mine.yaml"
     )
@@ -164,8 +164,8 @@ def test_a_file_names_the_device_and_changes_what_it_likes():
 
 
 @pytest.mark.parametrize("model", ["geomagic_touch", "omega_6"])
-def test_a_station_feels_what_its_device_can_display(model):
-    """The paper's contact with another device: the wall is touched, the force is within limits."""
+def test_station_force_is_within_the_device_limits(model):
+    """The paper's contact scenario with another device."""
     paper = LoadScenario("contact_transition")
     scenario = replace(
         paper, master=Master(model=model), simulation__duration=0.6, force_scaling__sigma=1.0
@@ -181,7 +181,7 @@ def test_a_station_feels_what_its_device_can_display(model):
 
 
 def test_encoders_count_whole_steps_from_the_start():
-    """Position and turns each in their own; what moves by less than half a step is not seen."""
+    """Motion below half a step is not visible."""
     omega, steps = device(), np.repeat([1e-3, 0.01], 3)
     pose = np.empty(7)
     for away, counts in ((0.4, 0.0), (0.6, 1.0), (-2.3, -2.0)):
@@ -191,8 +191,8 @@ def test_encoders_count_whole_steps_from_the_start():
     np.testing.assert_allclose(pose, omega.forward_kinematics(Q + V), atol=1e-12)
 
 
-def test_a_slower_device_is_read_and_takes_a_force_at_its_own_rate():
-    """Command and force are held for 2 ms; the hand's own pose is not."""
+def test_slow_device_holds_reading_and_force_at_its_rate():
+    """Command and force are held for 2 ms, but not the pose of the hand."""
     slow = dataclasses.replace(FIGURES["falcon"], rate_hz=500.0)
     move = Sine(duration=10.0, ramp=0.05, frequency=3.0, translation=[0.01, 0.01, 0.02])
     scenario = replace(

@@ -1,4 +1,4 @@
-"""The operator's intent and the impedance of the hand."""
+"""Intent and hand impedance of the operator."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from operator_motion import intent_at
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RotationMatrix
@@ -24,7 +25,6 @@ from drake_teleop.station.operator.operator import (
     OperatorConfig,
     Sine,
     hand_wrench_into,
-    intent_at,
 )
 
 START = phantom.forward_kinematics(phantom.HOME)
@@ -101,8 +101,8 @@ def test_minimum_jerk_peaks_at_fifteen_eighths_of_the_mean_speed():
     assert twists[0, 0] == pytest.approx(15 / 8 * 0.1 / 0.4)
 
 
-def test_two_sines_make_every_other_bottom_deeper():
-    """The contact experiment: the tip dips at 220 ms and stays clear one swing later."""
+def test_second_sine_makes_every_other_minimum_deeper():
+    """Contact experiment: the tip touches at 220 ms, but not one oscillation later."""
     main = Sine(t_start=0.0, duration=5.0, frequency=1 / 0.38, translation=[0, 0, 0.06])
     main.phase = -np.pi / 2 - 2 * np.pi * main.frequency * 0.22
     main.phase %= 2 * np.pi
@@ -125,8 +125,8 @@ def test_hand_pulls_towards_the_intent():
     np.testing.assert_allclose(wrench, [2.5, 0.8, -5.0, 0, 0, 0.03], atol=1e-12)
 
 
-def test_hand_turns_about_the_axis_of_the_error():
-    """An error of 0.4 rad about an axis of B gives a torque about it, whatever the posture."""
+def test_hand_torque_is_about_the_axis_of_the_error():
+    """An error of 0.4 rad about an axis of B gives a torque about this axis."""
     pose = phantom.forward_kinematics(np.array([0.3, 0.2, 0.4, -0.5, 0.6, 0.7]))
     axis = np.array([0.48, -0.6, 0.64])
     wanted = pose.copy()
@@ -138,7 +138,7 @@ def test_hand_turns_about_the_axis_of_the_error():
         np.testing.assert_allclose(wrench[3:], 1.5 * 0.4 * axis, atol=1e-12)
 
 
-def test_hand_is_not_stronger_than_a_hand():
+def test_hand_force_and_torque_are_limited():
     wanted = START.copy()
     wanted[4:] += [3.0, 4.0, 0.0]
     wrench = hand_wrench([700, 20, 3, 0.06], wanted, np.zeros(6), START, np.zeros(6))
@@ -149,8 +149,8 @@ def test_hand_is_not_stronger_than_a_hand():
 
 
 @pytest.mark.parametrize("grip", list(GRIPS))
-def test_hand_gives_way_to_the_displayed_force(grip):
-    """The two-port at rest: the hand pushes back with the displayed force, at F / K."""
+def test_hand_yields_to_the_displayed_force(grip):
+    """At rest the hand deflects by F / K."""
     period, force = 5e-4, np.array([0.4, 0.3, -1.0])
     viscous = JointFriction(coulomb=[0.0] * 6, viscous=[5e-4] * 3 + [5e-5] * 3)
     config = OperatorConfig(grip=grip)
@@ -183,7 +183,7 @@ def test_hand_gives_way_to_the_displayed_force(grip):
     assert angle == pytest.approx(0.01 / hand.rotational_stiffness, rel=1e-3)
 
 
-def test_operator_shows_its_intent():
+def test_operator_outputs_its_intent():
     operator = Operator(OperatorConfig(intent=SEGMENTS), START)
     context = operator.CreateDefaultContext()
     for time in (0.0, 0.37, 0.81):
@@ -207,7 +207,7 @@ def test_intent_loads_from_yaml():
     ]
 
 
-def test_the_grips_of_the_document_are_those_of_the_hands():
+def test_grips_in_docs_equal_the_code():
     page = Path(__file__).parents[2] / "docs" / "operator.md"
     text = page.read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(light|medium|firm)` \| (.*) \|$", text, re.MULTILINE)

@@ -1,4 +1,4 @@
-"""What a human notices: Weber's law, masking, and an expectation that is learnt while moving."""
+"""Contact detection by the operator: Weber's law, masking and learned expectation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PUSH = 5.0  # s, when a contact begins
 
 
 def record(mass: float, steady: float, push: float, amplitude: float = 0.0):
-    """The hand moves an object of this mass and weight at 1.5 Hz and is pushed from PUSH on."""
+    """Return a record of moving mass and weight at 1.5 Hz with a push from PUSH on."""
     omega = 2 * np.pi * 1.5
     velocity, force = np.zeros((len(T), 3)), np.zeros((len(T), 3))
     velocity[:, 2] = amplitude * omega * np.sin(omega * T)
@@ -40,8 +40,8 @@ def noticed(mass: float, steady: float, push: float, amplitude: float = 0.0, han
 
 @settings(max_examples=30, deadline=None)
 @given(steady=st.floats(0.0, 8.0))
-def test_a_push_is_noticed_beyond_the_just_noticeable_difference(steady):
-    """Weber's law, and the absolute threshold where there is little to compare with."""
+def test_push_is_detected_above_the_just_noticeable_difference(steady):
+    """Weber's law, and the absolute threshold for small forces."""
     least = max(HUMAN.absolute_threshold, HUMAN.weber_fraction * steady)
     after = T >= PUSH
     plain = noticed(0.0, steady, 1.2 * least)
@@ -52,13 +52,13 @@ def test_a_push_is_noticed_beyond_the_just_noticeable_difference(steady):
 
 
 @pytest.mark.parametrize("push", [0.1, 0.3])
-def test_a_felt_inertial_force_masks_a_contact(push):
-    """1.2 kg at 8.9 m/s^2: 10.7 N at most, so that a push of 0.3 N is less than a tenth of it."""
+def test_inertial_force_masks_a_contact(push):
+    """1.2 kg at 8.9 m/s^2 give 10.7 N; a push of 0.3 N is below a tenth of it."""
     assert noticed(0.0, 0.0, push).any()
     assert not noticed(1.2, 0.0, push, amplitude=0.1).any()
 
 
-def test_what_one_moves_is_learnt_and_is_no_contact():
+def test_moved_mass_is_learned_and_is_no_contact():
     felt = perceive(T, *record(1.2, 2.0, 0.0, 0.1), HUMAN, 0.0, attentive=3.0)
     late = T > 3.0
     assert np.abs(felt[late, EXCESS:THRESHOLD]).max() < 0.1
@@ -66,13 +66,12 @@ def test_what_one_moves_is_learnt_and_is_no_contact():
     assert not felt[:, NOTICED].any()
 
 
-def test_the_hands_own_mass_is_not_felt():
-    """Who accelerates nothing but the own hand is not masked."""
+def test_inertial_force_of_the_hand_is_not_perceived():
     assert noticed(1.2, 0.0, 0.3, amplitude=0.1, hand_mass=1.2).any()
 
 
 def test_masking_fades_with_its_time_constant():
-    """After a motion has stopped the threshold falls as exp(-t / masking_time)."""
+    """After a motion the threshold decays as exp(-t / masking_time)."""
     force, velocity = record(1.2, 0.0, 0.0, 0.1)
     moving = (T < 4.0)[:, np.newaxis]
     felt = perceive(T, force * moving, velocity * moving, HUMAN, 0.0, attentive=6.0)
@@ -81,9 +80,9 @@ def test_masking_fades_with_its_time_constant():
     assert ratio == pytest.approx(np.exp(-0.3 / HUMAN.masking_time), rel=0.02)
 
 
-def test_a_record_of_the_wrong_shape_is_refused():
+def test_record_of_wrong_shape_is_rejected():
     with pytest.raises(DrakeTeleopError, match="velocity"):
         perceive(T, np.zeros((len(T), 3)), np.zeros((len(T), 2)), HUMAN, 0.0)
     for times in (T[:1], T[::-1]):
-        with pytest.raises(DrakeTeleopError, match="t: does not rise"):
+        with pytest.raises(DrakeTeleopError, match="t: is not increasing"):
             perceive(times, np.zeros((len(times), 3)), np.zeros((len(times), 3)), HUMAN, 0.0)

@@ -1,4 +1,4 @@
-"""The simulated operator's tasks, in the whole station."""
+"""Tasks of the simulated operator in the whole station."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FAST = {
 
 
 def run(name: str, **changes):
-    """The scenario, with a load that is known."""
+    """Run the scenario with the true load."""
     scenario = replace(LoadScenario(name), **(FAST | changes))
     estimate = true_load(scenario)
     station = MakeTeleopStation(scenario, load_estimate=estimate)
@@ -65,8 +65,8 @@ def test_reaching_ends_in_the_target(reach):
 
 
 @pytest.mark.slow
-def test_a_smaller_target_takes_longer():
-    """Fitts: noise in the movements makes corrections necessary."""
+def test_smaller_target_takes_longer():
+    """Fitts' law: motor noise requires corrections."""
     mean = {}
     for width in (0.003, 0.02):
         task = Reach(translation=[0.0, 0.08, -0.06], width=width)
@@ -78,7 +78,7 @@ def test_a_smaller_target_takes_longer():
     assert mean[0.003] > mean[0.02] + 0.3
 
 
-def test_the_hand_knows_how_its_base_lies_and_how_motion_is_scaled():
+def test_hand_motion_uses_alignment_and_motion_scale():
     result, measures = run(
         "reach",
         kinematic_scaling__alignment=[0.0, 0.0, -0.7],
@@ -89,8 +89,8 @@ def test_the_hand_knows_how_its_base_lies_and_how_motion_is_scaled():
     assert np.linalg.norm(way) == pytest.approx(0.1 / 1.5, rel=0.1)
 
 
-def test_a_felt_force_is_split_along_and_across_the_tasks_axis(monkeypatch):
-    """Felt at a base that is turned about all axes, and less than it is."""
+def test_perceived_force_is_split_along_and_across_the_axis(monkeypatch):
+    """The base is rotated about all axes, and the force is scaled down."""
     R_WB = RollPitchYaw(0.4, -0.9, 1.3).ToRotationMatrix().matrix()
     task = Press(translation=[0.03, -0.02, -0.06])
     training = decision.Training(R_WB, 1.5, 0.3, 0.0, 0.0, 0)
@@ -107,14 +107,12 @@ def test_a_felt_force_is_split_along_and_across_the_tasks_axis(monkeypatch):
 
 
 @pytest.mark.parametrize(("length", "duration"), [(0.3, None), (1e-4, 0.2)])
-def test_a_submovement_keeps_to_the_acceleration_and_to_a_least_duration(
-    monkeypatch, length, duration
-):
+def test_submovement_respects_acceleration_and_minimum_duration(monkeypatch, length, duration):
     training = decision.Training(np.eye(3), 1.5, 0.3, 0.0, 0.0, 0)
     movement = Movement(acceleration=2.0, shortest=0.2, noise=0.0)
     person, plans = decision.pack_person(training, Perception(), movement), []
     monkeypatch.setattr(decision, "_to_hand", decision._to_hand.py_func)
-    monkeypatch.setattr(decision, "_random", lambda *_: 0.0)
+    monkeypatch.setattr(decision, "_random_number", lambda *_: 0.0)
     monkeypatch.setattr(decision, "plan_move", lambda *plan: plans.append(plan))
     took = decision._submovement.py_func(person, None, 0, 1.0, np.array([0.0, 1.5 * length, 0.0]))
     _, time, planned, change, _ = plans[0]
@@ -127,7 +125,7 @@ def test_a_submovement_keeps_to_the_acceleration_and_to_a_least_duration(
     assert took == duration if duration else peak == pytest.approx(2.0, rel=1e-6)
 
 
-def test_what_happens_is_the_seeds(reach):
+def test_run_depends_only_on_the_seed(reach):
     again, _ = run("reach")
     other, _ = run("reach", simulation__seed=5)
     assert np.array_equal(again["hand_wrench_E"], reach[0]["hand_wrench_E"])
@@ -135,8 +133,8 @@ def test_what_happens_is_the_seeds(reach):
 
 
 @pytest.mark.slow
-def test_the_picture_is_as_late_as_the_line():
-    """One movement is enough for a large target; that it is there, is seen both ways later."""
+def test_vision_has_the_delay_of_the_network():
+    """One movement reaches a large target; the operator sees it after both delays."""
     task = with_task(Reach(translation=[0.0, 0.08, -0.06], width=0.04))
     near, far = (
         run("reach", channel__delay=delay, **task)[1]["task_time_s"] for delay in (0.05, 0.2)
@@ -146,8 +144,7 @@ def test_the_picture_is_as_late_as_the_line():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("there", "back"), [(0.03, 0.22), (0.22, 0.03)])
-def test_lines_that_differ_are_waited_for_each_in_its_place(there, back):
-    """The tool moves after the one delay and is seen after the other: together a round trip."""
+def test_unequal_delays_add_to_one_round_trip(there, back):
     task = with_task(Reach(translation=[0.0, 0.08, -0.06], width=0.04))
     lines = Channel(delay=there, backward=NetworkConfig(delay=back))
     differ, same = (
@@ -158,7 +155,7 @@ def test_lines_that_differ_are_waited_for_each_in_its_place(there, back):
 
 
 @pytest.mark.slow
-def test_contact_is_noticed_and_the_hand_stops(touch):
+def test_hand_stops_after_contact_detection(touch):
     for result, measures in touch.values():
         assert measures["success"] == 1.0
         # Not before the reaction time is over.
@@ -175,8 +172,8 @@ def test_contact_is_noticed_and_the_hand_stops(touch):
 
 
 @pytest.mark.slow
-def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
-    """sigma = 1: the threshold follows the load's displayed weight, and with it trust."""
+def test_rendered_weight_raises_threshold_and_slows_approach(touch):
+    """sigma = 1: the threshold follows the rendered weight, and so does trust."""
     without, with_load = touch[0.0][1], touch[1.0][1]
     assert with_load["task_time_s"] > without["task_time_s"]
     assert with_load["effort_Ns"] > 2 * without["effort_Ns"]
@@ -186,8 +183,8 @@ def test_weight_that_is_felt_makes_one_slow_and_blunt(touch):
 
 
 @pytest.mark.slow
-def test_who_misses_the_mouth_looks_around():
-    """The chamfers reach 4 mm to each side; who sees the mouth farther off lands beside them."""
+def test_search_finds_the_slot_after_an_aim_error():
+    """The chamfers are 4 mm wide; a larger aim error lands beside them."""
     task = Insert(translation=[0.0, 0.0085, -0.02], depth=0.04)
     result, measures = run("insert", **with_task(task))
     assert measures["success"] == 1.0
@@ -197,7 +194,7 @@ def test_who_misses_the_mouth_looks_around():
 
 
 @pytest.mark.slow
-def test_who_feels_nothing_gives_up():
+def test_operator_gives_up_without_contact():
     result, measures = run("touch", force_scaling__gamma=0.0, sheet_spring=None)
     assert measures["success"] == 0.0 and np.isnan(measures["task_time_s"])
     assert np.isnan(measures["detection_time_s"])
@@ -205,11 +202,8 @@ def test_who_feels_nothing_gives_up():
 
 
 @pytest.mark.slow
-def test_a_set_force_is_held():
-    """Without friction in the device, which hides 1 N at the tool: as exactly as one can judge.
-
-    A force at the tool, however much of it is felt.
-    """
+def test_set_force_is_held():
+    """Without device friction, which hides 1 N at the tool."""
     smooth = {"master__friction": JointFriction([0.0] * 6, [5e-4] * 3 + [5e-5] * 3)}
     task = Press(translation=[0.0, 0.0, -0.08], force=12.0, tolerance=1.2)
     _, measures = run("press", **with_task(task, **smooth), force_scaling__gamma=1.6)
@@ -218,15 +212,15 @@ def test_a_set_force_is_held():
     assert measures["press_error_N"] < (0.1 + 2 * 0.1) * 12.0
 
 
-def test_a_press_that_takes_too_long_is_given_up():
+def test_press_is_given_up_after_timeout():
     task = Press(translation=[0.0, 0.0, -0.08], timeout=1.0)
     result, measures = run("press", **with_task(task, simulation__duration=1.5))
     assert measures["success"] == 0.0
     assert result["task_state"][-1, DONE] == -1.0
 
 
-def test_a_human_notices_the_papers_contact_and_nothing_before():
-    """Fig. 8 without inertia: the fast motion before is expected, the touch of 50 ms is not."""
+def test_papers_contact_is_detected_without_false_detection():
+    """Fig. 8 without inertia: the touch of 50 ms is detected, the fast motion before is not."""
     scenario = LoadScenario("contact_transition")
     changes = FAST | {"simulation__settle": 0.0, "simulation__duration": 1.7}
     scenario = replace(scenario, **changes)
@@ -240,8 +234,7 @@ def test_a_human_notices_the_papers_contact_and_nothing_before():
     assert detection_time(result.t, touching, noticed) < 0.03
 
 
-def test_every_movement_goes_on_from_the_one_before():
-    """Place, velocity and acceleration have no steps, and each ends where it was to end."""
+def test_movements_are_continuous_to_acceleration():
     memory, time, rng = decision.initial_memory(), 0.0, np.random.default_rng(3)
     expected = np.zeros(3)
 
@@ -287,17 +280,17 @@ def test_the_operators_noise_is_normal():
         (with_task(Reach(), kinematic_scaling__translation_scale=0.0), "translation_scale"),
     ],
 )
-def test_a_task_that_cannot_be_done_is_refused(changes, message):
+def test_impossible_task_is_rejected(changes, message):
     with pytest.raises(DrakeTeleopError, match=message):
         replace(Scenario(), **changes).check()
 
 
-def test_a_target_that_begins_where_the_tool_is_not_is_far_enough():
+def test_target_beyond_its_radius_is_accepted():
     check_task(Reach(translation=[0.0, 0.03, 0.0], width=0.04), "task")
     with pytest.raises(DrakeTeleopError, match=r"not more than 0\.02 m"):
         check_task(Reach(translation=[0.0, 0.019, 0.0], width=0.04), "task")
 
 
-def test_a_scenario_without_task_has_nothing_to_measure(reach):
+def test_measures_need_a_task(reach):
     with pytest.raises(DrakeTeleopError, match=r"operator\.task"):
         task_measures(reach[0], Scenario())

@@ -1,4 +1,4 @@
-"""Motion of S from encoders and accelerometer: exact, in time, and what elimination leaves."""
+"""Estimated motion of S: accuracy, delays and residuals of elimination."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.station.sensor.motion_estimation import (
     MotionEstimationConfig,
-    _track,
+    _update_filters,
     estimate_into,
     estimated_motion_std,
     motion_estimator,
@@ -81,7 +81,7 @@ def sampled(
     table: Array = ARM.table,
     seed: int = 0,
 ) -> Array:
-    """Truth through sensor and estimation; `believed` is what the estimation takes it for."""
+    """Return samples of sensor and estimation; `believed` is the nominal sensor."""
     n = truth.shape[1] - 15
     noise = np.random.default_rng(seed).standard_normal((len(truth) // NOISE_BLOCK + 1, NOISE_SIZE))
     samples, reading = np.empty((len(truth), 16 + n)), np.empty(13 + n)
@@ -103,7 +103,7 @@ def rms(rows: Array) -> float:
 
 
 def swinging(t: Array, frequencies=(1.3, 2.1, 0.7, 2.6, 1.9, 3.1), start=None, acceleration=5.0):
-    """Every joint on its own sine, about home or `start`; exact derivatives."""
+    """Return sine motions of all joints about home or `start`, with exact derivatives."""
     start = home() if start is None else start
     w = 2 * np.pi * np.array(frequencies)
     phase = np.outer(t, w) + np.arange(len(w))
@@ -116,7 +116,7 @@ def swinging(t: Array, frequencies=(1.3, 2.1, 0.7, 2.6, 1.9, 3.1), start=None, a
 
 
 def papers_motion(seconds: float):
-    """About 100 N: the scenario `free_motion_force`, up and down at 2.63 Hz without turning."""
+    """Return the vertical motion of `free_motion_force` at 2.63 Hz, about 100 N."""
     coarse = np.arange(0.0, seconds + 0.01, 0.004)
     x = np.clip(coarse / 0.6, 0.0, 1.0)
     height = 0.45 + 0.078 * x**3 * (10 - 15 * x + 6 * x**2) * np.sin(2 * np.pi * 2.63 * coarse)
@@ -144,7 +144,7 @@ SETTLED = 8000
     ("source", "tolerance"), [("encoders", 2e-3), ("accelerometer", 1e-4), ("fused", 1e-4)]
 )
 @pytest.mark.parametrize("latencies", [(0.0, 0.0, 0.0), (1e-3, 6e-3, 5e-4), (3e-3, 0.0, 2e-2)])
-def test_a_quiet_sensor_gives_the_truth_of_one_earlier_instant(source, tolerance, latencies):
+def test_noiseless_sensor_gives_truth_of_one_earlier_instant(source, tolerance, latencies):
     force, acceleration, encoders = latencies
     sensor = dataclasses.replace(
         QUIET,
@@ -162,8 +162,8 @@ def test_a_quiet_sensor_gives_the_truth_of_one_earlier_instant(source, tolerance
     assert error.max() < tolerance
 
 
-def test_the_quiet_accelerometer_is_as_before(fast):
-    """At So, through the wrench's own low-pass; omega is the angles' slope through the same."""
+def test_noiseless_accelerometer_sample_is_moved_and_filtered(fast):
+    """At So, with the wrench's low-pass; omega is the slope of the filtered angles."""
     sensor = dataclasses.replace(QUIET, p_SoAo_S=[0.0] * 3, R_SA=list(np.eye(3).ravel()))
     config = MotionEstimationConfig(source="accelerometer")
     samples = sampled(fast, sensor, config)
@@ -205,10 +205,10 @@ def test_arms_with_other_numbers_of_joints(source, joints):
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("frequency", [5.0, 20.0])
 def test_wrench_and_motion_are_in_phase(source, preset, frequency):
-    """To a fiftieth of a sample; and both are as late as is said, to a twentieth.
+    """Within a fiftieth of a sample, and within a twentieth of the stated delay.
 
-    Encoders alone pass a low-pass that only delays at low frequencies, while the wrench waits:
-    what it turns the phase further is 0.1 samples at 5 Hz, 1.6 at 20 Hz.
+    Source `encoders` has a low-pass whose phase exceeds its delay by 0.1 samples at 5 Hz
+    and 1.6 at 20 Hz.
     """
     sensor = without(
         PRESETS[preset], "noise", "random_walk", "offset", "drift", "quantisation", "saturation"
@@ -254,8 +254,8 @@ def test_the_delays_add_up():
     )
 
 
-def test_a_mismatch_of_6_ms_is_worse_than_no_inertia_at_all_above_28_hz(fast):
-    """2 sin(pi f tau) of the inertial wrench stays; that is all of it at f = 1 / (6 tau)."""
+def test_6_ms_mismatch_is_worse_than_no_inertia_above_28_hz(fast):
+    """The residual is 2 sin(pi f tau) of the inertial wrench: all of it at f = 1 / (6 tau)."""
     late = dataclasses.replace(QUIET, acceleration_latency=6e-3)
     config = MotionEstimationConfig("accelerometer")
     t = np.arange(12000) * T
@@ -264,7 +264,7 @@ def test_a_mismatch_of_6_ms_is_worse_than_no_inertia_at_all_above_28_hz(fast):
         return rms(eliminated(sampled(truth, late, config, believed)[SETTLED:])[:, :3])
 
     def inertial(truth: Array) -> float:
-        """What stays if only the weight, of the present attitude, is taken away."""
+        """Return the residual after elimination of the weight only."""
         still = (truth[SETTLED:, 15:], np.zeros((len(truth), 6)), np.zeros((len(truth), 6)))
         return rms(truth[SETTLED:, :3] - truth_of(still)[:, :3])
 
@@ -309,7 +309,7 @@ def test_the_gains_are_the_kalman_filters(position, acceleration, drift, period)
 
 
 def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
-    """White noise alone: crossover at the square root of the noises' ratio, damping 1/sqrt(2)."""
+    """Only white noise: crossover at the root of the noise ratio, damping 1/sqrt(2)."""
     position_std, acceleration_std = 5e-6, 1.5
     gains = steady_state(position_std, acceleration_std, 1e-3, T).gains
     crossover = np.sqrt(acceleration_std / position_std)
@@ -317,7 +317,7 @@ def test_with_little_drift_the_poles_are_those_of_a_second_order_butterworth():
     assert gains[1] == pytest.approx(crossover**2 * T, rel=0.05)
 
 
-def test_the_filter_is_as_good_as_predicted():
+def test_filter_errors_equal_the_predicted_deviations():
     position_std, white, walk, steps = 7e-6, 1.5, 3.0, 60000
     found = steady_state(position_std, white, walk, T)
     random = np.random.default_rng(1)
@@ -328,7 +328,7 @@ def test_the_filter_is_as_good_as_predicted():
     kept, bias, estimates, innovations = np.zeros(12), np.zeros(3), [], []
     for k in range(1, steps):
         acceleration, moved = measured[k] - bias, angle[k] - angle[k - 1]
-        _track(found.gains, T, moved, acceleration, kept)
+        _update_filters(found.gains, T, moved, acceleration, kept)
         bias -= moved
         kept[6:9] = acceleration + moved
         estimates.append(angle[k] - kept[:3])
@@ -337,8 +337,7 @@ def test_the_filter_is_as_good_as_predicted():
     assert np.std(innovations[8000:]) == pytest.approx(found.innovation_std, rel=0.01)
 
 
-def test_known_gains_of_the_jr3():
-    """Figures of the docs."""
+def test_gains_of_the_jr3_equal_the_docs():
     angular, linear = motion_gains(MotionEstimationConfig(), JR3, 6, T)
     assert angular.crossover_hz == pytest.approx(28.9, abs=0.1)
     assert linear.crossover_hz == pytest.approx(18.4, abs=0.1)
@@ -353,7 +352,7 @@ def left(fast: Array, sensor: WristSensorConfig, source: str) -> tuple[float, fl
     return rms(force), float(np.linalg.norm(force, axis=1).max())
 
 
-def test_fused_bears_a_wrong_accelerometer_and_costs_nothing_with_a_right_one(fast):
+def test_fused_corrects_a_wrong_accelerometer_without_loss(fast):
     sensor = without(JR3, "drift")
     assert np.linalg.norm(fast[SETTLED:, :3], axis=1).max() == pytest.approx(97.0, abs=3.0)
     wrong = dataclasses.replace(
@@ -372,8 +371,8 @@ def test_fused_bears_a_wrong_accelerometer_and_costs_nothing_with_a_right_one(fa
 
 @pytest.mark.parametrize("preset", ["jr3_85m35a3", "ati_gamma_imu"])
 @pytest.mark.parametrize("source", ["encoders", "accelerometer"])
-def test_the_noise_of_the_motion_is_as_stated(source, preset):
-    """Encoders: over the axes together, of which some depend on joints that are further away."""
+def test_motion_noise_equals_the_prediction(source, preset):
+    """For encoders on average over the axes."""
     real = without(PRESETS[preset], "random_walk", "offset", "drift", "saturation")
     config = MotionEstimationConfig(source)
     truth = truth_of(swinging(np.arange(16000) * T))
@@ -398,7 +397,7 @@ def test_the_offset_of_an_accelerometer_is_found(fast):
 # Flag and messages
 
 
-def test_the_flag_stays_while_a_part_of_the_reading_waits():
+def test_flag_stays_while_part_of_the_reading_is_delayed():
     sensor = dataclasses.replace(QUIET, acceleration_latency=1e-3)
     constants, memory = motion_estimator(MotionEstimationConfig("fused"), sensor, 6, T)
     reading, sample, flags = np.zeros(19), np.zeros(22), []
@@ -410,6 +409,6 @@ def test_the_flag_stays_while_a_part_of_the_reading_waits():
     assert np.flatnonzero(flags).tolist() == list(range(20, 29))
 
 
-def test_a_bandwidth_above_the_rate_is_refused():
+def test_bandwidth_above_the_rate_is_rejected():
     with pytest.raises(DrakeTeleopError, match="encoder_bandwidth_hz"):
         motion_estimator(MotionEstimationConfig("encoders", 500.0), JR3, 6, 1e-3)

@@ -1,9 +1,10 @@
-"""The wrist sensor's chain: each part alone does its formula, and the noise is what is stated."""
+"""Parts of the wrist sensor's chain, and its noise."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +26,17 @@ from drake_teleop.station.sensor.sensor_chain import (
     PARTS,
     PRESET_NAMES,
     WristSensorConfig,
-    believable,
     calibration_matrices,
+    is_plausible,
     read_into,
     sensor_chain,
     without,
 )
-from drake_teleop.station.sensor.sensor_noise import (
-    allan_deviation,
-    predicted_allan_deviation,
-    rest_record,
-    spectral_density,
+
+NOISE = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "_ext" / "sensor_noise.py"))
+allan_deviation, predicted_allan_deviation, rest_record, spectral_density = (
+    NOISE[name]
+    for name in ("allan_deviation", "predicted_allan_deviation", "rest_record", "spectral_density")
 )
 
 RATE, PERIOD, JOINTS = 8000.0, 125e-6, 3
@@ -47,7 +48,7 @@ UR5_AT_REST = RECORDS / "ur5_imu_fts_contact"
 
 
 def readings(config, truths, noise=None, period=PERIOD):
-    """(N, 13 + n) of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
+    """Return (N, 13 + n) readings of `truths` (N, 15 + n); `noise` (blocks, NOISE_SIZE) or none."""
     blocks = np.zeros((-(-len(truths) // NOISE_BLOCK), NOISE_SIZE)) if noise is None else noise
     constants, memory = sensor_chain(config, truths.shape[1] - 15, period)
     out = np.empty((len(truths), truths.shape[1] - 2))
@@ -71,13 +72,13 @@ def random_noise(count, seed=1):
 
 
 def as_read(truths):
-    """The reading of a perfect sensor at So."""
+    """Return the reading of an ideal sensor at So."""
     flag = np.zeros((len(truths), 1))
     return np.hstack([truths[:, :9], truths[:, 12:15], flag, truths[:, 15:]])
 
 
 @pytest.mark.parametrize("config", [PRESETS["ideal"], BARE], ids=["ideal", "all parts off"])
-def test_without_its_parts_the_sensor_reads_the_truth(config):
+def test_sensor_without_parts_reads_the_truth(config):
     truths = random_truths(70)
     np.testing.assert_allclose(readings(config, truths, random_noise(70)), as_read(truths), 1e-14)
 
@@ -103,7 +104,7 @@ def test_presets_are_plausible_and_settle_at_the_first_sample(name):
     assert np.ptp(found[:, 12:], axis=0).max() == 0.0
 
 
-def test_every_preset_can_be_named_in_a_file():
+def test_file_accepts_every_preset():
     assert list(PRESETS) == list(PRESET_NAMES)
 
 
@@ -152,8 +153,8 @@ def test_calibration_errors_are_linear_constant_and_independent_of_each_other():
     np.testing.assert_allclose(wrench, (alone + talk - np.eye(6)) @ turned, 1e-12, 1e-15)
 
 
-def test_an_accelerometer_on_the_axis_of_rotation_feels_gravity_only():
-    """S runs on a circle about a vertical axis, which goes through the accelerometer."""
+def test_accelerometer_on_the_rotation_axis_measures_gravity_only():
+    """S moves on a circle about a vertical axis through the accelerometer."""
     radius, speed, growth = 0.12, 3.0, 5.0
     truth = np.zeros((1, 15))
     truth[0, 6:9] = [-(speed**2) * radius, growth * radius, 9.81]
@@ -175,7 +176,7 @@ def filtered(values, bandwidth):
 
 
 @pytest.mark.parametrize("place", ["before_noise", "after_converter"])
-def test_the_low_pass_is_a_butterworth_that_starts_settled(place):
+def test_low_pass_is_a_butterworth_with_settled_start(place):
     truths = random_truths(300)
     found = readings(part(low_pass=place, bandwidth_hz=300.0), truths)
     expected = as_read(truths)
@@ -196,7 +197,7 @@ def test_the_place_of_the_low_pass_decides_what_it_filters():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_ramp_is_read_as_late_as_the_delays_say(name):
+def test_ramp_is_delayed_by_the_stated_delays(name):
     config = without(
         PRESETS[name], *QUIET, "calibration", "offset", "drift", "quantisation", "place"
     )
@@ -213,7 +214,7 @@ def test_a_ramp_is_read_as_late_as_the_delays_say(name):
 # Noise, offset, converter
 
 
-def test_white_noise_and_walk_are_the_numbers_that_were_given_times_their_sizes():
+def test_noise_and_walk_scale_the_given_random_numbers():
     count = 3 * NOISE_BLOCK + 5
     truths, noise = random_truths(count), random_noise(count)
     deviations = np.repeat([0.3, 0.02, 0.1, 2.0], 3)
@@ -229,7 +230,7 @@ def test_white_noise_and_walk_are_the_numbers_that_were_given_times_their_sizes(
     np.testing.assert_allclose(readings(config, truths, noise), expected, 1e-12, 1e-12)
 
 
-def test_the_offset_drifts_at_its_rate_and_may_be_changed_while_the_sensor_runs():
+def test_offset_drifts_and_may_change_during_a_run():
     offset, bias = [1.0, 2.0, 3.0, 0.1, 0.2, 0.3], [0.3, 0.2, 0.1, 3.0, 2.0, 1.0]
     drift = [0.5, -0.4, 0.3, 0.02, -0.01, 0.03]
     truths = random_truths(100)
@@ -255,7 +256,7 @@ def test_quantisation_rounds_to_the_nearest_step():
     assert np.all(np.abs(found - expected) <= steps * 0.5 * (1 + 1e-12))
 
 
-def test_saturation_clips_and_says_so_with_the_latency_of_its_path():
+def test_saturation_clips_and_flags_with_latency_of_its_path():
     config = part(saturates=True, force_latency=3 * PERIOD, acceleration_latency=PERIOD)
     truths = np.zeros((12, 15 + JOINTS))
     truths[2, 0] = -1.5 * config.force_range[0]
@@ -271,7 +272,7 @@ def test_saturation_clips_and_says_so_with_the_latency_of_its_path():
 
 @pytest.mark.parametrize("low_pass", ["none", "before_noise", "after_converter"])
 def test_the_offset_counts_in_the_saturation(low_pass):
-    """150 N with an offset of 60 N are beyond the range of 200 N, with -60 N they are not."""
+    """150 N with an offset of 60 N exceed the range of 200 N, with -60 N they do not."""
     truths = np.zeros((400, 15 + JOINTS))
     truths[:, 0] = 150.0
     for offset, reads, saturated in ((60.0, 200.0, True), (-60.0, 90.0, False)):
@@ -283,22 +284,22 @@ def test_the_offset_counts_in_the_saturation(low_pass):
         assert found[:, 12].all() == found[:, 12].any() == saturated
 
 
-def test_what_no_sensor_survives_is_not_read_and_its_offset_counts():
+def test_overload_including_offset_is_not_plausible():
     constants, _ = sensor_chain(part(saturates=True), JOINTS, PERIOD)
     truth, largest = np.zeros(15 + JOINTS), 10 * part().ranges()[0]
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     truth[0] = 0.99 * largest
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     constants[0] = 0.02 * largest  # of the offset
-    assert not believable(constants, truth)
+    assert not is_plausible(constants, truth)
     truth[0] = 0.0
-    assert believable(constants, truth)
+    assert is_plausible(constants, truth)
     constants[0] = np.nan
-    assert not believable(constants, truth)
+    assert not is_plausible(constants, truth)
     constants[0] = 0.0
     for place in range(len(truth)):
         for bad in (np.nan, -np.inf, 1e9):
-            assert not believable(constants, np.where(np.arange(len(truth)) == place, bad, truth))
+            assert not is_plausible(constants, np.where(np.arange(len(truth)) == place, bad, truth))
 
 
 # Latency
@@ -359,7 +360,7 @@ def records():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in AT_REST if name != "walk"])
-def test_the_spectrum_at_rest_is_the_one_that_was_predicted(records, name):
+def test_spectrum_at_rest_equals_prediction(records, name):
     """Averaged over bands, to five standard deviations of the estimate."""
     config, length = AT_REST[name], 2048
     f, found = signal.welch(records[name], RATE, nperseg=length, noverlap=0, axis=0)
@@ -376,7 +377,7 @@ def test_the_spectrum_at_rest_is_the_one_that_was_predicted(records, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", AT_REST)
-def test_the_allan_deviation_at_rest_is_the_one_that_was_predicted(records, name):
+def test_allan_deviation_at_rest_equals_prediction(records, name):
     lengths = 2 ** np.arange(0 if name != "walk" else 5, 14)
     found = allan_deviation(records[name], lengths)
     predicted = predicted_allan_deviation(AT_REST[name], lengths, PERIOD)
@@ -438,7 +439,7 @@ def test_at_rest_gravity_is_along_z_and_the_wrench_is_the_offset():
     [("wrench", {"force": slice(0, 3), "torque": slice(3, 6)}, 1.0),
      ("accel", {"acceleration": slice(0, 3)}, 9.80665)],
 )  # fmt: skip
-def test_the_ati_gamma_is_as_noisy_as_it_was_recorded(file, figures, unit):
+def test_ati_gamma_noise_equals_its_record(file, figures, unit):
     record = pl.read_csv(ATI_AT_REST / f"0-steady-state_{file}.csv").to_numpy() * unit
     step = allan_deviation(record, [1])[:, 0]
     for name, axes in figures.items():
@@ -447,8 +448,8 @@ def test_the_ati_gamma_is_as_noisy_as_it_was_recorded(file, figures, unit):
 
 
 @pytest.mark.skipif(not UR5_AT_REST.is_dir(), reason="the recordings are not here")
-def test_the_force_wanders_as_it_was_recorded():
-    """Two averaging times only, and drift in them: to 30 %."""
+def test_force_walk_equals_its_record():
+    """Two averaging times only, with drift: within 30 %."""
     file = UR5_AT_REST / "No10_Standstill_ForceSensor_All2__log_force_sensor.csv"
     record = pl.read_csv(file, has_header=False).to_numpy()
     quiet = record[record[:, 0] < 8.7]  # until the first push
@@ -473,7 +474,7 @@ def test_the_force_wanders_as_it_was_recorded():
         ({"bandwidth_hz": 3700.0}, r"^sensor\.bandwidth_hz: .*rates.sensor_hz"),
     ],
 )
-def test_what_cannot_be_is_refused(changes, message):
+def test_invalid_sensor_is_rejected(changes, message):
     with pytest.raises(DrakeTeleopError, match=message):
         dataclasses.replace(WristSensorConfig(), **changes).check("sensor", RATE)
 
@@ -486,7 +487,7 @@ def loaded(text):
     return config
 
 
-def test_a_preset_is_named_in_a_file_and_its_fields_overridden():
+def test_file_overrides_fields_of_a_preset():
     ati = PRESETS["ati_gamma_imu"]
     config = loaded("{preset: ati_gamma_imu, force_noise: 0.5}")
     assert config == dataclasses.replace(ati, force_noise=0.5) and config.preset == "ati_gamma_imu"
@@ -497,7 +498,7 @@ def test_a_preset_is_named_in_a_file_and_its_fields_overridden():
         loaded("{preset: jr3}")
 
 
-def test_a_preset_cannot_be_named_where_nothing_would_follow_from_it():
+def test_preset_without_effect_is_rejected():
     with pytest.raises(TypeError, match="preset"):
         WristSensorConfig(preset="ati_gamma_imu")
     with pytest.raises((TypeError, ValueError), match="preset"):
@@ -511,7 +512,7 @@ def section(title):
     return DOCUMENT.partition(f"## {title}\n")[2].partition("\n## ")[0]
 
 
-def test_the_document_names_every_part_with_its_fields():
+def test_docs_list_every_part_with_its_fields():
     rows = re.findall(r"^\| (\w+) \| (`.*?) \|", section("The parts"), re.MULTILINE)
     assert [name for name, _ in rows] == list(PARTS)
     fields = {field.name for field in dataclasses.fields(WristSensorConfig)}
@@ -521,7 +522,7 @@ def test_the_document_names_every_part_with_its_fields():
         assert set(PARTS[name]) <= set(named) or "…" in text
 
 
-def test_the_documents_figures_are_those_of_the_presets():
+def test_figures_in_docs_equal_the_presets():
     row = re.compile(r"^\| `(\w+)` \|[^|]*\| ([^|]*) \| ([^|]*) \| [^|]* \|$", re.MULTILINE)
     rows = row.findall(section("The presets"))
     assert len(rows) == 18
@@ -535,7 +536,7 @@ def test_the_documents_figures_are_those_of_the_presets():
                 assert numbers == np.atleast_1d(stated).tolist(), (field, name)
 
 
-def test_the_documents_script_runs(capsys):
+def test_script_in_docs_runs(capsys):
     script = re.search(r"```python\n(.*?)```", DOCUMENT, re.DOTALL).group(1)
     exec(compile(script, "sensor.md", "exec"), {})
     assert capsys.readouterr().out.strip() == script.rpartition("# ")[2].strip()

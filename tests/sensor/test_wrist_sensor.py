@@ -1,4 +1,4 @@
-"""The wrist sensor: what each part of the chain does to the truth."""
+"""The wrist sensor in the station."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUIET = without(
 
 
 def at_rest(config: WristSensorConfig, **changes):
-    """The station at rest: nothing is fed back that could move it; every sample is logged."""
+    """Run the station at rest; every sample is logged."""
     scenario = replace(
         Scenario(),
         wrist_sensor=config,
@@ -105,7 +105,7 @@ def test_channels_are_independent_and_other_seeds_give_other_noise():
 
 @pytest.mark.slow
 def test_the_converter_quantises_before_the_filter():
-    """The reading at rest is a whole number of quanta, whatever the truth is."""
+    """The reading at rest is a whole number of quanta."""
     result = at_rest(dataclasses.replace(QUIET, resolution=2.5e-4))
     force = result["measured_wrench_S"][-1, 2] / (2.5e-4 * 400.0)
     assert force == pytest.approx(round(force), abs=1e-6)
@@ -128,7 +128,7 @@ def test_angular_velocity_comes_from_the_encoders_with_their_resolution():
 
 
 def swinging(rate: float) -> SimulationResult:
-    """All joints move from a turned start under an ideal sensor; every sample is logged."""
+    """Move all joints from a rotated start with an ideal sensor; every sample is logged."""
     scenario = replace(
         Scenario(),
         wrist_sensor__ideal=True,
@@ -143,12 +143,8 @@ def swinging(rate: float) -> SimulationResult:
     return simulate(MakeIdentificationStation(scenario, trajectory), scenario.simulation)
 
 
-def test_the_log_says_of_which_instant_a_sample_is():
-    """The samples against what the plant says of `slave_state`.
-
-    Wrench of the weld, motion of its body and joint angles: those of the row's `sample_time` are
-    the sample, those of the row itself are not.
-    """
+def test_sample_time_is_the_instant_of_the_sample():
+    """Reaction force, motion and joint angles at `sample_time`, not at t, equal the sample."""
     result = swinging(8000.0)
     slave = AddSlavePlant(DiagramBuilder(), Slave(), None)
     plant, context = slave.plant, slave.plant.CreateDefaultContext()
@@ -189,8 +185,8 @@ def test_the_log_says_of_which_instant_a_sample_is():
     assert by_row.min() > 1e-4
 
 
-def test_an_instant_that_comes_twice_has_one_sample():
-    """At 7 kHz a row's time is later, by rounding, than the same instant of the 2 kHz events."""
+def test_one_sample_for_equal_instants_with_rounding():
+    """At 7 kHz rounding makes a row's time later than the same instant of the 2 kHz events."""
     result = swinging(7000.0)
     np.testing.assert_allclose(result["sample_time"][1:, 0], result.t[:-1], rtol=0, atol=1e-12)
     np.testing.assert_allclose(
@@ -198,16 +194,16 @@ def test_an_instant_that_comes_twice_has_one_sample():
     )
 
 
-def test_samples_wait_in_contact_until_the_torque_or_the_noise_changes():
-    """Asked three times a period, of which five have one torque and 128 one block of noise."""
+def test_samples_in_contact_wait_for_new_torque_or_noise():
+    """Three calls per period; five periods share a torque, 128 a block of noise."""
     period, k = 1.25e-4, np.arange(3 * 1000)
-    sensor: Any = SimpleNamespace(_period=period, _holds=(5 * period, NOISE_BLOCK * period))
+    sensor: Any = SimpleNamespace(_period=period, _event_periods=(5 * period, NOISE_BLOCK * period))
     due = [WristSensor._is_due(sensor, time) for time in k * period / 3]
     np.testing.assert_array_equal(due, (k % 15 == 0) | (k % (3 * NOISE_BLOCK) == 0))
 
 
-def test_a_noisy_sensor_need_not_ask_the_plant_in_contact(monkeypatch):
-    """The tip is in a leaf; what the plant says differs by rounding from what the samples know."""
+def test_noisy_sensor_does_not_evaluate_plant_contact(monkeypatch):
+    """The tip is in a leaf; the plant's wrench differs by rounding only."""
     asked, of_plant = [], wrist_sensor.contact_wrench_W
 
     def counted(*of_results):
@@ -227,8 +223,8 @@ def test_a_noisy_sensor_need_not_ask_the_plant_in_contact(monkeypatch):
         )
         station, before = MakeTeleopStation(scenario), len(asked)
         sensor = GetBlock(station, "wrist_sensor")
-        assert sensor._exact == ideal
-        sensor._exact = asks
+        assert sensor._uses_plant_contact == ideal
+        sensor._uses_plant_contact = asks
         result = simulate(station, scenario.simulation)
         assert np.abs(result["true_contact_wrench_W"][-20:, 2]).min() > 1.0
         return result["measured_wrench_S"], len(asked) - before

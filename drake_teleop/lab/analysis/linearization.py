@@ -364,7 +364,7 @@ class _Period:
         self._sensor = self._system("wrist_sensor")
         servo = smooth.joint_control
         servo.check_computed_torque("the linearisation")
-        scenario.master.check_leads_the_pose("the linearisation")
+        scenario.master.check_pose_mode("the linearisation")
         if self._has_ik_state:  # a speed limit would be nonlinear
             GetBlock(self._diagram, "inverse_kinematics").speed_limit[:] = np.inf
         gain = 4 * np.pi**2 * servo.position_bandwidth_hz * servo.velocity_bandwidth_hz
@@ -452,7 +452,7 @@ class _Period:
             else:
                 state = context.get_mutable_discrete_state(group.group)
                 state.get_mutable_value()[group.part] = values
-        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
+        self._sensor.reset_queue(self._context("wrist_sensor"))
 
     def _apply(self, u: Array) -> None:
         """Set the cut inputs to those of the operating point plus `u` (24,)."""
@@ -474,7 +474,7 @@ class _Period:
         if self._has_ik_state:  # time of its last command
             command = self._context("inverse_kinematics").get_mutable_discrete_state(0)
             command.get_mutable_value()[-1] = 0.0
-        self._sensor.bring_up_to_date(self._context("wrist_sensor"))
+        self._sensor.reset_queue(self._context("wrist_sensor"))
         self._simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         self._simulator.AdvanceTo(2 * self.dt)
         self._sensor.take_samples(self._context("wrist_sensor"))

@@ -109,7 +109,7 @@ def task_direction(
     mass_acceleration = n_W @ (a + np.cross(alpha, R_WS @ first_moment_S / mass))
     servo, sheet = scenario.joint_control, scenario.leaf
     servo.check_computed_torque("the model of one axis")
-    scenario.master.check_leads_the_pose("the model of one axis")
+    scenario.master.check_pose_mode("the model of one axis")
     forward, backward = scenario.channel.lines()
     axis = OneAxis(
         hand_mass=hand.mass,

@@ -17,7 +17,15 @@ from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, sensor_motion
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.regressor import non_contact_wrench
-from drake_teleop.station.film import Film, Reading, Show, add_shapes, frame_times, plain_room, rgba
+from drake_teleop.station.film import (
+    Film,
+    Reading,
+    Show,
+    add_shapes,
+    frame_times,
+    rgba,
+    set_plain_background,
+)
 
 _TABLE_COLOUR, _BONE_COLOUR = Rgba(0.85, 0.80, 0.72), Rgba(0.55, 0.58, 0.63)
 _TABLE_THICKNESS_M = 0.03  # of the drawn table [m]
@@ -113,7 +121,7 @@ def _add_bone(meshcat: Meshcat, name: str, p_BJ: Array) -> None:
 
 
 def _add_surroundings(meshcat: Meshcat, path_S: Array, bodies: Array) -> None:
-    plain_room(meshcat)
+    set_plain_background(meshcat)
     visuals = np.vstack([path_S, bodies, np.zeros((1, 3))])
     low, high = visuals.min(axis=0), visuals.max(axis=0)
     middle, size = (low + high) / 2, float(np.linalg.norm(high - low))

@@ -1,1 +1,1 @@
-"""The master side: the operator, the haptic device and the display of force on it."""
+"""Block "haptic device": dynamics of devices and leader arms, and their force display."""

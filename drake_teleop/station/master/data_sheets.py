@@ -1,8 +1,7 @@
-"""Haptic devices by name: the Phantom of the paper, and others by what their data sheets say.
+"""Haptic devices by name: the paper's Phantom, and others by data sheets.
 
-How sure each number is: D the manufacturer's figure, recalled and not read again; E an engineering
-estimate. A workspace of another form is the largest box inside it: of an omega a cylinder of 160 mm
-across and 110 mm, of a Virtuose a ball of 450 mm across, D.
+D: the manufacturer's value from memory; E: estimate. The workspace is the largest box in the real
+one: in a cylinder of 160 x 110 mm (omega) or a ball of 450 mm (Virtuose), D.
 
 | name | mass at the grip | friction | peak force | workspace, depth x width x height |
 |---|---|---|---|---|
@@ -12,7 +11,7 @@ across and 110 mm, of a Virtuose a ball of 450 mm across, D.
 | haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
 | virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
 
-| name | step of position | of the turns | own rate |
+| name | position step | rotation step | device rate |
 |---|---|---|---|
 | geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
 | omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
@@ -20,8 +19,8 @@ across and 110 mm, of a Virtuose a ball of 450 mm across, D.
 | haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
 | virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
 
-Of them only the Virtuose displays torque (3.1 N m D); an omega.3 and a Falcon do not turn. The
-omega.7's gripper and the buttons of all are left out.
+Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate. Gripper and buttons
+are not modelled.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -78,7 +77,7 @@ class JointFriction:
 @settings
 @dataclass
 class DeviceFigures:
-    """A device by its data sheet, see `task_space`; x of its base points to the operator, z up."""
+    """Data sheet of a device, see `task_space`; x of its base points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "that the hand moves with the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "likewise, about every axis")
@@ -110,20 +109,22 @@ class DeviceFigures:
     )
 
 
-def _sheet(mass: float, friction: float, force: float, size: list[float], **others: Any) -> Any:
+def _data_sheet(
+    mass: float, friction: float, force: float, size: list[float], **others: Any
+) -> Any:
     return DeviceFigures(
         apparent_mass=mass, friction=friction, peak_force=force, size=size, **others
     )
 
 
-_FIXED = [0.0, 0.0, 0.0]
-_OMEGA = [0.11, 0.113, 0.113]
-_OMEGA_TURN = np.radians([120.0, 70.0, 160.0]).tolist()  # D
-_OMEGA_READ = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
+_NO_ROTATION = [0.0, 0.0, 0.0]
+_OMEGA_SIZE = [0.11, 0.113, 0.113]
+_OMEGA_ROTATION = np.radians([120.0, 70.0, 160.0]).tolist()  # D
+_OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
 
-#: What the devices by name have, for `Master.figures`.
+#: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
-    "geomagic_touch": _sheet(
+    "geomagic_touch": _data_sheet(
         0.045,
         0.26,
         3.3,
@@ -132,11 +133,13 @@ FIGURES: dict[str, DeviceFigures] = {
         turn_resolution=2e-3,
         rate_hz=1000.0,
     ),
-    "omega_3": _sheet(0.25, 0.3, 12.0, _OMEGA, turn=_FIXED, **_OMEGA_READ),
-    "omega_6": _sheet(0.3, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
-    "omega_7": _sheet(0.35, 0.3, 12.0, _OMEGA, turn=_OMEGA_TURN, **_OMEGA_READ),
-    "falcon": _sheet(0.2, 0.5, 8.9, [0.102] * 3, turn=_FIXED, resolution=6.35e-5, rate_hz=1000.0),
-    "haply_inverse3": _sheet(
+    "omega_3": _data_sheet(0.25, 0.3, 12.0, _OMEGA_SIZE, turn=_NO_ROTATION, **_OMEGA_READING),
+    "omega_6": _data_sheet(0.3, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
+    "omega_7": _data_sheet(0.35, 0.3, 12.0, _OMEGA_SIZE, turn=_OMEGA_ROTATION, **_OMEGA_READING),
+    "falcon": _data_sheet(
+        0.2, 0.5, 8.9, [0.102] * 3, turn=_NO_ROTATION, resolution=6.35e-5, rate_hz=1000.0
+    ),
+    "haply_inverse3": _data_sheet(
         0.2,
         0.15,
         10.0,
@@ -145,7 +148,7 @@ FIGURES: dict[str, DeviceFigures] = {
         turn_resolution=2e-3,
         rate_hz=4000.0,
     ),
-    "virtuose_6d": _sheet(
+    "virtuose_6d": _data_sheet(
         1.0,
         1.0,
         35.0,
@@ -163,7 +166,7 @@ FIGURES: dict[str, DeviceFigures] = {
 @settings
 @dataclass
 class Master:
-    """Which haptic device, and where it starts."""
+    """Haptic device and its start position."""
 
     model: str = choice(
         PHANTOM,
@@ -178,11 +181,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """The device with a hand on it.
-
-        Args:
-            hand_mass: [kg], moves with the stylus.
-            hand_inertia: [kg m^2], about every axis through E.
+        """Return the device with the hand's passive mass [kg] and inertia about E [kg m^2].
 
         Raises:
             DrakeTeleopError: as `Leader.device`.
@@ -207,36 +206,31 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """Whether it is a leader that leads joint by joint."""
         return self.leader is not None and self.leader.leads == JOINTS
 
-    def check_leads_the_pose(self, what: str) -> None:
-        """Refuses a leader that leads joint by joint.
-
-        Raises:
-            DrakeTeleopError: if it does, for what knows poses alone.
-        """
+    def check_pose_mode(self, what: str) -> None:
+        """Raise a DrakeTeleopError for a leader in joint mode; `what` names the caller."""
         if self.leads_joints:
             raise DrakeTeleopError(
-                f"{what} knows a hand that leads the pose",
+                f"{what} supports pose mode only",
                 where="master.leader.leads",
-                remedy="set it to pose there: the hand feels the same",
+                remedy="set it to pose: the rendered force is the same",
             )
 
     def steps(self) -> NDArray[np.float64]:
-        """(6,) in which its axes are read [m, rad]; 0 if exactly."""
+        """Return (6,) encoder steps of the axes [m, rad]; 0 for exact reading."""
         if self.model in (PHANTOM, LEADER):
             return np.zeros(6)
         figures = self._figures()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def own_period(self, hand_hz: float) -> float | None:
-        """Of a device that is slower than the rate of the hand [s]; None of any other."""
+        """Return the sampling period of a device slower than `hand_hz` [s], else None."""
         rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """The same, linear: its encoders have no steps either."""
+        """Return a linear copy: no Coulomb friction, no encoder steps."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -248,7 +242,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """The same with its file found from a folder."""
+        """Return a copy whose file path is relative to `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -257,10 +251,10 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Checks what belongs to which device.
+        """Check combinations of fields.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
@@ -288,20 +282,20 @@ class Master:
                     where=f"{where}.figures",
                     remedy="leave them out",
                 )
-        if self.figures is not None and self.figures.turn[1] > _STEEPEST:
+        if self.figures is not None and self.figures.turn[1] > _MAX_PITCH_RAD:
             raise DrakeTeleopError(
                 f"a pitch of {self.figures.turn[1]:g} rad: there yaw and roll are the same",
                 where=f"{where}.figures.turn",
-                remedy=f"choose at most {_STEEPEST:g} rad",
+                remedy=f"choose at most {_MAX_PITCH_RAD:g} rad",
             )
 
 
-_STEEPEST = 1.5  # rad
+_MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """The defaults for a scenario's `master.figures`: those of the model that it names.
+    """Return the defaults for a scenario's `master.figures`, from its model.
 
-    A name that is not known is left to the check of the loaded block.
+    The check of the loaded block rejects unknown names.
     """
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

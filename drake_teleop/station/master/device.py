@@ -1,4 +1,4 @@
-"""The haptic device as a block: its dynamics, one step a period."""
+"""The haptic device as a block that advances its dynamics once per period."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, 
 from drake_teleop.station.master.force_display import ForceDisplay, initial_display
 from drake_teleop.station.master.leader import LeaderArm, LeaderDevice, LeaderDisplay
 
-_LARGEST_PERIOD = 1e-3  # s, slower than any haptic device
-# The Runge-Kutta step is stable up to 2.8 for (friction's slope / inertia) * period.
-_LARGEST_FRICTION_STEP = 2.0
+_MAX_PERIOD_S = 1e-3  # s, slower than any haptic device
+# A Runge-Kutta step is stable for (slope of friction / inertia) * period up to 2.8.
+_MAX_FRICTION_STEP = 2.0
 
 
 @njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
-    """`step`, and the pose and twist that follow: one call of compiled code instead of three.
+    """Apply `step` and update pose and twist, in one compiled call.
 
-    What the display remembers (`display`, `drive[6:]`) is kept for it, beside the angles. A device
-    that is pushed by what is no force stays where it is.
+    Stores the display's memory (`display`, `drive[6:]`) beside the joint positions. With invalid
+    forces the device does not move.
     """
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
@@ -38,21 +38,21 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Checks that a step a period is short enough for the device at the joints q.
+    """Check that one step per period is stable for the device at the joints q.
 
     Raises:
-        DrakeTeleopError: if it is not, for any device or for the friction of this one.
+        DrakeTeleopError: if the period is too long for haptic devices or for the friction.
     """
-    if not 0 < period <= _LARGEST_PERIOD:
+    if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
             f"a period of {period:g} s is too long for the haptic device",
             where="master.period",
-            remedy=f"choose at most {_LARGEST_PERIOD:g} s (1 kHz); the paper uses above 2 kHz",
+            remedy=f"choose at most {_MAX_PERIOD_S:g} s (1 kHz); the paper uses above 2 kHz",
         )
     device.check_limits(q)
     slope = device.damping_matrix(q, creeping=True)
     rate = float(np.max(np.linalg.eigvals(np.linalg.solve(device.mass_matrix(q), slope)).real))
-    if rate * period > _LARGEST_FRICTION_STEP:
+    if rate * period > _MAX_FRICTION_STEP:
         raise DrakeTeleopError(
             f"the friction stops the device within {1e3 / rate:.2g} ms, too fast for a "
             f"period of {1e3 * period:g} ms",
@@ -62,33 +62,31 @@ def check_period(
 
 
 class MasterDevice(LeafSystem):
-    """The device and the passive mass of the hand on it, advanced once a period.
+    """Device with the hand's passive mass, advanced once per period.
 
-    The full nonlinear dynamics (gravity, Coriolis, friction, end stops) take one classical
-    Runge-Kutta step a period while the inputs are held. A joint at its limit runs into a stiff,
-    damped end stop.
+    One classical Runge-Kutta step of the nonlinear dynamics (gravity, Coriolis, friction, stiff
+    damped end stops) with held inputs.
 
     .. pydrake_system::
 
         name: MasterDevice
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - drive: from the force display: torque at the joints (6) [N m; N], what it remembers
+        - drive: from the force display: joint torques (6) [N m; N], memory of the display
         output_ports:
-        - state: (12,) [q; qdot] [rad, rad/s; of axes that slide m, m/s]
+        - state: (12,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - for_display: the angles (6) [rad], and what the force display remembers
+        - for_display: joint positions (6) [rad], memory of the force display
 
     Args:
         period: [s], at most 1 ms.
-        device: with the mass of the hand that moves with it; the hand's weight is carried by the
-            operator.
+        device: includes the hand's mass; the operator carries the hand's weight.
         q_initial: (6,) joints at the start [rad; in task space m, rad], at rest.
 
     Raises:
-        DrakeTeleopError: if the period is too long, for the device or for its friction, or the
-            start is beyond a joint's limit.
+        DrakeTeleopError: if the period is too long for the device or its friction, or the start
+            violates a joint limit.
     """
 
     __slots__ = ONE_DICT
@@ -101,10 +99,10 @@ class MasterDevice(LeafSystem):
         self._work = np.zeros((2, 6, 6))
         self._stages = np.zeros((3, 12))
         self._hand_wrench = self.DeclareVectorInputPort("hand_wrench_E", 6)
-        # A port of its own for what the display remembers would be a call of its own.
+        # A separate port for the display's memory would cost a further call.
         display = initial_display(q_initial, device.numbers)
         self._drive = self.DeclareVectorInputPort("drive", len(display))
-        # Pose and twist are kept beside the state: they are read more often than they change.
+        # Pose and twist are states because they are read more often than they change.
         state = np.concatenate([q_initial, np.zeros(6)])
         for name, start in (
             ("state", state),
@@ -136,14 +134,10 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Adds "master_device" and "force_display", wired to each other, of a device or a leader arm.
-
-    Args:
-        builder: the diagram.
-        period, device, q_initial: as for `MasterDevice`.
+    """Add "master_device" and "force_display" of a device or leader arm, and connect them.
 
     Returns:
-        Both; what remains to be connected is the hand's wrench and the command.
+        Both blocks; the hand's wrench and the command remain to be connected.
     """
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):

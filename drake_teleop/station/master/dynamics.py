@@ -1,6 +1,6 @@
-"""The motion of a haptic device, the Phantom's or one in task space: one row of numbers says which.
+"""Dynamics of a haptic device: the Phantom, or a device in task space.
 
-Compiled code asks the numbers (`numbers.IN_TASK_SPACE`); Python asks a `HapticDevice`.
+`numbers.IN_TASK_SPACE` selects the model in compiled code; `HapticDevice` is the Python interface.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drake_teleop.station.master.numbers import (
 
 @njit(cache=True)
 def jacobian_into(q, device, J):
-    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.jacobian_into(q, J)
     else:
@@ -35,7 +35,7 @@ def jacobian_into(q, device, J):
 
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
-    """Writes the joint forces (6,) that hold the device against its weight."""
+    """Write the joint forces (6,) that compensate the device's weight."""
     if device[IN_TASK_SPACE] != 0.0:
         out[:6] = 0.0
     else:
@@ -44,7 +44,7 @@ def gravity_torque_into(q, device, out):
 
 @njit(cache=True)
 def pose_into(q, device, pose):
-    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]."""
+    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz]."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
@@ -53,7 +53,7 @@ def pose_into(q, device, pose):
 
 @njit(cache=True)
 def twist_into(q, v, device, J, twist):
-    """Writes [v; omega] of E in B (6,) = J v; `J` (6, 6) is scratch."""
+    """Write [v; omega] of E in B (6,) = J v; `J` (6, 6) is scratch."""
     jacobian_into(q, device, J)
     for i in range(6):
         twist[i] = 0.0
@@ -63,16 +63,12 @@ def twist_into(q, v, device, J, twist):
 
 @njit(cache=True)
 def step(state, hand_wrench, motor, device, period, work, stages):
-    """One classical Runge-Kutta step of `state` (12,) [q; v] in place, inputs held.
-
-    Error per step O(period^5).
+    """Advance `state` (12,) [q; v] in place by one classical Runge-Kutta step with held inputs.
 
     Args:
-        state: (12,), changed.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
         motor: (6,) torques (or forces) at the joints.
-        device: (NUMBERS,) of the device, see `numbers`.
-        period: [s].
+        device: (NUMBERS,), see `numbers`.
         work, stages: (2, 6, 6) and (3, 12) scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
@@ -99,7 +95,7 @@ def step(state, hand_wrench, motor, device, period, work, stages):
 
 @dataclass(frozen=True)
 class HapticDevice:
-    """A device with the passive mass of a hand on it.
+    """Device with the hand's passive mass.
 
     Attributes:
         numbers: (NUMBERS,), see `numbers`.
@@ -111,74 +107,64 @@ class HapticDevice:
 
     @property
     def peak_force(self) -> float:
-        """That it displays [N]."""
+        """Largest displayed force [N]."""
         return float(self.numbers[PEAK_FORCE])
 
     @property
     def peak_torque(self) -> NDArray[np.float64]:
-        """(3,) that it displays about its three turning axes [N m]."""
+        """(3,) largest displayed torques about the rotational axes [N m]."""
         return self.numbers[PEAK_TORQUE]
 
     @property
     def num_joints(self) -> int:
-        """The number of its axes."""
         return 6
 
     @property
     def friction_field(self) -> str:
-        """Where a scenario has its friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) what the force display takes for its axes at the joints q (6,): these."""
+        """Return (6,) axes for the force display at the joints q (6,): q itself."""
         return q
 
     @property
     def is_phantom(self) -> bool:
-        """Whether its kinematics are the Phantom's; otherwise those of `task_space`."""
+        """Whether the kinematics are the Phantom's, otherwise those of `task_space`."""
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The joints (6,) that put E at X_BE (7,).
-
-        Raises:
-            DrakeTeleopError: if it is out of reach.
-        """
+        """Return the joints (6,) with E at X_BE (7,); raise if it is out of reach."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
 
     def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """X_BE (7,) at the joints q (6,)."""
+        """Return X_BE (7,) at the joints q (6,)."""
         pose = np.empty(7)
         pose_into(q, self.numbers, pose)
         return pose
 
     def check_limits(self, q: NDArray[np.float64]) -> None:
-        """Checks that the joints q (6,) are within their limits.
-
-        Raises:
-            DrakeTeleopError: if they are not.
-        """
+        """Raise a DrakeTeleopError if a joint of q (6,) is outside its limits."""
         if self.is_phantom:
             phantom.check_limits(q)
         else:
             task_space.check_limits(q, self.numbers)
 
     def at_an_end(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(N,) whether an end stop holds, at the joints q (N, 6)."""
+        """Return (N,) whether an end stop is active at the joints q (N, 6)."""
         if self.is_phantom:
             return phantom.at_an_end(q)
         return task_space.at_an_end(q, self.numbers)
 
     def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6, 6), rows [v; omega] of E in B."""
+        """Return the Jacobian (6, 6), rows [v; omega] of E in B."""
         J = np.empty((6, 6))
         jacobian_into(q, self.numbers, J)
         return J
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6, 6) with the hand."""
+        """Return the mass matrix (6, 6), with the hand."""
         if self.is_phantom:
             return phantom.mass_matrix(q, self.numbers[HAND_MASS], self.numbers[HAND_INERTIA])
         M = np.empty((6, 6))
@@ -186,11 +172,9 @@ class HapticDevice:
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """(6, 6) of the joint forces against dq/dt.
+        """Return the matrix (6, 6) of joint forces against dq/dt at q (6,).
 
-        Args:
-            q: (6,) joints.
-            creeping: with the slope of Coulomb friction at standstill.
+        `creeping` includes the slope of Coulomb friction at standstill.
         """
         if self.is_phantom:
             slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED

@@ -1,8 +1,7 @@
-"""What lies between a haptic device and the station: encoders with steps, and a rate of its own.
+"""Encoders with finite steps, and the sampling rate of a device.
 
-The hand feels the device itself; what the station reads of it is in steps of the encoders, counted
-from the start. A device that is slower than `rates.hand_hz` is read, and takes a force, at its own
-rate: both are held in between, and `force_to_master` is the force as it is held.
+Encoder steps count from the start and affect only the station's readings. A device slower than
+`rates.hand_hz` holds its reading and its force; `force_to_master` is the held force.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def read_pose_into(q, q_start, steps, device, pose):
-    """Writes X_BE (7,) as encoders read it: q (6,) to whole `steps` (6,) from `q_start` (6,)."""
+    """Write X_BE (7,) for q (6,) rounded to whole `steps` (6,) from `q_start` (6,)."""
     read = np.empty(6)
     for i in range(6):
         away = q[i] - q_start[i]
@@ -27,7 +26,7 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """The pose that the device's encoders read.
+    """Pose as read by encoders that count `steps` (6,) [m, rad] from `q_start` (6,); 0 is exact.
 
     .. pydrake_system::
 
@@ -36,11 +35,6 @@ class Encoders(LeafSystem):
         - master_state: (12,) of the device
         output_ports:
         - pose_read: (7,) X_BE
-
-    Args:
-        device: whose kinematics it is.
-        q_start: (6,) from where it counts.
-        steps: (6,) of its axes [m, rad]; 0 for one that is read exactly.
     """
 
     __slots__ = ONE_DICT
@@ -59,20 +53,16 @@ class Encoders(LeafSystem):
         read_pose_into(q, *self._constants, output.get_mutable_value())
 
 
-class Held(LeafSystem):
-    """A vector that is looked at with a rate of its own. Unlike Drake's hold it has a start.
+class SampleHold(LeafSystem):
+    """Sample and hold with `period` [s]; unlike Drake's ZeroOrderHold it has a start value.
 
     .. pydrake_system::
 
-        name: Held
+        name: SampleHold
         input_ports:
         - value: (n,)
         output_ports:
-        - held: (n,) as it was at the last look
-
-    Args:
-        period: from one look to the next [s].
-        start: (n,) before the first.
+        - held: (n,) at the last sample
     """
 
     __slots__ = ONE_DICT
@@ -81,7 +71,7 @@ class Held(LeafSystem):
         super().__init__()
         self._value = self.DeclareVectorInputPort("value", len(start))
         self.DeclareStateOutputPort("held", self.DeclareDiscreteState(start))
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(0, self._value.Eval(context))

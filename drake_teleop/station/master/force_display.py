@@ -1,4 +1,4 @@
-"""The display of force on the master: J_M^T, gravity compensation, the device's limits."""
+"""Force display of the master: J_M^T, gravity compensation, the device's limits."""
 
 from __future__ import annotations
 
@@ -24,49 +24,45 @@ from drake_teleop.station.passivity.safe_state import (
     master_limits_into,
 )
 
-# What comes from the device: its angles, and what is remembered of the last period: angles that
-# were numbers, the wrench that was displayed and the fault, whether the wrench was changed after
-# one, for how long there has been none [s], the watch. What goes to it: the motors' torque in place
-# of the angles, and what to remember.
-_places = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
-_ANGLES, _LAST_ANGLES, _LAST = _places.vector(6), _places.vector(6), _places.vector(6)
-_FAULT, _CHANGED, _SOUND = _places.number(), _places.number(), _places.number()
-_WATCH = _places.vector(MASTER_WATCH)
-_SHOWN = slice(_LAST.start, _FAULT + 1)
-_NONE, _WRENCH, _HAND, _RESUMING = map(int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING))
+# From the device: joint positions, and memory of the last period: last valid positions, displayed
+# wrench and fault, whether the wrench was changed after a fault, time since the last fault [s],
+# watch. To the device: motor torques in place of the positions, and the new memory.
+_slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
+_POSITIONS, _LAST_POSITIONS, _DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
+_FAULT, _CHANGED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
+_WATCH = _slots.vector(MASTER_WATCH)
+_DISPLAYED_AND_FAULT = slice(_DISPLAYED.start, _FAULT + 1)
+_NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING = map(
+    int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
+)
 
 
 @njit(cache=True)
-def _full(numbers):
-    """(2,) of force and torque; from the limits on the device's own hold, motor by motor."""
+def _peak_wrench(numbers):
+    """Return (2,) peak force and largest motor torque; torque is limited per motor elsewhere."""
     return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the display is told before the first period.
-
-    Args:
-        q: (6,) the device's joints.
-        numbers: (NUMBERS,) of the device.
-    """
+    """Return the display's input before the first period, for joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
-    display[_ANGLES] = display[_LAST_ANGLES] = q
-    display[_WATCH] = initial_master_watch(_full(numbers))
+    display[_POSITIONS] = display[_LAST_POSITIONS] = q
+    display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
     return display
 
 
 @njit(cache=True)
 def limit_wrench_into(wrench, numbers, J, displayed):
-    """Writes what the device of these numbers can display of `wrench` (6,) [f; tau] at E, in B.
+    """Write the part of `wrench` (6,) [f; tau] at E, in B, within the device's limits.
 
-    The force is shortened to the peak force and the torque until no wrist motor is beyond its
-    peak torque; both keep their directions. A wrench that is not finite gives zero.
+    The force is scaled to the peak force, the torque to the peak torque of each wrist motor; both
+    keep their directions. A wrench that is not finite gives zero.
     """
     for k in range(6):
         if not math.isfinite(wrench[k]):
             displayed[:] = 0.0
             return
-    # hypot does not overflow, however large the command.
+    # hypot does not overflow.
     force = math.hypot(math.hypot(wrench[0], wrench[1]), wrench[2])
     scale = 1.0 if force <= numbers[PEAK_FORCE] else numbers[PEAK_FORCE] / force
     for k in range(3):
@@ -82,7 +78,7 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Writes J_M^T F + gravity compensation (6,) for a wrench F `displayed` (6,), J (6, 6) of q."""
+    """Write J_M^T F + gravity compensation (6,) for F `displayed` (6,), J (6, 6) at q."""
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -91,43 +87,47 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 
 @njit(cache=True, borrows=True)
 def display_into(wrench, device, numbers, period, J, drive):
-    """One period of the display; see `ForceDisplay` for its safe state.
+    """Advance the display by one period; see `ForceDisplay` for its safe state.
 
     Args:
-        wrench: (6,) F_E_B that the hand shall feel.
+        wrench: (6,) F_E_B to render.
         device: (27,) of `MasterDevice`.
         numbers: (NUMBERS,) of the device.
-        period: [s].
         J: (6, 6) scratch.
-        drive: (27,) written, for `MasterDevice`; in it what is displayed, and a `Fault`.
+        drive: (27,) output for `MasterDevice`, with the displayed wrench and a `Fault`.
     """
-    q, fault = device[_ANGLES], _NONE
+    q, fault = device[_POSITIONS], _NO_FAULT
     put(drive, 6, device, 6, _WATCH.stop - 6)
     if sound(q):
-        put(drive, _LAST_ANGLES.start, q, 0, 6)
+        put(drive, _LAST_POSITIONS.start, q, 0, 6)
     else:
-        q, fault = device[_LAST_ANGLES], _HAND
+        q, fault = device[_LAST_POSITIONS], _HAND_FAULT
     if not sound(wrench):
-        fault = _WRENCH
-    displayed, drive[_FAULT] = drive[_LAST], fault
+        fault = _WRENCH_FAULT
+    displayed, drive[_FAULT] = drive[_DISPLAYED], fault
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
-    if fault != _NONE or device[_CHANGED] != 0.0:
-        _change(device, numbers, period, drive)
+    if fault != _NO_FAULT or device[_CHANGED] != 0.0:
+        _fade(device, numbers, period, drive)
     motor_torque_into(displayed, q, numbers, J, drive[:6])
 
 
 @njit(cache=True)
-def _change(device, numbers, period, drive):
-    """Of a fault, and after one: fades what was displayed, and goes over to what is wanted.
+def _fade(device, numbers, period, drive):
+    """Fade out during a fault, and cross-fade to the command afterwards.
 
-    Arguments as of `display_into`; `drive` has what is wanted and the fault, and is changed.
+    Arguments as for `display_into`; `drive` contains command and fault, and is changed.
     """
-    displayed, last, limits, full = drive[_LAST], device[_LAST], np.empty(2), _full(numbers)
-    fault = drive[_FAULT] != _NONE
-    drive[_SOUND] = 0.0 if fault else device[_SOUND] + period
-    # All of the way within STOP_TIME, so that it does not turn at once either.
-    share = 0.0 if fault else period / max(STOP_TIME + period - drive[_SOUND], period)
+    displayed, last, limits, full = (
+        drive[_DISPLAYED],
+        device[_DISPLAYED],
+        np.empty(2),
+        _peak_wrench(numbers),
+    )
+    fault = drive[_FAULT] != _NO_FAULT
+    drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
+    # Complete within STOP_TIME, so that the direction does not jump either.
+    share = 0.0 if fault else period / max(STOP_TIME + period - drive[_TIME_SINCE_FAULT], period)
     for i in range(6):
         displayed[i] = (1.0 - share) * last[i] + share * displayed[i]
     master_limits_into(not fault, fault, period, 0.0, full, last, drive[_WATCH], limits)
@@ -140,43 +140,41 @@ def _change(device, numbers, period, drive):
         drive[_FAULT] = _RESUMING
 
 
-class Numbered(Protocol):
-    """A device of any kind, as the display knows it."""
+class DisplayDevice(Protocol):
+    """Device of any kind with `numbers`."""
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
-        """(NUMBERS,), see `numbers`."""
+    def numbers(self) -> NDArray[np.float64]: ...
 
 
 class ForceDisplay(LeafSystem):
-    """Turns the wrench that the hand shall feel into motor torques of the master.
+    """Convert the wrench to render into motor torques of the master.
 
-    Safe state: while the command is no wrench, or the device's angles are no numbers, what was
-    displayed fades to zero in 50 ms, and the gravity compensation goes on, of the last good angles.
-    Afterwards the wrench comes back as after silence in a channel
-    (`drake_teleop.station.passivity.safe_state`). The memory for that is in the device's state: an
-    event of this block would cost time.
+    Safe state: with an invalid command or invalid joint positions, the displayed wrench fades to
+    zero in 50 ms; gravity compensation uses the last valid positions. Afterwards the wrench returns
+    as after silence in a channel (`station.passivity.safe_state`). The device's state contains the
+    memory, because events of this block would cost time.
 
     .. pydrake_system::
 
         name: ForceDisplay
         input_ports:
-        - wrench_command: (6,) F_E_B, [f; tau] that the hand shall feel at E, in B [N, N m]
-        - for_display: from the device: its angles (6) [rad], and what was remembered
+        - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
+        - for_display: from the device: joint positions (6) [rad], memory
         output_ports:
-        - drive: for the device: J_M^T F + gravity compensation (6) [N m], what to remember
-        - force_to_master: (6,) F, what is displayed within the device's limits [N, N m]
+        - drive: for the device: J_M^T F + gravity compensation (6) [N m], memory
+        - force_to_master: (6,) F, displayed within the device's limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two, one after the other, for a log
+        - displayed_and_fault: the last two in one vector, for a log
 
     Args:
         period: of the device [s].
-        device: what displays it.
+        device: device with `numbers`.
     """
 
     __slots__ = ONE_DICT
 
-    def __init__(self, period: float, device: Numbered) -> None:
+    def __init__(self, period: float, device: DisplayDevice) -> None:
         super().__init__()
         self._period = period
         self._numbers = device.numbers
@@ -187,7 +185,7 @@ class ForceDisplay(LeafSystem):
         self._drive = self.DeclareVectorOutputPort(
             "drive", _WATCH.stop, weak_callback(self._calc_drive), inputs
         )
-        # A log looks when the device does: for both the drive is calculated once.
+        # The log samples with the device, so the drive is calculated once.
         for name, size, calc in (
             ("force_to_master", 6, self._calc_force),
             ("fault_at_hand", 1, self._calc_fault),
@@ -206,10 +204,10 @@ class ForceDisplay(LeafSystem):
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_LAST])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT]
 
     def _calc_both(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_SHOWN])
+        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED_AND_FAULT])

@@ -1,13 +1,11 @@
-"""A leader arm: any serial arm as a haptic device, by its own dynamics, in task space.
+"""A leader arm: any serial arm as a haptic device, with its own dynamics.
 
     M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 
-The dynamics are `slave.arm`'s, of the model's file. The hand holds it at E: the point of
-`hand_frame`, along the axes of B where the arm is at home. There the hand's mass moves with it,
-whose weight the operator carries. The motors carry the arm's weight, unless it is to be felt.
-
-The force display (`force_display`) sees it as a device whose axes are E's: what it drives is the
-wrench F, in the order of `task_space`, and J^T is done here.
+The dynamics are those of `slave.arm`. The hand holds the arm at E, the point of `hand_frame`, whose
+axes equal those of B at home. The operator carries the hand's weight; the motors carry the share
+`weight_carried` of the arm's weight. For `force_display` the axes of the device are those of E; it
+commands the wrench F in the order of `task_space`, and this module applies J^T.
 """
 
 from __future__ import annotations
@@ -43,27 +41,34 @@ from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
 
 Array = NDArray[np.float64]
 
-# Rows of what belongs to the joints.
-(_COULOMB, _VISCOUS, _LOWER, _UPPER, _STOP_STIFFNESS, _STOP_DAMPING, _TORQUE_LIMIT, _CARRIED) = (
-    range(8)
-)
-# Coulomb friction is tanh(speed / this): below it a joint creeps instead of sticking.
+# Rows of `LeaderDevice.joints`.
+(
+    _COULOMB,
+    _VISCOUS,
+    _LOWER,
+    _UPPER,
+    _STOP_STIFFNESS,
+    _STOP_DAMPING,
+    _TORQUE_LIMIT,
+    _WEIGHT_SHARE,
+) = range(8)
+# Coulomb friction is tanh(speed / this), so a joint creeps below it.
 FRICTION_SPEED = 0.02  # rad/s or m/s, E
-# End stops: so fast as a spring under the joint's inertia, and critically damped, E.
+# Natural frequency of the critically damped end stops with the joint's inertia, E.
 _STOP_HZ = 12.0
 
 
 @njit(cache=True)
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
-    """Forward dynamics of leader and hand.
+    """Write the forward dynamics of leader and hand.
 
     Args:
-        arm: `ArmModel.table`, with the hand's mass, to E in B.
+        arm: `ArmModel.table` with the hand's mass, to E in B.
         joints: (8, n) of the joints, see `LeaderDevice`.
         q, v: (n,) [rad, rad/s].
-        applied: (6,) [f; tau] on E, in B: of the hand, and what carries its weight.
+        applied: (6,) [f; tau] on E, in B: of the hand, minus the hand's weight.
         motor: (n,) [N m].
-        vdot: (n,) filled.
+        vdot: (n,) output.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -86,7 +91,7 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 @njit(cache=True)
 def _pose_and_twist(arm, q, v, pose, twist):
-    """X_BE with the sign of the quaternion that `pose` had, and [v; omega] of E in B."""
+    """Write X_BE (quaternion sign as before in `pose`), and [v; omega] of E in B."""
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
@@ -106,13 +111,13 @@ def _pose_and_twist(arm, q, v, pose, twist):
 
 @njit(cache=True)
 def motors_into(bare, arm, joints, q, F, torque):
-    """Writes J^T F and what carries the arm (n,), within the motors' limits, for F (6,) at E."""
+    """Write J^T F plus weight compensation (n,), within torque limits, for F (6,) at E."""
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
     inverse_dynamics(bare, q, still, still, torque)
     jacobian(arm, q, J)
     for i in range(n):
-        torque[i] *= joints[_CARRIED, i]
+        torque[i] *= joints[_WEIGHT_SHARE, i]
         for k in range(6):
             torque[i] += J[k, i] * F[k]
         limit = joints[_TORQUE_LIMIT, i]
@@ -123,15 +128,15 @@ def motors_into(bare, arm, joints, q, F, torque):
 def step_leader(
     bare, arm, joints, hand_weight, state, pose, twist, display, hand_wrench, drive, period
 ):  # fmt: skip
-    """One classical Runge-Kutta step of `state` (2 n,) in place, inputs held; pose, twist follow.
+    """Advance `state` (2 n,) by one Runge-Kutta step with held inputs; update pose and twist.
 
     Args:
         bare, arm: tables without and with the hand.
         joints: (8, n).
-        hand_weight: [N], which the operator carries.
+        hand_weight: [N], carried by the operator.
         state, pose, twist, display: see the ports of `LeaderArm`; changed.
         hand_wrench: (6,) of the hand on E, in B.
-        drive: of the force display: F [f; tau_z, tau_y, tau_x] (6), what it remembers.
+        drive: of the force display: F [f; tau_z, tau_y, tau_x] (6), memory.
         period: [s].
     """
     n = joints.shape[1]
@@ -141,7 +146,7 @@ def step_leader(
         for i in range(3):
             F[i], F[3 + i] = drive[i], drive[5 - i]
         put(applied, 0, hand_wrench, 0, 6)
-        # Against gravity, wherever that points.
+        # The arm's own gravity vector may have any direction.
         g = arm[n, GRAVITY : GRAVITY + 3]
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         for i in range(3):
@@ -160,13 +165,12 @@ def step_leader(
         for k in range(2 * n):
             state[k] += period * total[k]
         _pose_and_twist(arm, state[:n], state[n:], pose, twist)
-    for i in range(3):  # what the display knows of where it is
+    for i in range(3):  # position for the display
         display[i] = pose[4 + i] if sound(state) else math.nan
 
 
 @njit(cache=True)
-def _strongest(bare, arm, joints, q, wrench, shortened):
-    """Writes the largest share of `wrench` (6,) that the motors can display at q, at most all."""
+def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
     n = q.shape[0]
     weight, J, share = np.empty(n), np.empty((6, n)), 1.0
     motors_into(bare, arm, joints, q, np.zeros(6), weight)
@@ -184,16 +188,16 @@ def _strongest(bare, arm, joints, q, wrench, shortened):
 
 @dataclass(frozen=True)
 class LeaderDevice:
-    """A leader arm with the passive mass of a hand on it; see `HapticDevice` for its methods.
+    """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
-        arm: its dynamics in B to E, with the hand's mass.
-        bare: the same without the hand, of which the motors carry the weight.
-        joints: (8, n) Coulomb friction [N m], damping besides the model's [N m s/rad], limits
-            [rad], stiffness and damping of the end stops, limits of torque [N m], the share of
-            their weight that the motors carry.
-        home: (n,) where E has the axes of B [rad].
-        numbers: (NUMBERS,) what the force display is told.
+        arm: dynamics in B to E, with the hand's mass.
+        bare: dynamics without the hand, for weight compensation.
+        joints: (8, n) Coulomb friction [N m], damping in addition to the model's [N m s/rad], lower
+            and upper limits [rad], stiffness and damping of the end stops, torque limits [N m],
+            compensated share of the weight.
+        home: (n,) joint positions where E has the axes of B [rad].
+        numbers: (NUMBERS,) for the force display.
         name: for messages.
     """
 
@@ -204,39 +208,31 @@ class LeaderDevice:
     numbers: Array
     name: str = "leader"
     is_phantom = False
-    #: Where a scenario has its friction.
+    #: Scenario field of the friction.
     friction_field = "master.leader"
 
     @property
     def num_joints(self) -> int:
-        """The number of joints n."""
         return self.arm.num_joints
 
     @property
     def peak_force(self) -> float:
-        """That it displays [N]; in some postures its motors give less."""
         return float(self.numbers[PEAK_FORCE])
 
     @property
     def peak_torque(self) -> Array:
-        """(3,) that it displays [N m]."""
         return self.numbers[PEAK_TORQUE]
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
-        """What the compiled code takes."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
-        """(6,) what the force display takes for its axes: where E is."""
+        """Return (6,) axes for the force display: the position of E, then zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """The joints (n,) that put E at X_BE (7,), found from home.
-
-        Raises:
-            DrakeTeleopError: if it is out of reach.
-        """
+        """Return the joints (n,) with E at X_BE (7,), from home; raise if it is out of reach."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -250,17 +246,11 @@ class LeaderDevice:
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """X_BE (7,) at the joints q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
-        """Checks that the joints q (n,) are within their limits.
-
-        Raises:
-            DrakeTeleopError: if they are not.
-        """
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
                 f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
@@ -270,36 +260,27 @@ class LeaderDevice:
             )
 
     def at_an_end(self, q: Array) -> NDArray[np.bool_]:
-        """(N,) whether an end stop holds, at the joints q (N, n)."""
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
-        """(6, n), rows [v; omega] of E in B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """(n, n) with the hand."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        """(n, n) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
 
-def of_the_joints(
+def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """(8, n) for `LeaderDevice.joints`; end stops after the inertia at home.
+    """Return (8, n) for `LeaderDevice.joints`; end stops scale with the inertia at home.
 
-    Args:
-        arm: with the hand.
-        home: (n,).
-        coulomb, viscous: (n,) friction besides the model's damping.
-        limit: (n,) of the motors.
-        carried: share of the arm's weight that the motors carry.
+    `viscous` (n,) adds to the model's damping; `carried` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
@@ -307,23 +288,23 @@ def of_the_joints(
 
 
 class LeaderArm(LeafSystem):
-    """The leader and the passive mass of the hand on it, advanced once a period.
+    """Leader with the hand's passive mass, advanced once per period.
 
     .. pydrake_system::
 
         name: LeaderArm
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand at E, in B [N, N m]
-        - drive: from `LeaderDisplay`: the wrench F (6), what it remembers
+        - drive: from `LeaderDisplay`: the wrench F (6), memory
         output_ports:
         - state: (2 n,) [q; qdot] [rad, rad/s]
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - for_display: where E is (6), and what the force display remembers
+        - for_display: position of E and zeros (6), memory of the force display
 
     Args:
         period: [s].
-        device: with the mass of the hand that moves with it.
+        device: includes the hand's mass.
         q_initial: (n,) joints at the start, at rest.
     """
 
@@ -364,24 +345,20 @@ def _hand_weight(device: LeaderDevice) -> float:
 
 
 class LeaderDisplay(ForceDisplay):
-    """The force display of a leader: no more than its motors give besides what carries it.
+    """Force display of a leader, limited by motor torques after weight compensation.
 
     .. pydrake_system::
 
         name: LeaderDisplay
         input_ports:
-        - wrench_command: (6,) F_E_B, [f; tau] that the hand shall feel at E, in B [N, N m]
+        - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
         - for_display: from `LeaderArm`
-        - state: (2 n,) of it
+        - state: (2 n,) of `LeaderArm`
         output_ports:
         - drive: for `LeaderArm`
-        - force_to_master: (6,) F, what is displayed within the limits [N, N m]
+        - force_to_master: (6,) F, displayed within the limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two, one after the other, for a log
-
-    Args:
-        period: of the device [s].
-        device: what displays it.
+        - displayed_and_fault: the last two in one vector, for a log
     """
 
     __slots__ = ()
@@ -395,7 +372,7 @@ class LeaderDisplay(ForceDisplay):
     def _calc_drive(self, context: Context, output: BasicVector) -> None:
         wrench, q = self._command.Eval(context), self._joints.Eval(context)[: self._n]
         if np.isfinite(wrench).all() and np.isfinite(q).all():
-            _strongest(*self._constants, q, wrench, self._shortened)
+            _limit_to_motors(*self._constants, q, wrench, self._shortened)
             wrench = self._shortened
         display_into(
             wrench,

@@ -1,4 +1,4 @@
-"""A leader arm out of its file: whatever the slave's arm may be read from."""
+"""A leader arm from a model file, in the formats of the slave's arm."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -14,7 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.fields import settings
 from drake_teleop.common.quantities import choice, plain, quantity
-from drake_teleop.station.master.leader import LeaderDevice, of_the_joints
+from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.master.numbers import (
     HAND_INERTIA,
     HAND_MASS,
@@ -41,7 +41,7 @@ JOINTS = "joints"
 @settings
 @dataclass
 class Leader:
-    """An arm that the hand leads; it stands so that E is at `position` when it is at home."""
+    """Arm that the operator moves; its base is placed so that E is at `position` at home."""
 
     file: str = plain("", "URDF, SDF, MJCF or .dmd.yaml, from the scenario's folder")
     package_paths: list[str] = plain(
@@ -73,15 +73,15 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Checks what needs no file.
+        """Check the fields without reading the file.
 
         Raises:
-            DrakeTeleopError: naming `where` and the field.
+            DrakeTeleopError: with `where` and the field.
         """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
                 raise DrakeTeleopError(
-                    "a leader arm needs it", where=f"{where}.{name}", remedy="name it"
+                    "is required for a leader arm", where=f"{where}.{name}", remedy="set it"
                 )
         for name in ("home", "friction", "damping", "torque_limit"):
             values = getattr(self, name)
@@ -92,7 +92,7 @@ class Leader:
                 )
 
     def found_from(self, folder: Path) -> "Leader":
-        """The same with its files found from a folder, wherever the program runs."""
+        """Return a copy with absolute paths, relative to `folder`."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -100,7 +100,7 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Adds the arm to a plant, with its base at the origin of B, which stands at X_Table.
+        """Add the arm to a plant, with its base at the origin of B; X_Table is the pose of B.
 
         Raises:
             DrakeTeleopError: if it cannot be read, see `ParseModel`.
@@ -111,15 +111,11 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """The arm with a hand on it.
-
-        Args:
-            position: (3,) p_BE at home [m].
-            hand_mass, hand_inertia: as of `Master.device`.
+        """Return the arm with the hand's passive mass; E is at p_BE = `position` (3,) [m] at home.
 
         Raises:
-            DrakeTeleopError: if it cannot be read, is no chain of joints, or a list has not as many
-                numbers as it has joints.
+            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
+                length of a list differs from the number of joints.
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)
@@ -128,14 +124,14 @@ class Leader:
         frame = parsed.sensor_frame
         arm = ArmModelFromPlant(plant, frame.model_instance(), frame.name())
         home = self._home(arm)
-        bare = _at_E(arm, home, np.array(position))
+        bare = _with_end_frame_E(arm, home, np.array(position))
         phi = bare.phi_load
         phi[0] += hand_mass
         phi[[4, 7, 9]] += hand_inertia
         held = bare.with_load(phi)
-        coulomb, viscous = (self._of_all(name, arm, 0.0) for name in ("friction", "damping"))
-        limit = self._of_all("torque_limit", arm, arm.effort_limit)
-        joints = of_the_joints(held, home, coulomb, viscous, limit, self.weight_carried)
+        coulomb, viscous = (self._per_joint(name, arm, 0.0) for name in ("friction", "damping"))
+        limit = self._per_joint("torque_limit", arm, arm.effort_limit)
+        joints = joint_parameters(held, home, coulomb, viscous, limit, self.weight_carried)
         numbers = np.zeros(NUMBERS)
         numbers[HAND_MASS], numbers[HAND_INERTIA] = hand_mass, hand_inertia
         numbers[PEAK_FORCE], numbers[PEAK_TORQUE] = self.peak_force, self.peak_torque
@@ -144,12 +140,12 @@ class Leader:
 
     def _home(self, arm: ArmModel) -> Array:
         if self.home:
-            return self._of_all("home", arm, 0.0)
+            return self._per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
-    def _of_all(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        """(n,) of a list with a number for each joint, or one for all (not of home), or none."""
+    def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
+        """Return (n,) values of a list with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(
@@ -160,13 +156,13 @@ class Leader:
         return np.broadcast_to(np.array(values if values else otherwise, float), (n,)).copy()
 
 
-def _at_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
-    """The arm to E in place of the hand's frame, standing where p_BE (3,) is E at home."""
+def _with_end_frame_E(arm: ArmModel, home: Array, p_BE: Array) -> ArmModel:
+    """Return the arm with E as end frame, and its base moved so that E is at p_BE (3,) at home."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm.table, home, R, p)
     table, n = arm.table.copy(), arm.num_joints
     table[0, TRANSLATION:PHI] += p_BE - p
-    # R at home turns the hand's frame into B: E has B's axes there.
+    # R rotates the hand's frame into B, so that E has B's axes at home.
     R_LS = table[n, ROTATION:TRANSLATION].reshape(3, 3)
     table[n, ROTATION:TRANSLATION] = (R_LS @ R.T).ravel()
     phi, upper = table[n, PHI:ROTOR], np.triu_indices(3)

@@ -1,21 +1,21 @@
-"""The numbers of a haptic device in one vector, for compiled code: a place and a name for each."""
+"""Parameters of a haptic device in one vector for compiled code, with named indices."""
 
 from __future__ import annotations
 
 from drake_teleop.station.passivity.memory import Slots
 
 NUMBERS = 31  #: length of the vector
-_places = Slots(NUMBERS)
-HAND_MASS = _places.number()  #: of the hand on the grip [kg]
-HAND_INERTIA = _places.number()  #: about every axis through E [kg m^2]
-COULOMB = _places.vector(6)  #: friction, of the device's axes [N or N m]
-VISCOUS = _places.vector(6)  #: damping, likewise [N s/m or N m s/rad]
-PEAK_FORCE = _places.number()  #: of the wrench that is displayed [N]
-PEAK_TORQUE = _places.vector(3)  #: of the three turning axes [N m]; 0: not actuated
-IN_TASK_SPACE = _places.number()  #: 1 for a device of `task_space`, 0 for the Phantom
+_slots = Slots(NUMBERS)
+HAND_MASS = _slots.number()  #: of the hand on the grip [kg]
+HAND_INERTIA = _slots.number()  #: about every axis through E [kg m^2]
+COULOMB = _slots.vector(6)  #: friction, of the device's axes [N or N m]
+VISCOUS = _slots.vector(6)  #: damping, likewise [N s/m or N m s/rad]
+PEAK_FORCE = _slots.number()  #: of the wrench that is displayed [N]
+PEAK_TORQUE = _slots.vector(3)  #: of the three turning axes [N m]; 0: not actuated
+IN_TASK_SPACE = _slots.number()  #: 1 for a device of `task_space`, 0 for the Phantom
 # Only in task space:
-MASS = _places.number()  #: that the hand feels [kg]
-INERTIA = _places.number()  #: likewise, about every axis [kg m^2]
-CENTRE = _places.vector(3)  #: of the workspace, p_B [m]
-HALF_SIZE = _places.vector(3)  #: of the workspace [m]
-TURN = _places.vector(3)  #: largest yaw, pitch and roll [rad]
+MASS = _slots.number()  #: apparent mass at the grip [kg]
+INERTIA = _slots.number()  #: likewise, about every axis [kg m^2]
+CENTRE = _slots.vector(3)  #: of the workspace, p_B [m]
+HALF_SIZE = _slots.vector(3)  #: of the workspace [m]
+TURN = _slots.vector(3)  #: largest yaw, pitch and roll [rad]

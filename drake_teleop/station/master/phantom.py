@@ -1,22 +1,14 @@
-"""The Phantom Premium 1.5 HighForce/6DoF: its closed forms and its dynamics.
+"""The Phantom Premium 1.5 HighForce/6DoF: kinematics and dynamics in closed form.
 
-Frames. B is the device's base: origin where the yaw axis meets the shoulder axis, z_B up, x_B from
-the device towards the operator. E is the stylus frame: its origin is the gimbal point, where the
-three wrist axes meet. With all joints at zero (`HOME`) the inner link points along x_B, the outer
-link hangs straight down, the stylus points along x_B and R_BE is the identity.
-
-Joints q (6,) [rad]: q1 yaw about z_B; q2 inner link, up from the horizontal; q3 outer link, from
-the downward vertical towards x_B. The five-bar makes q3 absolute: q2 alone turns nothing but the
-inner link. The wrist is yaw q4 about the outer link, pitch q5 and roll q6 about the stylus:
+B: base frame, origin at the intersection of yaw and shoulder axis, z_B up, x_B towards the
+operator. E: stylus frame at the gimbal point. At `HOME` the inner link and the stylus point along
+x_B, the outer link down. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the
+downward vertical towards x_B (absolute: q2 rotates only the inner link); wrist yaw, pitch, roll.
 
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
-    R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6)
+    R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
 
-The wrist is singular at q5 = +-90 degrees (stylus along the outer link), the main axes at
-q2 - q3 = +-90 degrees, which is beyond their limits.
-
-How sure each number is: P = read in a public source (Cavusoglu, Feygin, Tendick 2002, as used by
-mahilab/Phantom), D = the manufacturer's figure, recalled, E = an engineering estimate.
+Sources: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer; E: estimate.
 """
 
 from __future__ import annotations
@@ -52,17 +44,17 @@ WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, E
 #: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
 JOINT_LOWER = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
 JOINT_UPPER = np.radians([90.0, 119.0, 214.0, 148.5, 130.0, 167.5])
-#: Range of q2 - q3 [rad]: the five-bar folds and stretches no further, P.
+#: Range of q2 - q3 [rad], limited by the five-bar, P.
 FIVE_BAR_RANGE = (math.radians(-55.0), math.radians(65.0))
 FORCE_LIMIT = 37.5  # N, peak at the gimbal point, D
 WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6, D
 
-#: The posture in which R_BE is the identity, in the middle of the workspace.
+#: Posture with R_BE = identity, in the middle of the workspace.
 HOME = np.zeros(6)
 
-# Coulomb friction is tanh(velocity / this): below it the device creeps instead of sticking.
+# Coulomb friction is tanh(velocity / this), so the device creeps below it.
 FRICTION_SPEED = 0.01  # rad/s, E
-# End stops, a spring and a damper that never pulls back, E: 7 kN/m at the tip.
+# End stops: spring and damper that never pull, E: 7 kN/m at the tip.
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
 
@@ -94,7 +86,7 @@ _GRAVITY_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 @njit(cache=True)
 def _main_mass_matrix_into(q, M):
-    """Sets M (6, 6) to the three main axes' closed form; the rest is zero."""
+    """Write the mass matrix of the three main axes into M (6, 6); the rest is zero."""
     M[:, :] = 0.0
     M[0, 0] = (
         _YAW_CONSTANT
@@ -109,7 +101,7 @@ def _main_mass_matrix_into(q, M):
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
@@ -123,7 +115,7 @@ def jacobian_into(q, J):
     J[5, 0] = 1.0
     J[3, 2], J[4, 2] = s1, -c1
     J[3, 3], J[4, 3], J[5, 3] = -c1 * s3, -s1 * s3, c3
-    # The last two axes in the yawed frame, then turned by q1.
+    # The last two axes in the yawed frame, then rotated by q1.
     x5, y5 = -c3 * s4, c4
     J[3, 4], J[4, 4], J[5, 4] = c1 * x5 - s1 * y5, s1 * x5 + c1 * y5, -s3 * s4
     x6, y6 = c3 * c4 * c5 + s3 * s5, s4 * c5
@@ -132,10 +124,10 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
-    """Writes the whole device's mass matrix, hand and reflected motors included, into M (6, 6).
+    """Write the mass matrix with wrist, hand and reflected motors into M (6, 6).
 
-    `J` is the Jacobian at q. Each wrist link (and the hand, with the last one) is a point mass at
-    E and an inertia that is the same about every axis.
+    `J` is the Jacobian at q. Each wrist link and the hand is a point mass at E with equal moments
+    of inertia.
     """
     _main_mass_matrix_into(q, M)
     M[0, 0] += _MOTOR_1
@@ -155,7 +147,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    """Writes the torque (6,) that holds the device, wrist included, against its weight.
+    """Write the torque (6,) that compensates the weight of device and wrist.
 
     The operator carries the weight of the hand.
     """
@@ -168,7 +160,7 @@ def gravity_torque_into(q, out):
 
 @njit(cache=True)
 def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
-    """Subtracts C(q, v) v of the whole device from `torque` (6,)."""
+    """Subtract C(q, v) v of the whole device from `torque` (6,)."""
     # Main axes: Christoffel symbols of their closed-form M.
     coupling = _COUPLING * math.cos(q[1] - q[2])
     yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
@@ -190,8 +182,8 @@ def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
     for i in range(3):
         torque[i] -= J[0, i] * fx + J[1, i] * fy + J[2, i] * fz
 
-    # Wrist links: angular velocity and velocity-product acceleration from link to link. Their
-    # inertia is the same about every axis, so there is no gyroscopic moment.
+    # Wrist links: angular velocity and velocity-product acceleration from link to link. Equal
+    # moments of inertia give no gyroscopic moment.
     omega, alpha = (0.0, 0.0, v[0]), (0.0, 0.0, 0.0)
     for k in range(2, 6):
         turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
@@ -233,15 +225,13 @@ def _add_friction_and_stops(q, v, coulomb, viscous, torque):
 
 @njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
-    """Forward dynamics of device and hand; writes the joint accelerations (6,) into `vdot`.
+    """Write the joint accelerations (6,) of device and hand into `vdot`.
 
     Args:
-        q, v: joint angles and rates (6,).
+        q, v, motor_torque: (6,) of the joints.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        motor_torque: (6,) at the joints.
-        device: (NUMBERS,) of the device, see `numbers`.
+        device: (NUMBERS,), see `numbers`.
         work: (2, 6, 6) scratch.
-        vdot: (6,) written.
     """
     J, M = work[0], work[1]
     jacobian_into(q, J)
@@ -258,7 +248,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]; even the signs are continuous in q."""
+    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz], with a sign continuous in q."""
     s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
     s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
@@ -278,20 +268,8 @@ def pose_into(q, pose):
     pose[6] = L1 * math.sin(q[1]) - L2 * math.cos(q[2])
 
 
-def closed_form_mass_matrix(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The three main axes' mass matrix (3, 3) [kg m^2] without wrist, motors or hand."""
-    M = np.empty((6, 6))
-    _main_mass_matrix_into(q, M)
-    return M[:3, :3]
-
-
-def closed_form_gravity(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The three main axes' gravity torque (3,) [N m] without wrist."""
-    return np.array([0.0, _GRAVITY_2 * np.cos(q[1]), _GRAVITY_3 * np.sin(q[2])])
-
-
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The geometric Jacobian of E (6, 6), rows [v; omega] in B."""
+    """Return the geometric Jacobian of E (6, 6), rows [v; omega] in B."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     return J
@@ -300,35 +278,28 @@ def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
 def mass_matrix(
     q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
 ) -> NDArray[np.float64]:
-    """The whole device's mass matrix (6, 6) with wrist, reflected motors and hand."""
+    """Return the mass matrix (6, 6) with wrist, reflected motors and hand."""
     M = np.empty((6, 6))
     mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
     return M
 
 
 def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The torque (6,) [N m] that holds the device, wrist included, against its weight."""
+    """Return the torque (6,) [N m] that compensates the weight of device and wrist."""
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
 
 
-def potential_energy(q: NDArray[np.float64]) -> float:
-    """The device's potential energy [J], wrist included; its gradient is `gravity_torque`."""
-    weight = WRIST_MASS * GRAVITY
-    energy = (_GRAVITY_2 + weight * L1) * np.sin(q[1]) - (_GRAVITY_3 + weight * L2) * np.cos(q[2])
-    return float(energy)
-
-
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
+    """Return X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
     pose = np.empty(7)
     pose_into(q, pose)
     return pose
 
 
 def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The joint angles (6,) that put the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees.
+    """Return joint angles (6,) with the stylus at X_BE (7,), elbow up, |q5| <= 90 degrees.
 
     Raises:
         DrakeTeleopError: if the pose is out of reach or needs a joint beyond its limit.
@@ -356,9 +327,9 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The joint angles of the serial tree in `phantom.sdf` for the device's q (..., 6).
+    """Return joint angles of the serial tree in `phantom.sdf` for q (..., 6).
 
-    The tree's third joint turns relative to the inner link, the device's q3 is absolute.
+    The tree's third joint is relative to the inner link; the device's q3 is absolute.
     """
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
@@ -366,14 +337,14 @@ def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether an end stop, of a joint or of the five-bar, holds at q (N, 6)."""
+    """Return (N,) whether an end stop of a joint or the five-bar is active at q (N, 6)."""
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
     return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
-    """Raises a DrakeTeleopError for the first of six joint angles [rad] out of its range."""
+    """Raise a DrakeTeleopError for the first of six joint angles [rad] out of its range."""
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:

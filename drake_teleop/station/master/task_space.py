@@ -1,15 +1,10 @@
-"""A haptic device by its data sheet: what the hand feels of it at the grip, not how it is built.
-
-Six axes, as of a gantry with a wrist on it: three slide along x, y and z of B, three turn through
-one point E. With all turns at zero R_BE is the identity.
+"""A haptic device by its data sheet, as seen at the grip.
 
     q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 
-The device is a mass and an inertia that are the same in every direction (`apparent_mass`,
-`inertia`), Coulomb friction and damping against the grip's velocity and angular velocity, end stops
-at the workspace's faces and the turns' ends, and its weight is balanced. So a data sheet gives it,
-and so it is for a delta or a counterbalanced arm in the middle of its workspace: there the mass
-of a Phantom changes by a third from one direction to another, which this leaves out.
+Isotropic mass and inertia (`apparent_mass`, `inertia`), Coulomb friction and damping against linear
+and angular velocity, end stops at the faces of the workspace, balanced weight. This approximates a
+delta or counterbalanced arm in the middle of its workspace.
 """
 
 from __future__ import annotations
@@ -36,16 +31,16 @@ from drake_teleop.station.master.numbers import (
     VISCOUS,
 )
 
-# Coulomb friction is tanh(speed / this): below it the device creeps instead of sticking.
-SLIDING_SPEED, TURNING_SPEED = 0.002, 0.01  # m/s, rad/s, E
-# End stops, a spring and a damper that never pulls back, E.
+# Coulomb friction is tanh(speed / this), so the device creeps below it.
+FRICTION_SPEED, FRICTION_ANGULAR_SPEED = 0.002, 0.01  # m/s, rad/s, E
+# End stops: spring and damper that never pull, E.
 _STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
-_TURN_STIFFNESS, _TURN_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
+_ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Writes the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
     s4, c4 = math.sin(q[3]), math.cos(q[3])
     s5, c5 = math.sin(q[4]), math.cos(q[4])
     J[:, :] = 0.0
@@ -56,7 +51,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
-    """Writes the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
+    """Write the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
     M[:, :] = 0.0
     inertia = device[INERTIA] + device[HAND_INERTIA]
     for i in range(3):
@@ -67,8 +62,7 @@ def mass_matrix_into(q, J, device, M):
 
 
 @njit(cache=True)
-def _against(motion, coulomb, viscous, speed_of_tanh):
-    """The factor of a velocity in the friction against it."""
+def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
     speed = math.hypot(math.hypot(motion[0], motion[1]), motion[2])
     if speed < 1e-9 * speed_of_tanh:  # tanh(x) = x, without 0 / 0
         return viscous + coulomb / speed_of_tanh
@@ -76,8 +70,8 @@ def _against(motion, coulomb, viscous, speed_of_tanh):
 
 
 @njit(cache=True)
-def _stop(beyond, rate, stiffness, damping):
-    """Of an end stop that is passed by `beyond`, of either sign, at `rate`: never pulls back."""
+def _stop_force(beyond, rate, stiffness, damping):
+    """Return the force of an end stop at penetration `beyond` (either sign); it never pulls."""
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
     if beyond < 0.0:
@@ -86,49 +80,53 @@ def _stop(beyond, rate, stiffness, damping):
 
 
 @njit(cache=True)
-def _beyond(x, half):
+def _penetration(x, half):
     return x - half if x > half else (x + half if x < -half else 0.0)
 
 
 @njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
-    """Forward dynamics of device and hand; arguments as of `phantom.acceleration_into`."""
+    """Write accelerations of device and hand; arguments as `phantom.acceleration_into`."""
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS] + device[HAND_MASS]
-    drag = _against(v[:3], device[COULOMB.start], device[VISCOUS.start], SLIDING_SPEED)
+    drag = _friction_factor(v[:3], device[COULOMB.start], device[VISCOUS.start], FRICTION_SPEED)
     for i in range(3):
-        beyond = _beyond(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
-        stop = _stop(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
+        beyond = _penetration(q[i] - device[CENTRE][i], device[HALF_SIZE][i])
+        stop = _stop_force(beyond, v[i], _STOP_STIFFNESS, _STOP_DAMPING)
         vdot[i] = (hand_wrench[i] + motor[i] + stop - drag * v[i]) / mass
 
-    # Of the turns: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
+    # Rotation: alpha = sum (axis vdot + omega of the axis x axis v), solved for vdot.
     inertia = device[INERTIA] + device[HAND_INERTIA]
     omega, bias = (0.0, 0.0, v[3]), (0.0, 0.0, 0.0)
     for k in range(4, 6):
         turn = times(v[k], (J[3, k], J[4, k], J[5, k]))
         bias = plus(bias, cross(omega, turn))
         omega = plus(omega, turn)
-    drag = _against(omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], TURNING_SPEED)
-    # Joint torques: of motors and stops, then of what acts about B's axes.
-    pushed = np.empty(3)
+    drag = _friction_factor(
+        omega, device[COULOMB.start + 3], device[VISCOUS.start + 3], FRICTION_ANGULAR_SPEED
+    )
+    # Joint torques of motors and stops, then of moments about B's axes.
+    torque = np.empty(3)
     for i in range(3):
-        beyond = _beyond(q[3 + i], device[TURN][i])
-        pushed[i] = motor[3 + i] + _stop(beyond, v[3 + i], _TURN_STIFFNESS, _TURN_DAMPING)
+        beyond = _penetration(q[3 + i], device[TURN][i])
+        torque[i] = motor[3 + i] + _stop_force(
+            beyond, v[3 + i], _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING
+        )
         for k in range(3):
             about = hand_wrench[3 + k] - drag * omega[k] - inertia * bias[k]
-            pushed[i] += J[3 + k, 3 + i] * about
-    # J^T J of the turns is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
+            torque[i] += J[3 + k, 3 + i] * about
+    # J^T J of the rotational axes is [[1, 0, -s5], [0, 1, 0], [-s5, 0, 1]].
     s5 = math.sin(q[4])
-    of_two = 1.0 - s5 * s5
-    vdot[3] = (pushed[0] + s5 * pushed[2]) / (of_two * inertia)
-    vdot[4] = pushed[1] / inertia
-    vdot[5] = (pushed[2] + s5 * pushed[0]) / (of_two * inertia)
+    determinant = 1.0 - s5 * s5
+    vdot[3] = (torque[0] + s5 * torque[2]) / (determinant * inertia)
+    vdot[4] = torque[1] / inertia
+    vdot[5] = (torque[2] + s5 * torque[0]) / (determinant * inertia)
 
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Writes X_BE (7,) [qw, qx, qy, qz, px, py, pz]; even the signs are continuous in q."""
+    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz], with a sign continuous in q."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
@@ -144,10 +142,10 @@ def pose_into(q, pose):
 def damping_matrix(
     q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
 ) -> NDArray[np.float64]:
-    """(6, 6) of the joint forces against dq/dt; see `HapticDevice.damping_matrix`."""
+    """Return (6, 6) joint forces against dq/dt, as `HapticDevice.damping_matrix`."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
-    of_tanh = np.array([SLIDING_SPEED, TURNING_SPEED])
+    of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
     drag = device[VISCOUS][[0, 3]] + creeping * device[COULOMB][[0, 3]] / of_tanh
     return J.T @ np.diag(np.repeat(drag, 3)) @ J
 
@@ -155,11 +153,7 @@ def damping_matrix(
 def inverse_kinematics(
     pose: NDArray[np.float64], device: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The axes q (6,) that put the grip at X_BE (7,).
-
-    Raises:
-        DrakeTeleopError: if the pose is outside the workspace.
-    """
+    """Return the axes q (6,) with the grip at X_BE (7,); raise outside the workspace."""
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -167,28 +161,24 @@ def inverse_kinematics(
     return q
 
 
-def _beyond_workspace(
+def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    """(..., 6) which axes of q are beyond the workspace by more than a margin [m, rad]."""
+    """Return (..., 6) axes of q outside the workspace by more than a margin [m, rad]."""
     centre = np.append(device[CENTRE], np.zeros(3))
     return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
 
 
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether an end stop holds at q (N, 6); an axis that does not turn has none."""
-    return (_beyond_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
+    """Return (N,) whether an end stop is active at q (N, 6); fixed rotations have none."""
+    return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1
     )
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    """Checks that the axes q (6,) are within the workspace.
-
-    Raises:
-        DrakeTeleopError: if they are not.
-    """
-    if _beyond_workspace(q, device, 1e-9).any():
+    """Raise a DrakeTeleopError if the axes q (6,) are outside the workspace."""
+    if _outside_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))
         turns = ", ".join(f"{a:.0f}" for a in np.degrees(device[TURN]))

@@ -1,1 +1,1 @@
-"""The operator."""
+"""Block "operator": hand impedance, perception, decisions and tasks."""

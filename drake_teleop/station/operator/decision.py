@@ -1,13 +1,9 @@
-"""How the operator goes about its tasks, by eye and by feel.
+"""Decisions of the operator during a task, from vision and perceived force.
 
-The hand is moved by submovements (`minimum_jerk`). Each is planned from what is seen or felt, which
-is late, and the next one waits until the effect of the last can be seen or felt: in a network with
-delay that is move and wait (Ferrell, IEEE Trans. Hum. Factors Electron. 6, 1965). What the operator
-knows: where it sees tool and target, what it feels, the scales of motion and force and the delay of
-the line, all of which one learns in training. `docs/operator.md` has every assumption and its
-source.
-
-Plain compiled functions on arrays: `decide` is the operator's head, every `PERIOD`.
+The hand moves by submovements (`minimum_jerk`), planned from delayed perception. The next one waits
+until the effect of the last is visible: move and wait (Ferrell, IEEE Trans. Hum. Factors Electron.
+6, 1965). From training the operator has the scales of motion and force and the mean delay.
+`docs/operator.md` contains all assumptions and sources. `decide` runs every `PERIOD`.
 """
 
 from __future__ import annotations
@@ -44,28 +40,29 @@ from drake_teleop.station.operator.task import (
 Array = NDArray[np.float64]
 
 PERIOD = 0.005
-"""How often the operator looks, feels and decides [s]; a submovement takes 40 of these."""
+"""Period of perception and decision [s]; a submovement takes at least 40 periods by default."""
 
-# Of a packed task.
-_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _WITHIN, _DWELL = 0, 1, 2, 3, 6, 9, 10
+# Indices of a packed task.
+_KIND, _T_START, _TIMEOUT, _GOAL, _AXIS, _TARGET_RADIUS, _DWELL = 0, 1, 2, 3, 6, 9, 10
 _STANDOFF, _FORCE, _TOLERANCE, _DEPTH, _TASK = 11, 12, 13, 14, 15
-_STREAM = 2  # of the seed; the network's lines have others
-# Of a packed person: what it knows of the station, and how it moves, sees and feels.
-_SCALE, _GAIN, _WAIT_SEEN, _WAIT_FELT, _KEY = 0, 1, 2, 3, 4
-_ACCELERATION, _SHORTEST, _NOISE, _SPEED, _GENTLE, _SEEN_NOISE, _DEPTH_ERROR = range(5, 12)
+_STREAM = 2  # random stream; the network's lines use others
+# Indices of a packed person: training, movement and perception.
+_SCALE, _FORCE_GAIN, _VISION_WAIT, _FORCE_WAIT, _KEY = 0, 1, 2, 3, 4
+_ACCELERATION, _MIN_DURATION, _NOISE, _APPROACH_SPEED, _GENTLE_FORCE = range(5, 10)
+_VISION_NOISE, _DEPTH_ERROR = 10, 11
 _AIM_ERROR, _WEBER, _R_WB = 12, 13, 14
 
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """What the operator has learnt of its station.
+    """Station properties that the operator learns in training.
 
     Args:
-        R_WB: (3, 3) how the master's base lies in the world.
+        R_WB: (3, 3) orientation of the master's base in the world.
         translation_scale: tool over hand.
-        force_gain: felt contact force over the contact force at the tool, gamma * force_scale.
+        force_gain: rendered over true contact force, gamma * force_scale.
         forward, backward: mean one-way delays [s].
-        seed: of its noise.
+        seed: of the operator's noise.
     """
 
     R_WB: Array
@@ -77,8 +74,8 @@ class Training:
 
 
 def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
-    """(23,) for `decide`."""
-    there_and_back = training.forward + training.backward + _SETTLE
+    """Return (23,) operator parameters for `decide`."""
+    there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
     return np.array(
@@ -95,15 +92,15 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
 
 
 def pack_task(task: Task) -> Array:
-    """(15,) for `decide`."""
+    """Return (15,) task parameters for `decide`."""
     packed = np.zeros(_TASK)
     packed[[_KIND, _T_START, _TIMEOUT]] = KINDS.index(type(task)), task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
     packed[_AXIS : _AXIS + 3] = np.array(task.translation) / task.distance
     if isinstance(task, Reach):
-        packed[[_WITHIN, _DWELL]] = task.width / 2, task.dwell
+        packed[[_TARGET_RADIUS, _DWELL]] = task.width / 2, task.dwell
         return packed
-    packed[[_WITHIN, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
+    packed[[_TARGET_RADIUS, _STANDOFF]] = max(0.25 * task.standoff, 1e-3), task.standoff
     packed[_DWELL] = task.hold if isinstance(task, Press) else task.dwell
     if isinstance(task, Press):
         packed[[_FORCE, _TOLERANCE]] = task.force, task.tolerance
@@ -113,40 +110,40 @@ def pack_task(task: Task) -> Array:
     return packed
 
 
-# What has happened so far: `state` of `decide`.
+# Indices of `state` in `decide`.
 PHASE, DONE, FELT, LIMIT, TRUST, STATE = 0, 1, 2, 3, 4, 5
-"""Places in the signal task_state, and its size."""
+"""Indices of the signal task_state, and its size."""
 WAITING, MOVING, FEELING, STOPPING, PRESSING, SEEKING, OVER = range(7)
-"""Phases: not begun; by eye; careful, until contact is felt; stopping; by force; seeking the way
-into the slot; done or not."""
-# Memory: steps; when the next submovement may be planned; since when the aim is met, -1 if not;
-# learnt stiffness of what is pressed; force and move of the press before; searches so far; plan.
-_STEP, _READY, _SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES = range(7)
+"""Phases: before the start; move by vision; careful approach until contact; stop; force control;
+search for the slot; finished or given up."""
+# Memory: steps; earliest time of the next submovement; time since the aim is met, else -1;
+# estimated contact stiffness; force and move of the last press; number of searches; plan.
+_STEP, _NEXT_TIME, _MET_SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES = range(7)
 MEMORY = PLAN + PLAN_SIZE
 
-_FIXATION = 50  # steps for which the eye rests, 0.25 s
-_SETTLE = 0.05  # s, after a submovement until its effect is there, E
-_RENEW = 0.3  # s, after which a careful approach is set anew to what is trusted, E
-_DISBELIEF = 0.03  # m, seen beyond the surface without feeling it: given up, E
-_LEAST_TRUST = 0.1  # by eye alone, E
-_FIRST_STIFFNESS, _SOFTEST, _STIFFEST = 2000.0, 200.0, 50000.0  # N/m, of what is pressed, E
-_LONGEST_PRESS = 0.003  # m, of one correction by force, at the tool, E
-_STUCK = 0.5  # of the push, from which on the peg does not just slide, E
-_GIVING, _LONGEST_GIVING = 5000.0, 0.0015  # N/m and m: how one gives way to a push sideways, E
-_SPIRAL, _GOLDEN_ANGLE = 0.5e-3, 2.399963  # m times the root of the searches, E; rad
-_DEEP = 0.8  # of the depth, from which on what is felt is taken for the floor, E
+_FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
+_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, E
+_APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, E
+_MAX_PENETRATION_M = 0.03  # perceived, without contact; beyond it the task is given up, E
+_MIN_TRUST = 0.1  # with vision only, E
+# Contact stiffness [N/m], E.
+_INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
+_MAX_PRESS_M = 0.003  # m, longest force correction, at the tool, E
+_STUCK_SHARE = 0.5  # share of the push force above which the peg is stuck, E
+_YIELD_STIFFNESS, _MAX_YIELD_M = 5000.0, 0.0015  # N/m and m: compliance to lateral force, E
+_SPIRAL_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963  # m, times sqrt(number of searches), E; rad
+_FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, E
 
 
 def initial_memory() -> Array:
-    """Before the first step."""
     memory = np.zeros(MEMORY)
-    memory[_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _FIRST_STIFFNESS, 1.0
+    memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
 
 
 @njit(cache=True)
 def _to_hand(person, vector_W, out):
-    """A displacement or velocity of the tool in W -> of the hand in B."""
+    """Convert a displacement or velocity of the tool in W to one of the hand in B."""
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
@@ -154,53 +151,52 @@ def _to_hand(person, vector_W, out):
 
 
 @njit(cache=True)
-def _random(person, step, draw):
+def _random_number(person, step, draw):
     return random_normal(np.uint64(person[_KEY]), 16 * step + draw)
 
 
 @njit(cache=True)
 def look_into(person, step, displacement_W, seen_W):
-    """Writes where the tool is seen (3,), from where it is; the error is that of a fixation."""
+    """Write the perceived displacement (3,); the error is constant during a fixation."""
     for i in range(3):
-        noise = person[_SEEN_NOISE] * _random(person, step // _FIXATION, 4 + i)
+        noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
         seen_W[i] = displacement_W[i] + noise
 
 
 @njit(cache=True)
 def _submovement(person, memory, step, time, error_W):
-    """Plans a movement of the hand that takes the error away, as well as hands can."""
     change = np.empty(3)
     _to_hand(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
     # A minimum-jerk movement of this length has this peak acceleration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_ACCELERATION])
-    duration = max(duration, person[_SHORTEST])
+    duration = max(duration, person[_MIN_DURATION])
     for i in range(3):
-        change[i] += person[_NOISE] * length * _random(person, step, i)
+        change[i] += person[_NOISE] * length * _random_number(person, step, i)
     plan_move(memory, time, duration, change, np.zeros(3))
     return duration
 
 
 @njit(cache=True)
 def _pressed_force(task, person, felt):
-    """The contact's force on the tool against the axis, from what is felt in excess [N]."""
+    """Return the contact force against the axis at the tool from the excess force [N]."""
     along = 0.0
     for i in range(3):
         axis_B = 0.0
         for k in range(3):
             axis_B += person[_R_WB + 3 * k + i] * task[_AXIS + k]
         along -= felt[i] * axis_B
-    return along / person[_GAIN] if person[_GAIN] > 0.0 else 0.0
+    return along / person[_FORCE_GAIN] if person[_FORCE_GAIN] > 0.0 else 0.0
 
 
 @njit(cache=True)
-def _met(memory, time, good, still_good):
-    """Whether an aim is met, with hysteresis; since when is remembered."""
-    if memory[_SINCE] < 0.0 and good:
-        memory[_SINCE] = time
+def _is_met(memory, time, good, still_good):
+    """Return whether an aim is met, with hysteresis; store the time since when."""
+    if memory[_MET_SINCE] < 0.0 and good:
+        memory[_MET_SINCE] = time
     elif not still_good:
-        memory[_SINCE] = -1.0
-    return memory[_SINCE] >= 0.0
+        memory[_MET_SINCE] = -1.0
+    return memory[_MET_SINCE] >= 0.0
 
 
 @njit(cache=True)
@@ -210,66 +206,65 @@ def _finish(state, memory, time, outcome):
 
 
 @njit(cache=True)
-def _enter(state, memory, phase, ready):
-    state[PHASE], memory[_READY], memory[_SINCE] = phase, ready, -1.0
+def _enter_phase(state, memory, phase, ready):
+    state[PHASE], memory[_NEXT_TIME], memory[_MET_SINCE] = phase, ready, -1.0
 
 
 @njit(cache=True)
 def decide(task, person, time, seen_W, felt, state, memory):
-    """One step of the operator's head; compiled, checks nothing.
+    """Update the operator's decisions by one step; inputs are not checked.
 
     Args:
         task: of `pack_task`.
         person: of `pack_person`.
         time: now [s].
-        seen_W: (3,) the tool's displacement from its start, as it is seen now, in W [m].
-        felt: (5,) of `perceive_into`, as old as the reaction takes.
-        state: (5,) phase, 1 done or -1 given up, whether contact is noticed, threshold [N], trust;
+        seen_W: (3,) perceived displacement of the tool from its start, in W [m].
+        felt: (5,) of `perceive_into`, delayed by the reaction time.
+        state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold [N], trust;
             updated.
         memory: (MEMORY,) of `initial_memory`, updated.
     """
     step = int(memory[_STEP])
     memory[_STEP] += 1.0
     state[FELT], state[LIMIT] = felt[NOTICED], felt[THRESHOLD]
-    # The least contact at the tool that would be noticed now, over one that does no harm.
+    # Smallest detectable contact force at the tool over the harmless one.
     unnoticed = math.inf
-    if person[_GAIN] > 0.0:
-        unnoticed = felt[THRESHOLD] / (person[_GAIN] * person[_GENTLE])
-    state[TRUST] = max(1.0 / (1.0 + unnoticed), _LEAST_TRUST)
+    if person[_FORCE_GAIN] > 0.0:
+        unnoticed = felt[THRESHOLD] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
+    state[TRUST] = max(1.0 / (1.0 + unnoticed), _MIN_TRUST)
     if state[PHASE] == WAITING and time >= task[_T_START]:
-        _enter(state, memory, MOVING, time)
+        _enter_phase(state, memory, MOVING, time)
     if state[PHASE] in (WAITING, OVER):
         return
     if time - task[_T_START] > task[_TIMEOUT]:
         _finish(state, memory, time, -1.0)
     elif state[PHASE] == MOVING:
-        _move(task, person, step, time, seen_W, state, memory)
+        _move_by_vision(task, person, step, time, seen_W, state, memory)
     elif state[PHASE] == FEELING:
-        _feel(task, person, time, seen_W, felt, state, memory)
-    elif state[PHASE] == STOPPING and time >= memory[_READY]:
+        _approach(task, person, time, seen_W, felt, state, memory)
+    elif state[PHASE] == STOPPING and time >= memory[_NEXT_TIME]:
         if task[_KIND] == PRESS:
-            _enter(state, memory, PRESSING, time)
-        elif _met(memory, time, True, True) and time - memory[_SINCE] >= task[_DWELL]:
+            _enter_phase(state, memory, PRESSING, time)
+        elif _is_met(memory, time, True, True) and time - memory[_MET_SINCE] >= task[_DWELL]:
             _finish(state, memory, time, 1.0)
     elif state[PHASE] == PRESSING:
-        _press(task, person, step, time, felt, state, memory)
-    elif state[PHASE] == SEEKING and time >= memory[_READY]:
-        _seek(task, person, step, time, seen_W, felt, state, memory)
+        _control_force(task, person, step, time, felt, state, memory)
+    elif state[PHASE] == SEEKING and time >= memory[_NEXT_TIME]:
+        _search_slot(task, person, step, time, seen_W, felt, state, memory)
 
 
 @njit(cache=True)
 def _seen_target(task, person, out):
-    """Where the target is seen, from the tool's start, in W; surfaces a little off on the axis."""
-    depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random(person, 0, 15)
+    """Write the perceived target from the tool's start, in W, with depth and aim errors."""
+    depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
         if task[_KIND] == INSERT and i < 2:
-            out[i] += person[_AIM_ERROR] * _random(person, 0, 13 + i)
+            out[i] += person[_AIM_ERROR] * _random_number(person, 0, 13 + i)
 
 
 @njit(cache=True)
 def _seen_depth(task, person, seen_W):
-    """How far the tool is seen beyond the surface or the mouth, along the axis [m]."""
     target, beyond = np.empty(3), -task[_STANDOFF]
     _seen_target(task, person, target)
     for i in range(3):
@@ -278,8 +273,7 @@ def _seen_depth(task, person, seen_W):
 
 
 @njit(cache=True)
-def _move(task, person, step, time, seen_W, state, memory):
-    """By eye to the target, or to the standoff before it."""
+def _move_by_vision(task, person, step, time, seen_W, state, memory):
     error = np.empty(3)
     _seen_target(task, person, error)
     off = 0.0
@@ -287,126 +281,126 @@ def _move(task, person, step, time, seen_W, state, memory):
         error[i] -= seen_W[i]
         off += error[i] * error[i]
     off = math.sqrt(off)
-    met = _met(memory, time, off <= 0.8 * task[_WITHIN], off <= task[_WITHIN])
+    met = _is_met(memory, time, off <= 0.8 * task[_TARGET_RADIUS], off <= task[_TARGET_RADIUS])
     if task[_KIND] == REACH:
-        if met and time - memory[_SINCE] >= task[_DWELL]:
+        if met and time - memory[_MET_SINCE] >= task[_DWELL]:
             _finish(state, memory, time, 1.0)
             return
-    elif met and time >= memory[_READY]:
-        _enter(state, memory, FEELING, time)
+    elif met and time >= memory[_NEXT_TIME]:
+        _enter_phase(state, memory, FEELING, time)
         return
-    if not met and time >= memory[_READY]:
+    if not met and time >= memory[_NEXT_TIME]:
         duration = _submovement(person, memory, step, time, error)
-        memory[_READY] = time + duration + person[_WAIT_SEEN]
+        memory[_NEXT_TIME] = time + duration + person[_VISION_WAIT]
 
 
 @njit(cache=True)
-def _feel(task, person, time, seen_W, felt, state, memory):
-    """On along the axis, as fast as one trusts to notice contact, until it is noticed."""
+def _approach(task, person, time, seen_W, felt, state, memory):
+    """Approach along the axis, with a speed proportional to trust, until contact is detected."""
     if task[_KIND] == INSERT:
         if state[FELT] > 0.0 and _is_stuck(task, person, felt):
             plan_stop(memory, time)
-            _enter(state, memory, SEEKING, time + STOP + person[_WAIT_FELT])
+            _enter_phase(state, memory, SEEKING, time + STOP + person[_FORCE_WAIT])
             return
     elif state[FELT] > 0.0:
         plan_stop(memory, time)
-        _enter(state, memory, STOPPING, time + STOP + person[_WAIT_FELT])
+        _enter_phase(state, memory, STOPPING, time + STOP + person[_FORCE_WAIT])
         return
-    if _seen_depth(task, person, seen_W) > task[_DEPTH] + _DISBELIEF:
+    if _seen_depth(task, person, seen_W) > task[_DEPTH] + _MAX_PENETRATION_M:
         _finish(state, memory, time, -1.0)
-    elif time >= memory[_READY]:
+    elif time >= memory[_NEXT_TIME]:
         velocity_W, speed, change = np.empty(3), np.empty(3), np.empty(3)
         for i in range(3):
-            velocity_W[i] = state[TRUST] * person[_SPEED] * task[_AXIS + i]
+            velocity_W[i] = state[TRUST] * person[_APPROACH_SPEED] * task[_AXIS + i]
         _to_hand(person, velocity_W, speed)
         plan = memory[PLAN : PLAN + PLAN_SIZE]
         for i in range(3):
-            change[i] = 0.5 * _RENEW * (plan_at(plan, time, i)[1] + speed[i])
-        plan_move(memory, time, _RENEW, change, speed)
-        memory[_READY] = time + _RENEW
+            change[i] = 0.5 * _APPROACH_UPDATE_S * (plan_at(plan, time, i)[1] + speed[i])
+        plan_move(memory, time, _APPROACH_UPDATE_S, change, speed)
+        memory[_NEXT_TIME] = time + _APPROACH_UPDATE_S
 
 
 @njit(cache=True)
-def _judged_force(task, person, felt, memory):
-    """The contact's force against the axis; its error stays the same until it is judged anew."""
-    error = person[_WEBER] * _random(person, int(memory[_READY] / PERIOD), 3)
+def _perceived_force(task, person, felt, memory):
+    """Return the perceived force against the axis, with one error per judgement."""
+    error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
     return (1.0 + error) * _pressed_force(task, person, felt)
 
 
 @njit(cache=True)
-def _correction(task, memory, force):
-    """How far to move for the set force; how stiff what is pressed is shows in the effect."""
+def _press_displacement(task, memory, force):
+    """Return the displacement for the set force, from a stiffness learned from its effect."""
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
-        memory[_STIFFNESS] = min(max(stiffness, _SOFTEST), _STIFFEST)
+        memory[_STIFFNESS] = min(max(stiffness, _MIN_STIFFNESS), _MAX_STIFFNESS)
     move = (task[_FORCE] - force) / memory[_STIFFNESS]
-    move = min(max(move, -_LONGEST_PRESS), _LONGEST_PRESS)
+    move = min(max(move, -_MAX_PRESS_M), _MAX_PRESS_M)
     memory[_LAST_FORCE], memory[_LAST_MOVE] = force, move
     return move
 
 
 @njit(cache=True)
-def _press(task, person, step, time, felt, state, memory):
-    """Corrects the force by small submovements."""
-    force = _judged_force(task, person, felt, memory)
+def _control_force(task, person, step, time, felt, state, memory):
+    force = _perceived_force(task, person, felt, memory)
     error = abs(task[_FORCE] - force)
-    met = _met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])
-    if met and time - memory[_SINCE] >= task[_DWELL]:
+    met = _is_met(memory, time, error <= 0.5 * task[_TOLERANCE], error <= task[_TOLERANCE])
+    if met and time - memory[_MET_SINCE] >= task[_DWELL]:
         _finish(state, memory, time, 1.0)
-    elif not met and time >= memory[_READY]:
-        move = _correction(task, memory, force)
+    elif not met and time >= memory[_NEXT_TIME]:
+        move = _press_displacement(task, memory, force)
         duration = _submovement(person, memory, step, time, move * task[_AXIS : _AXIS + 3])
-        memory[_READY] = time + duration + person[_WAIT_FELT]
+        memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]
 
 
 @njit(cache=True)
 def _sideways_into(task, person, felt, out):
-    """Writes the contact's force across the axis (3,), in W, and returns its size [N]."""
+    """Write the contact force across the axis (3,), in W, and return its size [N]."""
     along, size = _pressed_force(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
         for k in range(3):
-            if person[_GAIN] > 0.0:
-                out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_GAIN]
+            if person[_FORCE_GAIN] > 0.0:
+                out[i] += person[_R_WB + 3 * i + k] * felt[k] / person[_FORCE_GAIN]
         size += out[i] * out[i]
     return math.sqrt(size)
 
 
 @njit(cache=True)
 def _is_stuck(task, person, felt):
-    """Whether the slot holds against more than sliding does."""
-    limit = _STUCK * task[_FORCE]
+    """Return whether the contact force exceeds that of sliding in the slot."""
+    limit = _STUCK_SHARE * task[_FORCE]
     sideways = _sideways_into(task, person, felt, np.empty(3))
     return _pressed_force(task, person, felt) >= limit or sideways >= limit
 
 
 @njit(cache=True)
-def _seek(task, person, step, time, seen_W, felt, state, memory):
-    """Pushes with the set force, gives way sideways, and looks around where nothing says where."""
-    force = _judged_force(task, person, felt, memory)
+def _search_slot(task, person, step, time, seen_W, felt, state, memory):
+    """Push with the set force, yield sideways, and search on a spiral without sideways force."""
+    force = _perceived_force(task, person, felt, memory)
     if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
-        _enter(state, memory, FEELING, time)
+        _enter_phase(state, memory, FEELING, time)
         return
-    deep = _seen_depth(task, person, seen_W) >= _DEEP * task[_DEPTH]
-    if deep and abs(force - task[_FORCE]) <= _STUCK * task[_FORCE]:
-        _enter(state, memory, STOPPING, time)
+    deep = _seen_depth(task, person, seen_W) >= _FLOOR_SHARE * task[_DEPTH]
+    if deep and abs(force - task[_FORCE]) <= _STUCK_SHARE * task[_FORCE]:
+        _enter_phase(state, memory, STOPPING, time)
         return
-    move, push = np.empty(3), _correction(task, memory, force)
+    move, push = np.empty(3), _press_displacement(task, memory, force)
     sideways = _sideways_into(task, person, felt, move)
-    if sideways >= state[LIMIT] / person[_GAIN]:
-        share = min(1.0 / _GIVING, _LONGEST_GIVING / sideways)
+    if sideways >= state[LIMIT] / person[_FORCE_GAIN]:
+        share = min(1.0 / _YIELD_STIFFNESS, _MAX_YIELD_M / sideways)
         for i in range(3):
             move[i] *= share
     else:
         n = memory[_SEARCHES]
         memory[_SEARCHES] += 1.0
         for k in range(2):
-            before = _SPIRAL * math.sqrt(n) * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
-            now = _SPIRAL * math.sqrt(n + 1) * math.cos(_GOLDEN_ANGLE * (n + 1) - 0.5 * math.pi * k)
+            before = _SPIRAL_M * math.sqrt(n) * math.cos(_GOLDEN_ANGLE * n - 0.5 * math.pi * k)
+            now = _SPIRAL_M * math.sqrt(n + 1)
+            now *= math.cos(_GOLDEN_ANGLE * (n + 1) - 0.5 * math.pi * k)
             move[k] = now - before
         move[2] = 0.0
     for i in range(3):
         move[i] += push * task[_AXIS + i]
     duration = _submovement(person, memory, step, time, move)
-    memory[_READY] = time + duration + person[_WAIT_FELT]
+    memory[_NEXT_TIME] = time + duration + person[_FORCE_WAIT]

@@ -1,7 +1,7 @@
-"""Moving the hand: minimum-jerk movements, planned from whatever motion it is in.
+"""Minimum-jerk movements of the hand from any initial motion.
 
-Hoff and Arbib, J. Motor Behav. 25, 1993. A plan is a part of the operator's memory: start [s],
-length [s], and coefficients of a quintic in time over length, for each axis.
+Hoff and Arbib, J. Motor Behav. 25, 1993. A plan in the operator's memory: start [s], duration [s],
+and for each axis coefficients of a quintic in normalised time.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import numpy as np
 from drake_teleop.common.compiled import njit
 
 PLAN, PLAN_SIZE = 7, 20
-"""Where the plan is in the operator's memory, and its size."""
-STOP = 0.15  # s, in which the hand stops, E
+"""Start of the plan in the operator's memory, and its size."""
+STOP = 0.15  # s, stopping time of the hand, E
 
 
 @njit(cache=True)
 def plan_at(plan, time, i):
-    """Place, speed and acceleration of axis i; after the plan's end it goes on at its speed."""
+    """Return position, speed and acceleration of axis i; speed is constant after the plan."""
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
     c = plan[2 + 6 * i : 8 + 6 * i]
@@ -32,7 +32,7 @@ def plan_at(plan, time, i):
 
 @njit(cache=True)
 def add_plan_into(memory, time, pose, twist):
-    """Adds where the operator wants to be at `time` to an intended pose (7,) and twist (6,)."""
+    """Add the plan at `time` to an intended pose (7,) and twist (6,)."""
     plan = memory[PLAN : PLAN + PLAN_SIZE]
     for i in range(3):
         x, v, _ = plan_at(plan, time, i)
@@ -42,7 +42,7 @@ def add_plan_into(memory, time, pose, twist):
 
 @njit(cache=True)
 def plan_move(memory, time, length, change, end_speed):
-    """The minimum-jerk motion from the present one, by `change` (3,), in `length`.
+    """Plan a minimum-jerk motion from the present one by `change` (3,) in `length` [s].
 
     It ends without acceleration and with the velocity `end_speed` (3,).
     """
@@ -60,7 +60,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plans from now to rest, in `STOP` seconds, as far on as the motion takes it."""
+    """Plan a stop within `STOP` seconds."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

@@ -1,10 +1,8 @@
-"""The operator: an intended path of the hand, followed through the hand's impedance.
+"""The operator: intended path of the hand, followed through the hand's impedance.
 
-The hand is a two-port: it pulls the stylus towards where the operator wants it, and gives way to
-the force that it feels. Its passive mass moves with the stylus and is part of the device.
-
-With a task the operator is closed-loop: it sees the tool and feels the stylus, both late, and plans
-its movements from them (`decision.py`, `perception.py`); the intent's segments are added to these.
+The hand pulls the stylus towards the intended pose and yields to forces. Its passive mass is part
+of the device. With a task the operator is closed-loop: delayed vision and force perception
+determine its movements (`decision.py`, `perception.py`), which add to the intent's segments.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -13,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -32,22 +30,21 @@ from drake_teleop.common.vectors import put
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import Training
-from drake_teleop.station.operator.intended import unit_pose_into
 from drake_teleop.station.operator.minimum_jerk import add_plan_into
 from drake_teleop.station.operator.perception import Perception, perceive_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-_FORCE_LIMIT = 60.0  # N, what a hand can exert on a stylus and still control, E
-_TORQUE_LIMIT = 2.0  # N m, E
+_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, E
+_MAX_TORQUE_NM = 2.0  # N m, E
 
 
 @dataclass(frozen=True)
 class HandImpedance:
-    """The hand between the operator's intent and the stylus; every value E.
+    """Impedance between intended and actual pose of the hand; all values E (estimates).
 
-    Translational values are common in the haptics literature. The inertia is that of the mass at
-    a radius of gyration of 30 mm; the rotational damping ratio is about 0.7.
+    Translational values are common in the haptics literature. The radius of gyration is 30 mm; the
+    rotational damping ratio is about 0.7.
     """
 
     mass: float  # kg, moves with the stylus
@@ -58,7 +55,7 @@ class HandImpedance:
     rotational_stiffness: float  # N m/rad
 
 
-#: The hand by grip.
+#: Hand impedance by grip.
 GRIPS = {
     "light": HandImpedance(0.10, 2.0, 50.0, 0.9e-4, 0.015, 0.5),
     "medium": HandImpedance(0.25, 8.0, 250.0, 2.25e-4, 0.035, 1.5),
@@ -69,7 +66,7 @@ GRIPS = {
 @settings
 @dataclass
 class MinimumJerk:
-    """A move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+    """Move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "when the move starts")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "how long it takes")
@@ -82,9 +79,9 @@ class MinimumJerk:
 @settings
 @dataclass
 class Sine:
-    """An oscillation that fades in and out on minimum-jerk ramps, so that it is C2 throughout.
+    """Oscillation with minimum-jerk ramps at both ends (C2).
 
-    At full swing the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
+    Between the ramps the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
     """
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "when it starts to fade in")
@@ -101,7 +98,7 @@ class Sine:
 @settings
 @dataclass
 class OperatorConfig:
-    """How the hand holds the stylus and what it wants to do with it."""
+    """Grip, intended motion and task of the operator."""
 
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
@@ -111,15 +108,15 @@ class OperatorConfig:
 
     @property
     def hand(self) -> HandImpedance:
-        """The hand's impedance."""
+        """Impedance of the hand."""
         return GRIPS[self.grip]
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
-    """The segments as an array (n, 12) for the compiled functions.
+    """Return the segments as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3). A minimum-jerk move is a ramp that never fades out, times sin(pi / 2).
+    (3), rotation (3). A minimum-jerk move is a ramp without end, times sin(pi / 2).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -137,7 +134,7 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _ramp(time, length):
-    """Minimum-jerk ramp from 0 at time 0 to 1 at `length`, and its rate."""
+    """Return the minimum-jerk ramp from 0 at time 0 to 1 at `length`, and its rate."""
     u = time / length
     if u <= 0.0:
         return 0.0, 0.0
@@ -148,10 +145,10 @@ def _ramp(time, length):
 
 @njit(cache=True)
 def intent_into(packed, start, t, pose, twist):
-    """Writes the intended pose X_BE (7,) and twist [v; omega] (6,) at time t.
+    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) at time t.
 
-    `packed` comes from `pack_intent`, `start` (7,) is X_BE before the first segment. Translations
-    add; rotations follow one another in the order of the list, each about axes of B.
+    `packed` is of `pack_intent`, `start` (7,) is X_BE before the first segment. Translations add;
+    rotations apply in the order of the list, each about axes of B.
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
@@ -178,29 +175,26 @@ def intent_into(packed, start, t, pose, twist):
         twist[3 + k] = omega[k]
 
 
-def intent_at(
-    segments: Sequence[MinimumJerk | Sine], start: NDArray[np.float64], t: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The intended motion at the times t (n,) [s].
-
-    Args:
-        segments: the intent, relative to the start pose.
-        start: (7,) X_BE before the first segment.
-
-    Returns:
-        (n, 7) poses X_BE and (n, 6) twists [v; omega] of E in B.
-    """
-    times = np.atleast_1d(np.asarray(t, dtype=float))
-    packed = pack_intent(segments)
-    poses, twists = np.empty((len(times), 7)), np.empty((len(times), 6))
-    for time, pose, twist in zip(times, poses, twists, strict=True):
-        intent_into(packed, start, time, pose, twist)
-    return poses, twists
+@njit(cache=True)
+def unit_pose_into(pose, twist, out):
+    """Write a pose (7,) with unit quaternion; return whether pose and twist (6,) are valid."""
+    square, rest = 0.0, 0.0
+    for k in range(4):
+        square += pose[k] * pose[k]
+    for k in range(7):
+        rest += pose[k] - pose[k]  # NaN unless it is finite
+    for k in range(6):
+        rest += twist[k] - twist[k]
+    if not (rest == 0.0 and 0.0 < square < math.inf):
+        return False
+    size = math.sqrt(square)
+    for k in range(7):
+        out[k] = pose[k] / size if k < 4 else pose[k]
+    return True
 
 
 @njit(cache=True)
 def _limit(vector, limit):
-    """Shortens a vector (3,) in place to `limit`, keeping its direction."""
     length = math.hypot(math.hypot(vector[0], vector[1]), vector[2])
     if length > limit:
         for k in range(3):
@@ -209,16 +203,15 @@ def _limit(vector, limit):
 
 @njit(cache=True)
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
-    """Writes the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
+    """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
 
     f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector (in B) of the
-    orientation error, the shorter way round. Both are bounded by what a hand can exert.
+    shorter rotation. Both are limited to the strength of a hand.
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
-        intent_pose, pose: (7,) X_BE wanted and actual.
-        intent_twist, twist: (6,) [v; omega] of E in B, wanted and actual.
-        wrench: (6,) written.
+        intent_pose, pose: (7,) X_BE.
+        intent_twist, twist: (6,) [v; omega] of E in B.
     """
     wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
     error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
@@ -227,15 +220,15 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
         wrench[k] += impedance[1] * (intent_twist[k] - twist[k])
         wrench[3 + k] = impedance[2] * error[k]
         wrench[3 + k] += impedance[3] * (intent_twist[3 + k] - twist[3 + k])
-    _limit(wrench[:3], _FORCE_LIMIT)
-    _limit(wrench[3:], _TORQUE_LIMIT)
+    _limit(wrench[:3], _MAX_FORCE_N)
+    _limit(wrench[3:], _MAX_TORQUE_NM)
 
 
 @njit(cache=True)
-def _wanted_into(packed, start, moving, memory, time, pose, twist):
-    """The intent's segments, and on top of them what the task asks for; no memory: no task.
+def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
+    """Write the intended motion: the intent's segments plus the task's plan.
 
-    `start` (7,) moves by itself with the twist `moving` (6,).
+    `start` (7,) moves with the twist `moving` (6,). An empty `memory` means no task.
     """
     intent_into(packed, start, time, pose, twist)
     for k in range(6):
@@ -248,8 +241,7 @@ def _wanted_into(packed, start, moving, memory, time, pose, twist):
 def _wrench_now(
     packed, start, moving, memory, time, impedance, wanted, wanted_twist, pose, twist, wrench
 ):  # fmt: skip
-    """`_wanted_into` and `hand_wrench_into` in one call of compiled code."""
-    _wanted_into(packed, start, moving, memory, time, wanted, wanted_twist)
+    _intended_motion_into(packed, start, moving, memory, time, wanted, wanted_twist)
     hand_wrench_into(impedance, wanted, wanted_twist, pose, twist, wrench)
 
 
@@ -258,20 +250,17 @@ def _look_feel_decide(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
     memory, feelings, sights, touches,
 ):  # fmt: skip
-    """One step of the operator's head, see `Operator`; compiled, checks nothing.
+    """Update perception and decision by one step; inputs are not checked.
 
     Args:
-        task, person: of `pack_task`, `pack_person`.
-        senses: (4,) of `Perception.parameters`.
-        hand_mass: [kg].
+        task, person, senses: of `pack_task`, `pack_person`, `Perception.parameters`.
         arm: the slave's table.
-        tip: (6,) the tool's tip in S, and where it starts in W [m].
-        time: now [s].
+        tip: (6,) the tool's tip in S, and its start in W [m].
         hand_wrench, twist: (6,) of the hand on the stylus and of the stylus, in B.
         slave_q: (n,) [rad].
         task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
-        sights: (m, 3) what is seen and has not reached the mind yet, a ring; updated.
-        touches: (n, 5) likewise what is felt.
+        sights: (m, 3) ring buffer of delayed vision; updated.
+        touches: (n, 5) ring buffer of delayed force perception; updated.
     """
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -281,24 +270,23 @@ def _look_feel_decide(
         for k in range(3):
             displacement[i] += R_WS[i, k] * tip[k]
     decision.look_into(person, step, displacement, sights[step % sights.shape[0]])
-    # Until contact is expected the operator learns what moving alone feels like.
+    # Before contact is expected, only the expectation is updated.
     attentive = task_state[decision.PHASE] > decision.MOVING
     felt = touches[step % touches.shape[0]]
     perceive_into(
         feelings, senses, decision.PERIOD, hand_mass, hand_wrench[:3], twist[:3], attentive, felt
     )
-    # The next to be written over is the oldest.
+    # The next entry to be overwritten is the oldest.
     seen, felt = sights[(step + 1) % sights.shape[0]], touches[(step + 1) % touches.shape[0]]
     decision.decide(task, person, time, seen, felt, task_state, memory)
 
 
-def _ring(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, k) what is on its way for `delay` [s]."""
+def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.tile(start, (round(delay / decision.PERIOD) + 1, 1))
 
 
 class Operator(LeafSystem):
-    """Holds the stylus and moves it towards the intended pose; feels what pushes back.
+    """Operator that moves the stylus towards the intended pose and perceives contact.
 
     .. pydrake_system::
 
@@ -306,25 +294,23 @@ class Operator(LeafSystem):
         input_ports:
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B
-        - intended_pose: (7,) X_BE that the operator wants, in place of the config's intent; may be
-          left unconnected
-        - intended_twist: (6,) its twist [v; omega] of E in B; unconnected zero
-        - slave_state: [q; v] of the slave, for what is seen of the tool (with a task)
+        - intended_pose: (7,) X_BE that replaces the config's intent; may be left unconnected
+        - intended_twist: (6,) its twist [v; omega] of E in B; zero if unconnected
+        - slave_state: [q; v] of the slave, for the view of the tool (with a task)
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
         - intent: (7,) the intended X_BE
-        - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is noticed, threshold of
-          the felt force [N], trust (with a task)
+        - task_state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold of
+          the rendered force [N], trust (with a task)
 
     Args:
         config: grip, intent and task.
         start: (7,) X_BE to which the intent is relative.
-        training: what a task needs to be known of the station.
-        arm: the slave's, likewise.
-        tip: (6,) the tool's tip in S and where it starts in W [m], likewise.
+        training, arm, tip: required for a task: station properties, the slave's arm, and the
+            tool's tip in S and at the start in W (6,) [m].
 
     Raises:
-        DrakeTeleopError: from the simulation, if what is intended is not finite.
+        DrakeTeleopError: during simulation, if the intended motion is not finite.
     """
 
     __slots__ = ONE_DICT
@@ -342,9 +328,13 @@ class Operator(LeafSystem):
         self._impedance = np.array(
             [hand.stiffness, hand.damping, hand.rotational_stiffness, hand.rotational_damping]
         )
-        # Segments, the pose that they are relative to, and how that moves.
+        # Segments, their reference pose and its twist.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
-        self._wanted, self._wanted_twist, self._intended = np.empty(7), np.empty(6), np.empty(7)
+        self._intent_pose, self._intent_twist, self._commanded_pose = (
+            np.empty(7),
+            np.empty(6),
+            np.empty(7),
+        )
         self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)
@@ -359,7 +349,6 @@ class Operator(LeafSystem):
         self.DeclareVectorOutputPort("intent", 7, weak_callback(self._calc_intent), moving)
 
     def _declare_intention(self) -> set[DependencyTicket]:
-        """Ports that the intention is taken from; what it depends on, besides time and task."""
         pose = self._intended_pose = self.DeclareVectorInputPort("intended_pose", 7)
         twist = self._intended_twist = self.DeclareVectorInputPort("intended_twist", 6)
         return {pose.ticket(), twist.ticket()}
@@ -372,12 +361,12 @@ class Operator(LeafSystem):
         arm: ArmModel,
         tip: NDArray[np.float64],
     ) -> DependencyTicket:
-        """Ports, states and event of the head; what the plan depends on."""
+        """Declare ports, states and event of the task; return the plan's ticket."""
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
-        self._sights = _ring(senses.vision_delay + training.backward, np.zeros(3))
-        self._touches = _ring(senses.reaction_time, nothing_felt)
-        self._head = (
+        self._sights = _ring_buffer(senses.vision_delay + training.backward, np.zeros(3))
+        self._touches = _ring_buffer(senses.reaction_time, nothing_felt)
+        self._task_parameters = (
             decision.pack_task(task),
             decision.pack_person(training, senses, config.movement),
             senses.parameters(decision.PERIOD),
@@ -404,7 +393,7 @@ class Operator(LeafSystem):
         state[3] = state[3].reshape(self._sights.shape)
         state[4] = state[4].reshape(self._touches.shape)
         _look_feel_decide(
-            *self._head,
+            *self._task_parameters,
             context.get_time(),
             self._wrench.Eval(context),
             self._twist.Eval(context),
@@ -418,19 +407,18 @@ class Operator(LeafSystem):
         return context.get_discrete_state(self._groups[1]).value()
 
     def _intention(self, context: Context) -> tuple[NDArray[np.float64], ...]:
-        """What the plan is added to: segments, the pose they are relative to, its twist."""
         if not self._intended_pose.HasValue(context):
             return self._intent
         pose = self._intended_pose.Eval(context)
         known = self._intended_twist.HasValue(context)
         twist = self._intended_twist.Eval(context) if known else self._intent[2]
-        if not unit_pose_into(pose, twist, self._intended):
+        if not unit_pose_into(pose, twist, self._commanded_pose):
             raise DrakeTeleopError(
-                f"what the operator wants at {context.get_time():g} s is no finite pose or twist",
+                f"the intended motion at {context.get_time():g} s is not a finite pose and twist",
                 where="intended_pose",
                 remedy="give X_BE [qw qx qy qz px py pz] in m, and [v; omega] in m/s, rad/s",
             )
-        return self._no_segments, self._intended, twist
+        return self._no_segments, self._commanded_pose, twist
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:
         _wrench_now(
@@ -438,8 +426,8 @@ class Operator(LeafSystem):
             self._memory(context),
             context.get_time(),
             self._impedance,
-            self._wanted,
-            self._wanted_twist,
+            self._intent_pose,
+            self._intent_twist,
             self._pose.Eval(context),
             self._twist.Eval(context),
             output.get_mutable_value(),
@@ -447,4 +435,4 @@ class Operator(LeafSystem):
 
     def _calc_intent(self, context: Context, output: BasicVector) -> None:
         time, pose, memory = context.get_time(), output.get_mutable_value(), self._memory(context)
-        _wanted_into(*self._intention(context), memory, time, pose, self._wanted_twist)
+        _intended_motion_into(*self._intention(context), memory, time, pose, self._intent_twist)

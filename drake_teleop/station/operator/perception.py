@@ -1,26 +1,14 @@
-"""When a human notices contact in what the hand feels: the operator's own detector.
+"""Contact detection by the operator, from the perceived force.
 
-**What is felt.** The stylus pushes the skin with u, the reaction to the hand's wrench without what
-accelerates the hand's own mass. Both u and the hand's velocity v pass the low-pass of kinaesthesia.
-
-**What was expected.** Who moves an object knows what it will push back with (internal models:
-Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994). Here
+The stylus exerts u on the skin: the reaction to the hand's wrench minus the inertial force of the
+hand. u and the hand's velocity v pass a low-pass. The expected force (internal model: Shadmehr and
+Mussa-Ivaldi, J. Neurosci. 14, 1994) is
 
     u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
 
-with the felt mass m, damping b, friction c and steady force u_0 (3,), learnt while moving by a
-Kalman filter of a slow random walk. The share sigma of the load's inertial force that is displayed
-is part of m, its weight of u_0.
-
-**What is noticed.** The excess e = u - u_expected, once it is as long as the threshold
-
-    max(absolute threshold, Weber fraction * held |u_expected|)
-
-A felt inertial or static force thus masks a contact; it does so for a while after it has gone
-(forward masking), as its held magnitude fades. While there is excess nothing is learnt, so that a
-contact does not become what is expected; a force that rises more slowly than one learns, does.
-
-`docs/operator.md` has the source of every number.
+A Kalman filter with random walks estimates m, b, c, u_0 while there is no contact. Contact is
+detected if |u - u_expected| reaches max(absolute threshold, Weber fraction * held |u_expected|);
+the held value decays (forward masking). Slowly rising forces become expected: `docs/operator.md`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -38,28 +26,28 @@ from drake_teleop.common.quantities import quantity
 
 Array = NDArray[np.float64]
 
-# Random walks of [m, b, c, u_0 (3)] in a second, and where they start; all E.
+# Random walks of [m, b, c, u_0 (3)] per second, and initial standard deviations; all E.
 _WALK = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
-_FIRST_DOUBT = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_RESIDUAL = 0.007  # N / sqrt(Hz), of the expectation while it is learnt: 0.1 N at 200 Hz, E
-_SLOW = 0.01  # m/s, v_0, as of the device's friction
-_PARAMETERS = 6
+_INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
+_NOISE_DENSITY = 0.007  # N / sqrt(Hz), measurement noise of the filter: 0.1 N at 200 Hz, E
+_FRICTION_SPEED = 0.01  # m/s, v_0, about that of the device's friction
+_NUM_PARAMETERS = 6
 
-# Memory: filtered u and v, likewise a sample ago (12), held |u_expected|, count, what is expected
+# Memory: filtered u and v, and those a sample ago (12), held |u_expected|, count, estimate
 # [m, b, c, u_0 (3)], and its covariance.
 _HELD, _COUNT, _THETA = 12, 13, 14
-_P = _THETA + _PARAMETERS
-SIZE = _P + _PARAMETERS**2
-"""Of the memory of `perceive_into`."""
+_P = _THETA + _NUM_PARAMETERS
+MEMORY_SIZE = _P + _NUM_PARAMETERS**2
+"""Size of the memory of `perceive_into`."""
 
-EXCESS, THRESHOLD, NOTICED, PERCEIVED = 0, 3, 4, 5
-"""Places in what `perceive_into` writes, and its size."""
+EXCESS, THRESHOLD, NOTICED, OUTPUT_SIZE = 0, 3, 4, 5
+"""Indices of the output of `perceive_into`, and its size."""
 
 
 @settings
 @dataclass
 class Perception:
-    """What a human sees and feels, how exactly and how late; see docs/operator.md."""
+    """Accuracy and delay of human vision and force perception; see docs/operator.md."""
 
     weber_fraction: float = quantity(0.1, "1", 0.0, 1.0, "just noticeable difference of a force")
     absolute_threshold: float = quantity(0.06, "N", 1e-3, 10.0, "least force that is noticed")
@@ -72,32 +60,31 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of where a slot is seen, sideways")
 
     def parameters(self, dt: float) -> Array:
-        """(4,) for `perceive_into`: Weber fraction, threshold [N], fade and smoothing per step."""
+        """Return (4,) Weber fraction, threshold [N], decay and smoothing per step."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
 
 
 def initial_memory() -> Array:
-    """The memory of `perceive_into` before the first step."""
-    memory = np.zeros(SIZE)
-    memory[_P:] = np.diag(_FIRST_DOUBT**2).ravel()
+    memory = np.zeros(MEMORY_SIZE)
+    memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
 
 
 @njit(cache=True)
 def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
-    """One step of what the hand feels; compiled, checks nothing.
+    """Update the force perception by one step; inputs are not checked.
 
     Args:
-        memory: (SIZE,) of `initial_memory`, updated.
+        memory: (MEMORY_SIZE,) of `initial_memory`, updated.
         parameters: (4,) of `Perception.parameters`.
         dt: time since the last step [s].
-        hand_mass: of the hand itself, which no skin feels [kg].
+        hand_mass: mass of the hand, whose inertial force is not perceived [kg].
         hand_force: (3,) of the hand on the stylus [N].
         velocity: (3,) of the stylus, same axes [m/s].
-        attentive: before that the operator only learns what to expect, and notices nothing.
-        out: (5,) filled: excess force on the hand (3) [N], threshold [N], 1 if it is noticed.
+        attentive: if false, update only the expectation and detect no contact.
+        out: (5,) output: excess force on the hand (3) [N], threshold [N], 1 if detected.
     """
     weber, absolute, fade, smooth = parameters
     first = memory[_COUNT] == 0.0
@@ -109,20 +96,20 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
     memory[_COUNT] += 1.0
-    # In the middle between two samples, where the difference of velocities is the acceleration.
-    speed = _SLOW * _SLOW
+    # Midway between two samples, where the velocity difference gives the acceleration.
+    speed = _FRICTION_SPEED * _FRICTION_SPEED
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
     speed = math.sqrt(speed)
     theta, expected_square, excess_square = memory[_THETA:_P], 0.0, 0.0
-    rows, excess = np.zeros((3, _PARAMETERS)), out[:3]
+    rows, excess = np.zeros((3, _NUM_PARAMETERS)), out[:3]
     for i in range(3):
         v = 0.5 * (memory[3 + i] + memory[9 + i])
         a = (memory[3 + i] - memory[9 + i]) / dt
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3 + i] = a, v, v / speed, 1.0
         felt = 0.5 * (memory[i] + memory[6 + i]) + hand_mass * a
         expected = 0.0
-        for j in range(_PARAMETERS):
+        for j in range(_NUM_PARAMETERS):
             expected += rows[i, j] * theta[j]
         excess[i] = felt - expected
         expected_square += expected * expected
@@ -132,27 +119,29 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     noticed = attentive and math.sqrt(excess_square) >= out[THRESHOLD]
     out[NOTICED] = 1.0 if noticed else 0.0
     if not noticed:
-        _learn(theta, memory[_P:].reshape(_PARAMETERS, _PARAMETERS), rows, excess, dt)
+        _update_expectation(
+            theta, memory[_P:].reshape(_NUM_PARAMETERS, _NUM_PARAMETERS), rows, excess, dt
+        )
 
 
 @njit(cache=True)
-def _learn(theta, P, rows, excess, dt):
-    """Kalman filter of a random walk; the three rows one after the other."""
-    gain = np.empty(_PARAMETERS)
-    for j in range(_PARAMETERS):
+def _update_expectation(theta, P, rows, excess, dt):
+    """Update the Kalman filter of a random walk, row by row."""
+    gain = np.empty(_NUM_PARAMETERS)
+    for j in range(_NUM_PARAMETERS):
         P[j, j] += _WALK[j] * _WALK[j] * dt
     before = theta.copy()
     for i in range(3):
-        residual, variance = excess[i], _RESIDUAL * _RESIDUAL / dt
-        for j in range(_PARAMETERS):
+        residual, variance = excess[i], _NOISE_DENSITY * _NOISE_DENSITY / dt
+        for j in range(_NUM_PARAMETERS):
             residual -= rows[i, j] * (theta[j] - before[j])
             gain[j] = 0.0
-            for k in range(_PARAMETERS):
+            for k in range(_NUM_PARAMETERS):
                 gain[j] += P[j, k] * rows[i, k]
             variance += rows[i, j] * gain[j]
-        for j in range(_PARAMETERS):
+        for j in range(_NUM_PARAMETERS):
             theta[j] += gain[j] * residual / variance
-            for k in range(_PARAMETERS):
+            for k in range(_NUM_PARAMETERS):
                 P[j, k] -= gain[j] * gain[k] / variance
 
 
@@ -171,22 +160,21 @@ def perceive(
     hand_mass: float,
     attentive: float = 0.3,
 ) -> Array:
-    """What a human would notice in a record, before the reaction time.
+    """Return the contact detection for a record, without reaction time.
 
     Args:
         t: (N,) evenly spaced times [s].
-        hand_force, velocity: (N, 3) of hand and stylus, in the same axes, as the signals
-            `hand_wrench_E` and `twist_master` have them.
-        perception: of the human.
+        hand_force, velocity: (N, 3) of hand and stylus, in the same axes, as in the signals
+            `hand_wrench_E` and `twist_master`.
+        perception: parameters.
         hand_mass: that moves with the stylus [kg].
-        attentive: from when on something can be noticed [s]; before, one learns what to expect.
+        attentive: start of detection [s]; before, only the expectation is updated.
 
     Returns:
-        (N, 5) excess of the force on the hand (3) [N], threshold [N], 1 while it is noticed.
+        (N, 5) excess of the force on the hand (3) [N], threshold [N], 1 while contact is detected.
 
     Raises:
-        DrakeTeleopError: for arrays of the wrong shape, values that are not finite, or times that
-            do not rise.
+        DrakeTeleopError: for wrong shapes, values that are not finite, or times not increasing.
     """
     rows = {"hand_force": (hand_force, 3), "velocity": (velocity, 3)}
     _, (force, speed) = checked_rows(**rows)
@@ -194,9 +182,9 @@ def perceive(
     steps = np.diff(times)
     if not len(steps) or steps.min() <= 0.0:
         raise DrakeTeleopError(
-            "does not rise", where="t", remedy="give two samples or more, in order of their time"
+            "is not increasing", where="t", remedy="give at least two samples in order of time"
         )
-    dt, out = float(np.median(steps)), np.empty((len(times), PERCEIVED))
+    dt, out = float(np.median(steps)), np.empty((len(times), OUTPUT_SIZE))
     parameters = perception.parameters(dt)
     _perceive_all(times, force, speed, parameters, dt, hand_mass, attentive, initial_memory(), out)
     return out

@@ -1,7 +1,4 @@
-"""The operator's tasks: what is to be done, where, how long and how hard; and how the hand moves.
-
-`docs/operator.md` has every assumption and its source; `decision` goes about them.
-"""
+"""Tasks and movement parameters of the operator; sources in `docs/operator.md`."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
@@ -23,14 +20,14 @@ class _Task:
 
     @property
     def distance(self) -> float:
-        """From the tool at the start to the target [m]."""
+        """Distance from the tool's start to the target [m]."""
         return math.hypot(*self.translation)
 
 
 @settings
 @dataclass
 class Reach(_Task):
-    """Brings the tool's tip into a sphere in free space and keeps it there (Fitts)."""
+    """Move the tool's tip into a sphere in free space and keep it there (Fitts)."""
 
     width: float = quantity(0.01, "m", 5e-4, 0.5, "diameter of the target")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
@@ -39,7 +36,7 @@ class Reach(_Task):
 @settings
 @dataclass
 class Touch(_Task):
-    """Approaches a surface at the target, notices contact, and stops."""
+    """Approach a surface at the target, detect contact, and stop."""
 
     standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
@@ -48,7 +45,7 @@ class Touch(_Task):
 @settings
 @dataclass
 class Press(_Task):
-    """Approaches a surface at the target and presses on it with a set force for a while."""
+    """Approach a surface at the target and press on it with a set force."""
 
     standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
     force: float = quantity(8.0, "N", 0.1, 500.0, "to press with, tool on surface")
@@ -59,7 +56,7 @@ class Press(_Task):
 @settings
 @dataclass
 class Insert(_Task):
-    """Puts the tool down into a slot whose mouth is the target, and pushes it to the floor."""
+    """Insert the tool into a slot whose mouth is the target, and push it to the floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
     standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
@@ -72,11 +69,23 @@ Task: TypeAlias = Reach | Touch | Press | Insert
 REACH, TOUCH, PRESS, INSERT = range(4)
 KINDS = (Reach, Touch, Press, Insert)
 
+#: Names of the measures that `station.task_measures` defines.
+TASK_MEASURES = (
+    "success",
+    "task_time_s",
+    "contact_force_overshoot_N",
+    "effort_Ns",
+    "task_work_J",
+    "detection_time_s",
+    "false_notices",
+    "press_error_N",
+)
+
 
 @settings
 @dataclass
 class Movement:
-    """How the operator moves; see docs/operator.md."""
+    """Parameters of the operator's movements; see docs/operator.md."""
 
     acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak, of the hand in a submovement")
     shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
@@ -88,10 +97,10 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Checks what no range of one field can say.
+    """Check that the target is farther than its tolerance or standoff.
 
     Raises:
-        DrakeTeleopError: naming `where` and the field.
+        DrakeTeleopError: with `where` and the field.
     """
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:

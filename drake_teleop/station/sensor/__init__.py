@@ -1,1 +1,1 @@
-"""The wrist sensor."""
+"""Block "wrist sensor": readings, and estimated motion of the sensor frame S."""

@@ -1,24 +1,14 @@
-"""The motion of S at the wrench's instant (long: each path, its delay and its noise together).
+"""Motion of S at the wrench's sampling instant: specific force s at So, omega and alpha, all in S.
 
-What is to be known is s (specific force of So), omega and alpha, all in S. What there is to know it
-from are the encoders, which see the angles but not their derivatives, and an accelerometer
-somewhere in the sensor's housing, which sees s and alpha but neither omega nor its own errors:
+- `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
+  No accelerometer; the whole sample has the delay of the low-pass.
+- `accelerometer` (default, as in the paper): measured alpha, s moved to So, omega from encoders.
+- `fused`: a steady-state Kalman filter per axis integrates s and alpha and corrects omega and the
+  accelerometer's drift, gain and alignment with the encoders. Fast motion follows the
+  accelerometer, slow motion the encoders.
 
-- `encoders`: the angles pass a low-pass and are differenced twice; the arm's kinematics do the
-  rest. No accelerometer is needed; everything, the wrench too, comes as late as the low-pass.
-- `accelerometer`: alpha as measured, s moved from the accelerometer's place to So, omega from the
-  encoders.
-- `fused`: the accelerometer's s and alpha are integrated to a displacement and an angle, which are
-  compared with the encoders'. The difference corrects omega and what the accelerometer reads wrong
-  (its drifting error, gain, misalignment): fast motion is the accelerometer's, slow motion the
-  encoders'. A Kalman filter for each axis in its steady state; the gains are a closed form.
-
-The paper's sensor measures accelerations along with the wrench, so `accelerometer` is the default;
-`fused` is for one that is not calibrated well, or late.
-
-The delays of all paths are known. The encoders' angles pass the low-pass that the wrench has
-passed, and the faster paths wait for the slowest, so that what leaves in one sample belongs to one
-instant.
+All delays are known. The angles pass the wrench's low-pass, and faster paths wait for the slowest,
+so that a sample belongs to one instant.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -63,40 +53,39 @@ from drake_teleop.station.sensor.sensor_chain import (
 from drake_teleop.station.slave.arm import MOTION_SIZE, sensor_motion
 
 _SOURCES = ("encoders", "accelerometer", "fused")
-#: How far an encoder's error moves So, root mean square over joints and directions [m/rad]: that of
-#: the RX90 where it works. The gains depend on its square root at most.
-_REACH = 0.4
-#: Encoders that do not round are known this well [rad], accelerometers this well [m/s^2, rad/s^2].
-_LEAST_ANGLE_STD, _LEAST_ACCELERATION_STD = 1e-8, 1e-6
+#: Displacement of So per encoder error, RMS over joints and directions [m/rad], for the RX90. The
+#: gains depend on its square root at most.
+_RMS_LEVER_M = 0.4
+#: Smallest standard deviations of angles [rad] and accelerations [m/s^2, rad/s^2].
+_MIN_ANGLE_STD, _MIN_ACCELERATION_STD = 1e-8, 1e-6
 
 # Constants: period, whether the encoders are the only source, whether they correct the
-# accelerometer, samples that wrench, acceleration and angles wait (the angles' with a fraction).
-_PERIOD, _ENCODERS, _FUSED, _WAITS = 0, 1, 2, 3
-_PLACE = 6  # (3,) of the accelerometer
-_ORIENTATION = _PLACE + 3  # (3, 3)
-_FILTERS = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
+# accelerometer, waits of wrench, acceleration and angles (fractional) in samples.
+_PERIOD, _ENCODERS, _FUSED, _DELAYS = 0, 1, 2, 3
+_POSITION = 6  # (3,) position of the accelerometer
+_ORIENTATION = _POSITION + 3  # (3, 3)
+_LOW_PASSES = _ORIENTATION + 9  # (4, 5) low-passes of the angles: the sensor's and `encoders`'
 _SECTIONS = 4
-_ANGULAR_GAINS = _FILTERS + 5 * _SECTIONS
+_ANGULAR_GAINS = _LOW_PASSES + 5 * _SECTIONS
 _LINEAR_GAINS = _ANGULAR_GAINS + 3
-# Memory: samples taken, samples for which the flag stays; what `_track` keeps of angle and
-# displacement, each with the error of the accelerometer and the last R_WS or p_WS; scratch
-# for kinematics; then by joint: velocity, acceleration, the last three angles, the low-passes;
-# last the delay line.
-_HELD = 1
+# Memory: samples taken, samples for which the flag stays; state of `_update_filters` for angle and
+# displacement, each with the accelerometer's error and the last R_WS or p_WS; scratch for
+# kinematics; per joint: velocity, acceleration, last three angles, low-passes; delay line.
+_FLAG_SAMPLES = 1
 _ANGULAR = 2
-_TRACK = 24
-_LINEAR = _ANGULAR + _TRACK
-_MOTION = _LINEAR + _TRACK
+_FILTER_SIZE = 24
+_LINEAR = _ANGULAR + _FILTER_SIZE
+_MOTION = _LINEAR + _FILTER_SIZE
 _JOINTS = _MOTION + MOTION_SIZE
 _PER_JOINT = 5 + 2 * _SECTIONS
-#: In the last row of `ArmModel.table`.
+#: Index in the last row of `ArmModel.table`.
 _GRAVITY = 22
 
 
 @settings
 @dataclass
 class MotionEstimationConfig:
-    """From what the motion of the sensor is estimated."""
+    """Source of the estimated motion of the sensor."""
 
     source: str = choice(
         "accelerometer", _SOURCES, "what angular velocity and accelerations come from"
@@ -114,12 +103,12 @@ class MotionEstimationConfig:
 
 @dataclass(frozen=True)
 class Delays:
-    """How old what leaves the sensor is, at low frequencies [s].
+    """Delays at low frequencies [s].
 
     Args:
-        wrench, acceleration, encoders: of each path, before it waits; the encoders' after the
-            low-passes that they pass here.
-        sample: of everything in a sample: the slowest path's that the source uses.
+        wrench, acceleration, encoders: delay of each path before waiting; the encoders' with the
+            low-passes of this module.
+        sample: delay of a sample: that of the slowest path in use.
     """
 
     wrench: float
@@ -130,14 +119,12 @@ class Delays:
 
 @dataclass(frozen=True)
 class SteadyState:
-    """A steady-state Kalman filter of position, rate and the error of a measured acceleration.
+    """Steady-state Kalman filter of position, rate and error of a measured acceleration.
 
-    Args:
-        gains: (3,) by which a difference of positions corrects the position [1], the rate [1/s]
-            and the acceleration [1/s^2].
-        innovation_std: of that difference, before the correction, in the position's unit.
-        position_std: of the corrected position.
-        crossover_hz: above it the accelerometer weighs more, below it the positions.
+    Attributes:
+        gains: (3,) of the innovation for position [1], rate [1/s] and acceleration [1/s^2].
+        innovation_std, position_std: standard deviations, in the position's unit.
+        crossover_hz: the accelerometer dominates above it, the positions below it.
     """
 
     gains: NDArray[np.float64]
@@ -149,27 +136,26 @@ class SteadyState:
 def steady_state(
     position_std: float, acceleration_std: float, drift: float, period: float
 ) -> SteadyState:
-    """The gains for white noise of the position, white noise and random walk of the acceleration.
+    """Return the filter for white position noise, white noise and random walk of the acceleration.
 
     The model is x_k = x_{k-1} + T v_k, v_k = v_{k-1} + T (a_{k-1} - e_{k-1} - noise). With
     u = (1 - z)(1 - 1/z) the spectrum of the innovations is, up to a factor,
-    u^3 + (acceleration_std T^2 / position_std)^2 u + (drift T^2.5 / position_std)^2, a cubic
-    whose roots give the three poles, and they the gains (spectral factorisation; e.g. Anderson and
-    Moore, Optimal Filtering, ch. 9).
+    u^3 + (acceleration_std T^2 / position_std)^2 u + (drift T^2.5 / position_std)^2. Its roots give
+    the poles and the gains (spectral factorisation; Anderson and Moore, Optimal Filtering, ch. 9).
 
     Args:
         position_std: of each measured position, any unit.
         acceleration_std: of each measured acceleration [that unit / s^2].
-        drift: of the acceleration's error, its random walk [that unit / s^2 / sqrt(s)], positive.
+        drift: random walk of the acceleration's error [that unit / s^2 / sqrt(s)], positive.
         period: T [s].
     """
     white = (acceleration_std * period**2 / position_std) ** 2
     walk = (drift * period**2.5 / position_std) ** 2
-    # In units of `scale` the roots are of order one, and numpy finds them well.
+    # Scaled, the roots are of order one and well conditioned.
     scale = max(np.sqrt(white), np.cbrt(walk))
     u = scale * np.roots([1.0, 0.0, white / scale**2, walk / scale**3]).astype(complex)
     root = np.sqrt(u * u - 4.0 * u)
-    # Each root u belongs to two numbers delta = 1 - z; the stable pole is inside the unit circle.
+    # Each root u has two solutions delta = 1 - z; the stable pole is inside the unit circle.
     delta = np.where(abs(2.0 - u - root) < abs(2.0 - u + root), u + root, u - root) / 2.0
     z = 1.0 - delta
     keeps = np.prod(z).real
@@ -185,12 +171,12 @@ def steady_state(
 
 
 def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, period: float) -> Delays:
-    """How late each path is, and with it the sample.
+    """Return the delays of all paths and of the sample.
 
-    The wrench waits whole samples, so that nothing is interpolated but the encoders' angles.
+    The wrench waits whole samples, so that only the encoders' angles are interpolated.
     """
     wrench, acceleration, encoders = sensor.delays(period)
-    encoders += _lag(_filters(config, sensor, period)) * period
+    encoders += _group_delay(_filters(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
     waits = np.ceil((max(sources) - wrench) / period - 1e-6)
     sample = wrench + max(waits, 0.0) * period
@@ -200,22 +186,22 @@ def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, perio
 def motion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[SteadyState, SteadyState]:
-    """The filters of source `fused`: of angles [rad], and of displacements of So [m]."""
+    """Return the filters of source `fused` for angles [rad] and displacements of So [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
         steady_state(angle_std, alpha_std.mean(), drift, period),
-        steady_state(angle_std * _REACH, s_std.mean(), config.acceleration_drift, period),
+        steady_state(angle_std * _RMS_LEVER_M, s_std.mean(), config.acceleration_drift, period),
     )
 
 
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """(9,) noise of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
+    """Return (9,) noise of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
 
-    Next to `WristSensorConfig.wrench_std`: if that is of raw samples, before the low-pass, so is
-    this. Nothing for omega, whose noise is small.
+    As `WristSensorConfig.wrench_std`, before a low-pass after the converter. The small noise of
+    omega counts as 0.
     """
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
@@ -230,23 +216,23 @@ def estimated_motion_std(
     if sensor.low_pass == "after_converter":
         power /= np.mean(np.abs(response[0] * response[1]) ** 2)
     alpha = _angle_std(sensor, num_joints) * np.sqrt(power)
-    return np.repeat([alpha * _REACH, 0.0, alpha], 3)
+    return np.repeat([alpha * _RMS_LEVER_M, 0.0, alpha], 3)
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Rounding of the angles, as an angle about any axis of S [rad].
+    """Return the rounding error of the angles as rotation about any axis of S [rad].
 
-    n axes of any direction: each direction gets a third of their variance.
+    Assumption: n joint axes of random direction; each direction has a third of their variance.
     """
-    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _LEAST_ANGLE_STD)
+    rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
 
 def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3,) of s, moved to So, which adds alpha x r, and of alpha."""
-    std = np.maximum(sensor.motion_std(), _LEAST_ACCELERATION_STD)
+    """Return (3,) standard deviations of s, moved to So (adds alpha x r), and of alpha."""
+    std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
     x, y, z = p_SoAo_S**2
@@ -257,29 +243,24 @@ def _accelerometer_std(
 def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What `estimate_into` needs: constants, and its memory before the first reading.
+    """Return constants and initial memory of `estimate_into` for an arm with n joints.
 
-    Args:
-        config: what the motion is estimated from.
-        sensor: what the readings come from, as far as a maker's sheet says it: delays, filter,
-            noise, place and orientation of the accelerometer.
-        num_joints: n, of the arm.
-        period: of the sensor [s].
+    `sensor` gives the nominal delays, filter, noise and pose of the accelerometer.
 
     Raises:
-        DrakeTeleopError: if the low-pass of the encoders is too near to half of the sensor's rate.
+        DrakeTeleopError: if the encoders' bandwidth is 0.45 of the sensor's rate or more.
     """
     delays = path_delays(config, sensor, period)
     paths = np.array([delays.wrench, delays.acceleration, delays.encoders])
     used = np.array([True, config.source != "encoders", True])
     waits = np.where(used, delays.sample - paths, 0.0) / period
-    # Rounding must not turn three samples into two and a fraction.
+    # Remove rounding errors of whole numbers.
     waits = np.where(np.abs(waits - np.rint(waits)) < 1e-6, np.rint(waits), waits)
     p_SoAo_S, R_SA = sensor.accelerometer()
     angular, linear = motion_gains(config, sensor, num_joints, period)
     constants = np.concatenate(
         [
-            # What an ideal accelerometer reads is not to be corrected.
+            # An ideal accelerometer needs no correction.
             [period, config.source == "encoders", config.source == "fused" and not sensor.ideal],
             waits,
             p_SoAo_S,
@@ -296,7 +277,7 @@ def motion_estimator(
 def _filters(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    """(4, 5) second-order sections that the angles pass; those that are not there do nothing."""
+    """Return (4, 5) second-order sections for the angles; unused ones have b0 = 1, else 0."""
     filters = np.zeros((_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
@@ -313,22 +294,20 @@ def _filters(
     return filters
 
 
-def _lag(sections: NDArray[np.float64]) -> float:
-    """Group delay of second-order sections at zero frequency [samples]."""
+def _group_delay(sections: NDArray[np.float64]) -> float:
     b0, b1, b2, a1, a2 = sections.T
     return float(np.sum((b1 + 2 * b2) / (b0 + b1 + b2) - (a1 + 2 * a2) / (1 + a1 + a2)))
 
 
 @njit(cache=True)
 def estimate_into(constants, memory, arm, reading, sample):
-    """One reading of the sensor (13 + n,) becomes one sample (16 + n,), all of one instant.
+    """Convert one reading (13 + n,) of `read_into` to one sample (16 + n,) of a single instant.
 
-    Called once for each period. At the first reading everything settles on it, at rest.
+    Call it once per period. At the first reading all filters settle on it, at rest.
 
     Args:
         constants, memory: of `motion_estimator`.
         arm: `ArmModel.table`.
-        reading: see `drake_teleop.station.sensor.sensor_chain.read_into`.
         sample: see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
@@ -337,9 +316,9 @@ def estimate_into(constants, memory, arm, reading, sample):
     angles = sample[JOINT_POSITION]
     put(angles, 0, reading, READ_ANGLES.start, n)
     if starts:
-        settle(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
-    low_pass(constants[_FILTERS:_ANGULAR_GAINS], joints[5 * n :], angles)
-    _wait(constants, memory, n, reading, sample)
+        settle(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
+    low_pass(constants[_LOW_PASSES:_ANGULAR_GAINS], joints[5 * n :], angles)
+    _delay_paths(constants, memory, n, reading, sample)
     if starts:
         for i in range(3 * n):
             joints[2 * n + i] = angles[i % n]
@@ -348,15 +327,15 @@ def estimate_into(constants, memory, arm, reading, sample):
     if constants[_ENCODERS] != 0.0:
         put(sample, MOTION.start, motion, 0, 9)
     else:
-        _accelerate(constants, memory, arm[n, _GRAVITY:], motion, sample)
+        _convert_accelerometer(constants, memory, arm[n, _GRAVITY:], motion, sample)
     memory[0] += 1.0
 
 
 @njit(cache=True)
-def _wait(constants, memory, n, reading, sample):
-    """Each path waits: wrench, and the accelerometer in the place of s and omega, and angles.
+def _delay_paths(constants, memory, n, reading, sample):
+    """Delay wrench, accelerometer (written in place of s and omega) and angles.
 
-    The flag stays for as long as any part of the reading waits.
+    The saturation flag stays while any part of its reading waits.
     """
     angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
@@ -369,27 +348,28 @@ def _wait(constants, memory, n, reading, sample):
     if memory[0] == 0.0:
         for k in range(1, rows):
             put(line, k * width, line, 0, width)
-    wrench = int(constants[_WAITS]) * width
-    acceleration = int(constants[_WAITS + 1]) * width
+    wrench = int(constants[_DELAYS]) * width
+    acceleration = int(constants[_DELAYS + 1]) * width
     waited, read = sample[WRENCH], sample[MOTION]
     for i in range(6):
         waited[i] = line[wrench + i]
         read[i] = line[acceleration + 6 + i]
-    wait = int(constants[_WAITS + 2])
-    older = constants[_WAITS + 2] - wait
+    wait = int(constants[_DELAYS + 2])
+    older = constants[_DELAYS + 2] - wait
     encoders = wait * width + 12
     before = min(wait + 1, rows - 1) * width + 12
     for i in range(n):
         angles[i] = (1.0 - older) * line[encoders + i] + older * line[before + i]
-    memory[_HELD] = float(rows) if reading[READ_SATURATED] != 0.0 else max(memory[_HELD] - 1.0, 0.0)
-    sample[SATURATED] = 1.0 if memory[_HELD] > 0.0 else 0.0
+    flagged = float(rows) if reading[READ_SATURATED] != 0.0 else memory[_FLAG_SAMPLES] - 1.0
+    memory[_FLAG_SAMPLES] = max(flagged, 0.0)
+    sample[SATURATED] = 1.0 if memory[_FLAG_SAMPLES] > 0.0 else 0.0
 
 
 @njit(cache=True)
 def _differentiate(constants, joints, angles):
-    """Backward differences of second order: they belong to the last sample, not to half before.
+    """Update velocity and acceleration by backward differences of second order.
 
-    The acceleration only for source `encoders`: without its low-pass it would be all rounding.
+    Only source `encoders` gets the acceleration: without low-pass, rounding dominates it.
     """
     n, period = angles.shape[0], constants[_PERIOD]
     for i in range(n):
@@ -401,10 +381,10 @@ def _differentiate(constants, joints, angles):
 
 
 @njit(cache=True)
-def _accelerate(constants, memory, gravity, motion, sample):
-    """s, omega and alpha in `sample` from the accelerometer's reading that stands in it.
+def _convert_accelerometer(constants, memory, gravity, motion, sample):
+    """Convert the accelerometer's reading in `sample` to s, omega and alpha.
 
-    `motion` is what the encoders say, with no acceleration.
+    `motion` is the encoders' motion without accelerations.
     """
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
@@ -419,19 +399,19 @@ def _accelerate(constants, memory, gravity, motion, sample):
         if starts:
             put(angular, 3, omega, 0, 3)
             put(angular, 15, R, 0, 9)
-        _turned(angular[15:], R, motion)
+        _rotation_vector_into(angular[15:], R, motion)
         put(angular, 15, R, 0, 9)
         for i in range(3):
             alpha[i] -= angular[12 + i]
-        _track(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
+        _update_filters(constants[_ANGULAR_GAINS:], period, motion, alpha, angular)
         for i in range(3):
             angular[12 + i] -= motion[i]
             alpha[i] += motion[i]
             angular[6 + i] = alpha[i]
             omega[i] = angular[3 + i] + 0.5 * period * alpha[i]
 
-    # From Ao to So: what the rotation adds over r = p_SoAo_S goes.
-    r, w = three(constants, _PLACE), three(omega, 0)
+    # From Ao to So, with r = p_SoAo_S.
+    r, w = three(constants, _POSITION), three(omega, 0)
     s[0], s[1], s[2] = minus(s, plus_cross(cross(alpha, r), w, cross(w, r)))
     if fused:
         if starts:
@@ -440,9 +420,9 @@ def _accelerate(constants, memory, gravity, motion, sample):
             motion[i] = motion[9 + i] - linear[15 + i]
             linear[15 + i] = motion[9 + i]
             s[i] -= linear[12 + i]
-        a_W = motion[3:6]  # what the encoders said of omega is used up
+        a_W = motion[3:6]  # reuses the encoders' omega
         a_W[0], a_W[1], a_W[2] = plus(apply(R, s), gravity)
-        _track(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
+        _update_filters(constants[_LINEAR_GAINS:], period, motion, a_W, linear)
         correction = apply(transposed(R), motion)
         for i in range(3):
             linear[12 + i] -= correction[i]
@@ -451,8 +431,8 @@ def _accelerate(constants, memory, gravity, motion, sample):
 
 
 @njit(cache=True)
-def _turned(before, R, angle):
-    """The rotation vector from one R_WS (by rows) to the next, in S, as long as it is small."""
+def _rotation_vector_into(before, R, angle):
+    """Write the rotation vector from one R_WS (by rows) to the next, in S, for small angles."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0
@@ -462,20 +442,17 @@ def _turned(before, R, angle):
 
 
 @njit(cache=True)
-def _track(gains, period, moved, acceleration, kept):
-    """One step of the three filters of `steady_state`.
+def _update_filters(gains, period, moved, acceleration, kept):
+    """Update the three filters of `steady_state`.
 
-    Between two samples the rate is that of their middle; the acceleration's mean around a sample is
-    Numerov's, so that the two integrations are exact to the fourth order.
+    The rate belongs to the middle between two samples. The mean acceleration is Numerov's, so that
+    both integrations are of fourth order.
 
     Args:
-        gains: of `steady_state`.
-        period: [s].
-        moved: (3,) how far the encoders say that it went since the last sample; becomes the
-            correction of the acceleration.
+        moved: (3,) encoder displacement since the last sample; becomes the acceleration correction.
         acceleration: (3,) now.
-        kept: by how much the estimated position is behind (3), the rate half a sample ago (3), the
-            last acceleration and the one before (6); all are updated but the last acceleration.
+        kept: estimated position error (3), rate half a sample ago (3), last acceleration and the
+            one before (6); updated, except for the last acceleration.
     """
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0

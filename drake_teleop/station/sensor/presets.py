@@ -1,4 +1,4 @@
-"""Wrist sensors by name."""
+"""Presets of wrist sensors by name."""
 
 from __future__ import annotations
 
@@ -18,15 +18,10 @@ def _with_imu(
     torque_noise: float,
     **others: Any,
 ) -> WristSensorConfig:
-    """A sensor of wrenches beside which an IMU stands, that of the ATI's record.
+    """Return a wrench sensor with the IMU of the ATI record.
 
-    Args:
-        side: range of fx and fy [N].
-        along: of fz [N].
-        bending: of tx and ty [N m].
-        twist: of tz [N m].
-        force_noise, torque_noise: white, 1 sigma of a sample [N, N m].
-        **others: what else is not as `WristSensorConfig` has it.
+    Ranges: `side` of fx, fy and `along` of fz [N], `bending` of tx, ty and `twist` of tz [N m].
+    Noise: white, 1 sigma per sample [N, N m].
     """
     figures: dict[str, Any] = {
         "p_SoAo_S": [0.0, 0.0, 0.05],
@@ -116,43 +111,36 @@ PRESETS: dict[str, WristSensorConfig] = {
         force_latency=2e-3,
     ),
 }
-"""Sensors by name.
+"""Sensors by name, with the sources of their values.
 
-jr3_85m35a3: JR3 85M35A3-I40-D 200N12, the paper's. Ranges of force and torque: its name and data
-sheet. S lies on the flange, and the acceleration part in the middle of the housing, 35 mm high.
-Noise, quantum, ranges of acceleration: estimates. Filter: one of those that can be selected. Drift:
-0.5 N in 10 min, between the records of the ATI. Walks of force and torque: the Allan deviation at 1
-to 2.5 s of a force sensor on a UR5 at rest (kkufieta/ur5_modeling_force_estimate, No10); of the
-specific force: 0.2 mg at 30 s, what MEMS accelerometers have; of the angular acceleration: in the
-ratio of the noises, as it is made of accelerometers a few centimetres apart. No latency: force and
-acceleration go through the same converter, filter and line.
+jr3_85m35a3: JR3 85M35A3-I40-D 200N12 of the paper. Force and torque ranges: data sheet. S is on the
+flange, the accelerometer in the middle of the 35 mm housing. Noise, quantum and acceleration ranges
+are estimates. Drift: 0.5 N in 10 min, between the ATI records. Walks of force and torque: Allan
+deviation at 1 to 2.5 s of a UR5 force sensor at rest (kkufieta/ur5_modeling_force_estimate, No10);
+of specific force: 0.2 mg at 30 s (typical for MEMS); of angular acceleration: in the ratio of the
+noises. Latency is zero: force and acceleration share converter, filter and line.
 
-ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU on an end effector, as recorded by A. Skrede
-(doi 10.5281/zenodo.11075229). The white noise is what the record at rest has from one sample to the
-next (Allan deviation at one sample, 698 Hz and 254 Hz; the standard deviation would count the arm's
-vibration): force 0.018, 0.019, 0.018 N, torque 0.0012, 0.0010, 0.0003 N m, specific force 0.061,
-0.060, 0.031 m/s^2, here their root mean squares. The spectrum of tz is white up to 349 Hz, so the
-low-pass, 300 Hz for the mechanics (an estimate), stands before the noise. Offsets, axes of the IMU
-and its lag of 6 ms: fits to the same records. Quantum and range of the IMU: steps of 2.44e-4 g in
-its record, 16 bits of +-8 g. Ranges of the Gamma: SI-130-10, an estimate, as are the place of the
-IMU and its angular acceleration: differences of a gyroscope's samples, without a walk. The record
-at rest lasts 1 s: the other walks and the drift are those of the other preset.
+ati_gamma_imu: ATI Gamma with NetBox and MPU6886 IMU, recorded by A. Skrede (doi
+10.5281/zenodo.11075229). White noise: Allan deviation at one sample at rest (698 and 254 Hz), RMS
+over the axes. The spectrum of tz is white up to 349 Hz, so the low-pass (300 Hz, mechanics, an
+estimate) is before the noise. Offsets, IMU axes and its lag of 6 ms: fits to these records. IMU
+quantum and range: steps of 2.44e-4 g, 16 bits of +-8 g. Estimates: ranges of the Gamma (SI-130-10),
+place of the IMU, angular acceleration (gyroscope differences, no walk). Other walks and drift: as
+jr3_85m35a3.
 
-The others: ranges are the makers' figures, recalled and not read again, and so are the noise of the
-FT 300 and of Franka's estimate, and the quantum of the Mini45; all else is an estimate, and of the
-offset the paper's. An IMU like the ATI's is thought to stand beside them, but in the Bota sensors,
-which have one. `ur5e_built_in` and `franka_estimated` are what a robot says without a sensor of its
-user's own: of the first the maker gives a precision of 3.5 N and 0.2 N m (here three deviations),
-of the second an accuracy of 0.8 N, which depends on the posture: here errors of gain and
-cross-talk, and a walk. Set `rates.sensor_hz` to the real one's rate: 7000 (ATI), 800 (Bota), 100
-(Robotiq), 500 (OnRobot, UR), 1000 (Franka), and lower `bandwidth_hz` where that asks for it.
+Others: ranges, the noise of FT 300 and Franka and the quantum of the Mini45 are the makers' values
+from memory; the rest are estimates, and the offset is the paper's. All except the Bota sensors get
+the ATI's IMU. `ur5e_built_in`: precision 3.5 N and 0.2 N m (three sigma). `franka_estimated`:
+accuracy 0.8 N, modelled by gain errors, cross-talk and a walk. Set `rates.sensor_hz` to the real
+rate: 7000 (ATI), 800 (Bota), 100 (Robotiq), 500 (OnRobot, UR), 1000 (Franka); reduce `bandwidth_hz`
+accordingly.
 """
 
 
 def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """The defaults for a scenario's block `wrist_sensor`: those of the preset that it names.
+    """Return the defaults for a scenario's block `wrist_sensor`, from its preset.
 
-    A name that is not known is left to the check of the loaded block.
+    The check of the loaded block rejects unknown names.
     """
     name = (block or {}).get("preset")
     return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))

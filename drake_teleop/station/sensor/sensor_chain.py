@@ -1,7 +1,4 @@
-"""The wrist sensor as a chain of small parts (long: their parameters beside what they do).
-
-The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool, the motion of the
-sensor frame S, and the joints' angles. A reading is what the electronics put out. Between them::
+"""The wrist sensor as a chain from true wrench, motion of S and joint angles to readings::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |
@@ -9,18 +6,10 @@ sensor frame S, and the joints' angles. A reading is what the electronics put ou
                 -> offset + drift -> quantisation -> saturation -> [low-pass] -> latency of its path
     joints' angles           -> quantisation --------------------------------> latency of its path
 
-The acceleration part measures at its own place Ao, along its own axes A: specific force and angular
-acceleration. Angular velocity is not measured.
-
-The low-pass stands in one of two places. In the JR3 it is digital: its converter works at the full
-rate, the signal processor filters what comes out, noise and quantisation steps included
-(`after_converter`). An analog filter against aliasing, or a mechanical one, stands before the
-electronics that make the noise (`before_noise`).
-
-Each part is a group of fields of `WristSensorConfig` that is off when it is zero; `without` turns
-parts off by name. Calibration errors are off in the presets of sensors: what a maker's calibration
-sheet leaves is far below the bound of 1 % that is stated for such sensors, an error that is
-constant can be calibrated away, and a study of errors wants to see this one on its own.
+The accelerometer at Ao with axes A measures specific force and angular acceleration. The low-pass
+is analog or mechanical (`before_noise`), or digital as in the JR3 (`after_converter`). Each part is
+a group of fields of `WristSensorConfig`; `without` switches parts off. Calibration errors are off
+by default.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -45,30 +34,30 @@ from drake_teleop.load.regressor import (
     WRENCH,
 )
 
-#: Samples that share one block of random numbers: one event of a noise source, one step of a walk.
+#: Samples per block of random numbers: one event of a noise source, one step of a walk.
 NOISE_BLOCK = 128
 _CHANNELS = 12
 #: Standard normal numbers for NOISE_BLOCK samples: 12 for each, then 12 for the random walks.
 NOISE_SIZE = _CHANNELS * (NOISE_BLOCK + 1)
 
-#: Of what is in `drake_teleop.station.sensor.presets`.
+#: Keys of `drake_teleop.station.sensor.presets.PRESETS`.
 PRESET_NAMES = (
     *("ideal", "jr3_85m35a3", "ati_gamma_imu", "ati_mini45", "bota_sensone", "bota_rokubi"),
     *("robotiq_ft300", "onrobot_hex_e", "ur5e_built_in", "franka_estimated"),
 )
-_LOW_PASS = ("none", "before_noise", "after_converter")
+_LOW_PASS_CHOICES = ("none", "before_noise", "after_converter")
 _SECTIONS = 2  # second-order sections of the fourth-order low-pass
-_ROTATION_ERROR = 1e-6
-# No sensor survives this many ranges of its own.
-_OVERLOAD = 10.0
-# A low-pass overshoots what saturates: by 11 % of a step, which may be from one end to the other.
-_OVERSHOOT = 1.5
+_ROTATION_TOLERANCE = 1e-6
+# Overload limit in ranges.
+_OVERLOAD_FACTOR = 10.0
+# The low-pass overshoots by 11 % of a step, which may be two ranges.
+_OVERSHOOT_FACTOR = 1.5
 
 
 @settings
 @dataclass
 class WristSensorConfig:
-    """A force/torque sensor with accelerometers; the defaults are the paper's, `jr3_85m35a3`."""
+    """Force/torque sensor with accelerometers; the defaults are the paper's, `jr3_85m35a3`."""
 
     preset: str = field(
         default="custom",
@@ -98,7 +87,9 @@ class WristSensorConfig:
         [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "its axes, row by row"
     )
 
-    low_pass: str = choice("after_converter", _LOW_PASS, "where the low-pass stands, if anywhere")
+    low_pass: str = choice(
+        "after_converter", _LOW_PASS_CHOICES, "where the low-pass stands, if anywhere"
+    )
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
     force_noise: float = quantity(0.25, "N", 0.0, 100.0, "white, 1 sigma of each raw sample")
@@ -138,31 +129,14 @@ class WristSensorConfig:
     encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of the joints' angles, likewise")
 
     def noise_std(self) -> NDArray[np.float64]:
-        """The 12 standard deviations of the white noise [N, N m, m/s^2, rad/s^2], raw."""
-        return np.repeat(
-            [
-                self.force_noise,
-                self.torque_noise,
-                self.acceleration_noise,
-                self.angular_acceleration_noise,
-            ],
-            3,
-        )
+        """Return (12,) standard deviations of raw white noise [N, N m, m/s^2, rad/s^2]."""
+        return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
     def random_walk(self) -> NDArray[np.float64]:
-        """The 12 random walks: standard deviation after one second, in units per sqrt(s)."""
-        return np.repeat(
-            [
-                self.force_walk,
-                self.torque_walk,
-                self.acceleration_walk,
-                self.angular_acceleration_walk,
-            ],
-            3,
-        )
+        """Return (12,) standard deviations of the random walks after 1 s, in units per sqrt(s)."""
+        return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
-        """The 12 ranges in the order of the noise."""
         return np.concatenate(
             [
                 self.force_range,
@@ -173,46 +147,42 @@ class WristSensorConfig:
         )
 
     def largest_wrench(self) -> NDArray[np.float64]:
-        """(6,) beyond which a reading is none [N, N m]."""
-        share = _OVERSHOOT if self.saturates and not self.ideal else _OVERLOAD
+        """Return (6,) the largest valid reading [N, N m]."""
+        share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """(6,) weights for an estimator: noise and quantisation, never quite zero [N, N m].
+        """Return (6,) noise and quantisation for an estimator, at least 1e-6 [N, N m].
 
-        Of raw samples: before the low-pass if that comes after the converter.
+        For raw samples: before a low-pass after the converter.
         """
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """(9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
+        """Return (9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
 
-        Of raw samples, as the wrench's. Nothing for omega: the rounding of the encoders is
-        differentiated, and the filter takes its high frequencies away; what is left is small.
+        For raw samples. Omega counts as exact: filtered encoder rounding is small.
         """
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
     def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """p_SoAo_S (3,) [m] and R_SA (3, 3) as calibrated: So and S if the sensor is ideal."""
+        """Return p_SoAo_S (3,) [m] and R_SA (3, 3); So and S for an ideal sensor."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
 
     def latencies(self, period: float) -> NDArray[np.int64]:
-        """(3,) samples that force, acceleration and encoders are late, without the low-pass.
-
-        Whole samples: each latency is rounded to the nearest multiple of the period [s].
-        """
+        """Return (3,) latencies of force, acceleration and encoders, in whole samples."""
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
     def delays(self, period: float) -> NDArray[np.float64]:
-        """(3,) how old force, acceleration and encoders are when they are read [s].
+        """Return (3,) delays of force, acceleration and encoder readings [s].
 
-        Latency, and the group delay of the low-pass at zero frequency for the first two.
+        Latency; for the first two plus the low-pass's group delay at zero frequency.
         """
         delays = self.latencies(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
@@ -222,18 +192,10 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Checks what the ranges of the fields cannot say.
-
-        Args:
-            where: the place for the message.
-            rate_hz: the sensor's sampling rate [Hz].
-
-        Raises:
-            DrakeTeleopError: naming `where` and the field.
-        """
+        """Raise a DrakeTeleopError if R_SA is no rotation or the bandwidth is too high."""
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
-        if error > _ROTATION_ERROR or np.linalg.det(R_SA) < 0:
+        if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
             raise DrakeTeleopError(
                 "is not a rotation: its rows are not unit vectors at right angles, right-handed",
                 where=f"{where}.R_SA",
@@ -248,32 +210,21 @@ class WristSensorConfig:
             )
 
 
-#: The parts by name, and the fields that turn each of them off.
+_CALIBRATION = (
+    *("gain_error", "cross_talk", "misalignment"),
+    *("acceleration_gain_error", "acceleration_misalignment"),
+)
+_QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
+#: Parts by name, with the field values that switch them off.
 PARTS: dict[str, dict[str, Any]] = {
-    "calibration": {
-        "gain_error": 0.0,
-        "cross_talk": 0.0,
-        "misalignment": 0.0,
-        "acceleration_gain_error": 0.0,
-        "acceleration_misalignment": 0.0,
-    },
+    "calibration": dict.fromkeys(_CALIBRATION, 0.0),
     "place": {
         "p_SoAo_S": [0.0] * 3,
         "R_SA": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
     },
     "low_pass": {"low_pass": "none"},
-    "noise": {
-        "force_noise": 0.0,
-        "torque_noise": 0.0,
-        "acceleration_noise": 0.0,
-        "angular_acceleration_noise": 0.0,
-    },
-    "random_walk": {
-        "force_walk": 0.0,
-        "torque_walk": 0.0,
-        "acceleration_walk": 0.0,
-        "angular_acceleration_walk": 0.0,
-    },
+    "noise": {f"{name}_noise": 0.0 for name in _QUANTITIES},
+    "random_walk": {f"{name}_walk": 0.0 for name in _QUANTITIES},
     "offset": {"offset": [0.0] * 6, "acceleration_offset": [0.0] * 6},
     "drift": {"drift": [0.0] * 6},
     "quantisation": {"resolution": 0.0, "encoder_resolution": 0.0},
@@ -283,7 +234,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
-    """A copy of the sensor with some of its `PARTS` off.
+    """Return a copy of the sensor with some of its `PARTS` off.
 
     >>> without(WristSensorConfig(), "noise", "offset").force_noise
     0.0
@@ -293,17 +244,10 @@ def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Fourth-order Butterworth low-pass as two second-order sections, bilinear, prewarped.
+    """Return (2, 5) rows [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
 
-    The poles of `scipy.signal.butter`, whose import would double that of a scenario, and whose
-    sections have the gain of all in the first: `settle` takes each for one of unit gain.
-
-    Args:
-        cutoff_hz: -3 dB frequency [Hz], below half the rate.
-        rate_hz: sampling rate [Hz].
-
-    Returns:
-        (2, 5) rows [b0, b1, b2, a1, a2], each of unit gain at zero frequency.
+    Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires. The
+    poles equal those of `scipy.signal.butter`, whose import is slow.
     """
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_SECTIONS, 5))
@@ -323,11 +267,10 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """What the channels make of the truth: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
+    """Return the calibration matrices: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
 
-    (1 + gains + cross-talk) times the small rotation of the misalignment. Gains and cross-talk are
-    uniform inside their bounds, the axis of the misalignment has any direction. Always the same
-    numbers are drawn, so that one error does not change when another is switched on.
+    (1 + gains + cross-talk) times the rotation of the misalignment. Gains and cross-talk are
+    uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
     """
     random = np.random.default_rng(config.unit)
     gains, talk, axis = (
@@ -346,14 +289,13 @@ def calibration_matrices(
 
 
 def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    """Rodrigues' formula; `axis` of any length."""
     K = cross_matrix(axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-#: In the constants: offset of force and torque, which may be changed while the sensor runs.
+#: Constants: offset of force and torque, which may change during a run.
 OFFSET = slice(0, 6)
-# The truth: as a sample, see `drake_teleop.load.regressor`, but for the flag.
+# The truth: as a sample (`drake_teleop.load.regressor`) without the flag.
 TRUE_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
@@ -362,16 +304,16 @@ READ_SATURATED, READ_ANGLES = 12, slice(13, None)
 _DRIFT, _NOISE, _WALK, _QUANTA, _LIMITS = range(12, 72, 12)
 _WRENCH = 72  # (6, 6)
 _MOTION = _WRENCH + 36  # (2, 3, 3) from S into A, for s and alpha
-_PLACE = _MOTION + 18  # (3,)
-_FILTER = _PLACE + 3  # (2, 5)
-_LOW_PASS_PLACE = _FILTER + 5 * _SECTIONS
-_LATENCIES = _LOW_PASS_PLACE + 1  # (3,)
+_POSITION = _MOTION + 18  # (3,)
+_FILTER = _POSITION + 3  # (2, 5)
+_LOW_PASS_STAGE = _FILTER + 5 * _SECTIONS
+_LATENCIES = _LOW_PASS_STAGE + 1  # (3,)
 _ENCODER = _LATENCIES + 3
 _IDEAL = _ENCODER + 1
 _OVERLOADS = _IDEAL + 1  # (6,)
-_BEFORE, _AFTER = 1.0, 2.0  # as in _LOW_PASS
-# Memory: samples taken, 12 random walks, the filter (2, 2, 12), then the delay line, a row for each
-# of the last samples: 12 channels, whether force or acceleration is saturated, angles.
+_BEFORE_NOISE, _AFTER_CONVERTER = 1.0, 2.0  # as in _LOW_PASS_CHOICES
+# Memory: samples taken, 12 random walks, filter (2, 2, 12), delay line with a row per sample: 12
+# channels, saturation of force and of acceleration, angles.
 _WALKS = 1
 FILTERED = _WALKS + _CHANNELS
 _LINE = FILTERED + 2 * _SECTIONS * _CHANNELS
@@ -381,16 +323,10 @@ _ROW = _CHANNELS + 2
 def sensor_chain(
     config: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What `read_into` needs: constants, and its memory before the first sample.
+    """Return constants and initial memory of `read_into` for an arm with n joints.
 
-    Args:
-        config: the sensor.
-        num_joints: n, of the arm.
-        period: sampling period [s].
-
-    Returns:
-        constants: `constants[OFFSET]` is the wrench's offset [N, N m] and may drift.
-        memory: its first entry counts samples.
+    `constants[OFFSET]` is the wrench's offset [N, N m], which may change during a run.
+    `memory[0]` counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
@@ -414,8 +350,13 @@ def sensor_chain(
             (angular @ R_SA.T).ravel(),
             p_SoAo_S,
             sections.ravel(),
-            [_LOW_PASS.index(config.low_pass), *latencies, config.encoder_resolution, config.ideal],
-            _OVERLOAD * config.ranges()[:6],
+            [
+                _LOW_PASS_CHOICES.index(config.low_pass),
+                *latencies,
+                config.encoder_resolution,
+                config.ideal,
+            ],
+            _OVERLOAD_FACTOR * config.ranges()[:6],
         ]
     )
     rows = 0 if config.ideal else latencies.max() + 1
@@ -423,11 +364,11 @@ def sensor_chain(
 
 
 @njit(cache=True)
-def believable(constants, truth):
-    """Whether there is something to read: finite, and nothing that would have broken the sensor.
+def is_plausible(constants, truth):
+    """Return whether the truth is finite and does not overload the sensor.
 
     Args:
-        constants, truth: of `read_into`. The offset counts: NaN in it is a dead channel.
+        constants, truth: of `read_into`. A NaN offset marks a dead channel.
     """
     good = True
     for i in range(6):
@@ -439,17 +380,17 @@ def believable(constants, truth):
 
 @njit(cache=True)
 def read_into(constants, memory, noise, truth, reading):
-    """One sample of the sensor: `truth` (15 + n,) becomes `reading` (13 + n,).
+    """Convert `truth` (15 + n,) to `reading` (13 + n,): one sample of the sensor.
 
-    Called once for each period. At the first sample the filters and delay lines settle on it.
+    Call it once per period. At the first sample filters and delay lines settle on it.
 
     Args:
         constants, memory: of `sensor_chain`.
         noise: (NOISE_SIZE,) standard normal numbers for this block of NOISE_BLOCK samples.
-        truth: [wrench (6) that the sensor exerts on the tool at So in S | specific force of So (3),
-            angular velocity (3), angular acceleration (3) in S | joints' angles (n)].
+        truth: [wrench (6) of the sensor on the tool at So in S | specific force of So (3),
+            angular velocity (3), angular acceleration (3) in S | joint angles (n)].
         reading: [wrench (6) | specific force at Ao (3), angular acceleration (3) in A |
-            1 if a channel is saturated, else 0 | joints' angles (n)].
+            1 if a channel is saturated, else 0 | joint angles (n)].
     """
     angles = truth[TRUE_ANGLES]
     if constants[_IDEAL] != 0.0:
@@ -466,26 +407,26 @@ def read_into(constants, memory, noise, truth, reading):
     row = memory[_LINE:][:width]
     channels = row[:_CHANNELS]
     walks, filtered = memory[_WALKS:FILTERED], memory[FILTERED:_LINE]
-    sections, place = constants[_FILTER:_LOW_PASS_PLACE], constants[_LOW_PASS_PLACE]
+    sections, place = constants[_FILTER:_LOW_PASS_STAGE], constants[_LOW_PASS_STAGE]
     if count % NOISE_BLOCK == 0:
         for i in range(_CHANNELS):
             walks[i] += constants[_WALK + i] * noise[_CHANNELS * NOISE_BLOCK + i]
 
     _calibrate(constants, truth, channels)
-    if place == _BEFORE:
+    if place == _BEFORE_NOISE:
         if count == 0:
             settle(sections, filtered, channels)
         low_pass(sections, filtered, channels)
     for i in range(_CHANNELS):
         channels[i] += constants[i] + count * constants[_DRIFT + i]
-    if place == _AFTER and count == 0:
+    if place == _AFTER_CONVERTER and count == 0:
         settle(sections, filtered, channels)
     first = _CHANNELS * (count % NOISE_BLOCK)
     for i in range(_CHANNELS):
         channels[i] += constants[_NOISE + i] * noise[first + i] + walks[i]
     row[_CHANNELS] = _convert(constants, 0, 6, channels)
     row[_CHANNELS + 1] = _convert(constants, 6, 12, channels)
-    if place == _AFTER:
+    if place == _AFTER_CONVERTER:
         low_pass(sections, filtered, channels)
     quantum = constants[_ENCODER]
     for i in range(_ROW, width):
@@ -511,9 +452,9 @@ def read_into(constants, memory, noise, truth, reading):
 
 @njit(cache=True)
 def shift(line, width):
-    """Makes room for a new row at the start of a delay line, whose rows stand by age.
+    """Shift a delay line, newest row first, by one row.
 
-    A ring would be no faster, and what is remembered would not be the same after a period.
+    A ring buffer is not faster, and its memory would not be periodic.
     """
     for i in range(line.shape[0] - 1, width - 1, -1):
         line[i] = line[i - width]
@@ -521,7 +462,7 @@ def shift(line, width):
 
 @njit(cache=True)
 def _calibrate(constants, truth, out):
-    """The 12 channels as their gains, cross-talk, axes and place make them of the truth."""
+    """Write the 12 channels with gains, cross-talk, axes and place of the accelerometer."""
     wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
     omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
@@ -529,7 +470,7 @@ def _calibrate(constants, truth, out):
         for j in range(6):
             value += constants[_WRENCH + 6 * i + j] * wrench[j]
         out[i] = value
-    r = three(constants, _PLACE)
+    r = three(constants, _POSITION)
     at_Ao = plus_cross(plus_cross(s, alpha, r), omega, cross(omega, r))
     out[6], out[7], out[8] = apply(nine(constants, _MOTION), at_Ao)
     out[9], out[10], out[11] = apply(nine(constants, _MOTION + 9), alpha)
@@ -537,7 +478,7 @@ def _calibrate(constants, truth, out):
 
 @njit(cache=True)
 def _convert(constants, first, end, channels):
-    """Quantisation and saturation in place; 1.0 if one of the channels is saturated."""
+    """Quantise and saturate in place; return 1.0 if one of the channels is saturated."""
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
@@ -552,10 +493,10 @@ def _convert(constants, first, end, channels):
 
 @njit(cache=True)
 def low_pass(sections, memory, values):
-    """Second-order sections one after the other, transposed direct form II, `values` in place.
+    """Apply second-order sections in series to `values` in place (transposed direct form II).
 
     Args:
-        sections: (5 k,) [b0, b1, b2, a1, a2] of each; one with b0 = 1 does nothing.
+        sections: (5 k,) [b0, b1, b2, a1, a2] of each; sections with b0 = 1 are skipped.
         memory: (2 k n,) updated.
         values: (n,) channels.
     """
@@ -576,7 +517,7 @@ def low_pass(sections, memory, values):
 
 @njit(cache=True)
 def settle(sections, memory, values):
-    """Puts the memory of `low_pass` where it would be after a long time at `values`."""
+    """Set the memory of `low_pass` to its steady state at `values`."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b1, b2 = sections[5 * k + 1], sections[5 * k + 2]

@@ -1,18 +1,13 @@
-"""The wrist sensor in the station: when it samples, and what (long: the step and its block).
+"""The wrist sensor in the station: sampling instants and samples.
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The truth is rigid-body mechanics: the wrench that the sensor exerts on the tool is V phi of the
-tool minus what the environment exerts on it (Eqs. 1, 2), and the motion is that of S.
+The true wrench on the tool is V phi minus the wrench of the environment (Eqs. 1, 2).
 
-The plant takes steps of its own, cut only where something drives it. When a step is over the sensor
-looks back: at each instant in it at which it samples, position and velocity are interpolated
-(Hermite), and the accelerations follow from the dynamics under the torque that the motors had. So
-8 kHz need no events, and what is sampled is exact for the state it belongs to. What the compiled
-law does not know of a tool that it knows otherwise (`Contact.watched`) Drake is asked for where it
-comes near, in a plant of its own (`ContactTwin`). Contact that it does not know at all
-(`Contact.beyond`) Drake tells, for the end of a step alone: then each sample is an event, and ends
-one.
+Sampling needs no events: after each integration step, position and velocity at each sampling
+instant in the step are interpolated (Hermite), and accelerations follow from the dynamics. A tool
+near a shape of `Contact.watched` gets its contact wrench from Drake (`ContactTwin`). With contact
+outside the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -65,7 +60,7 @@ from drake_teleop.station.sensor.sensor_chain import (
     OFFSET,
     TRUE_ANGLES,
     WristSensorConfig,
-    believable,
+    is_plausible,
     read_into,
     sensor_chain,
 )
@@ -90,22 +85,22 @@ from drake_teleop.station.slave.plant_dynamics import (
 
 Array = NDArray[np.float64]
 
-#: A part of a period, within which two instants are one.
-_SAME = 1e-6
-#: Steps of the plant that wait to be sampled, at most.
-_LONGEST = 16
-#: How often the plant is asked whether it moves as the dynamics here say [s], and how alike they
-#: have to be: rounding is 1e-12, in a stiff contact 1e-9.
-_CHECK_PERIOD, _ALIKE = 0.1, 1e-6
-#: For so many samples a lost one shows, so that no log misses it.
-_SHOWS = 40
-#: Instead of a wrench that the plant tells, see `sample_step`.
-_BY_LAW = np.zeros(0)
+#: Tolerance of equal instants, in periods.
+_TIME_TOLERANCE = 1e-6
+#: Largest number of queued steps.
+_MAX_QUEUED_STEPS = 16
+#: Period of the comparison of the plant's acceleration with the dynamics here [s], and relative
+#: tolerance: rounding is 1e-12, in a stiff contact 1e-9.
+_CHECK_PERIOD, _ACCELERATION_TOLERANCE = 0.1, 1e-6
+#: Samples for which a lost sample stays flagged, so that the log contains the flag.
+_LOST_FLAG_SAMPLES = 40
+#: Value of `touching_W` in `sample_step` that selects the compiled contact law.
+_USE_CONTACT_LAW = np.zeros(0)
 
 
 @njit(cache=True)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Writes [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+    """Write [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
 
     The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
     about the world's origin, in W.
@@ -124,7 +119,7 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 
 @njit(cache=True)
 def _interpolate(h, u, x, xdot, end, end_dot, out):
-    """Hermite: positions from values and two derivatives, velocities from values and one."""
+    """Interpolate by Hermite polynomials: quintic for positions, cubic for velocities."""
     half = x.shape[0] // 2
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -140,8 +135,8 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 
 @njit(cache=True)
-def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
-    """One sample of the state x and what follows from it, into `memory`, see `sample_step`."""
+def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
+    """Write one sample of the state x into `memory`, see `sample_step`."""
     arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
     half = x.shape[0] // 2
@@ -154,8 +149,8 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
     size = BEFORE_JOINTS + n
     sample = memory[:size]
     put(memory, size, memory, 0, size)
-    if not believable(constants, truth):  # filters would remember it for long
-        sample[SATURATED] = LOST + _SHOWS
+    if not is_plausible(constants, truth):  # keeps it out of the filters
+        sample[SATURATED] = LOST + _LOST_FLAG_SAMPLES
         return
     lost = sample[SATURATED] - 1.0
     if ideal:
@@ -171,8 +166,8 @@ def _take(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 
 @njit(cache=True)
-def remember_step(tail, time, state, around):
-    """Puts a step's end into the queue that `sample_step` works off; see its `memory`."""
+def queue_step(tail, time, state, around):
+    """Append the end of a step to the queue of `sample_step`, see its `memory`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
@@ -181,17 +176,16 @@ def remember_step(tail, time, state, around):
 
 
 @njit(cache=True, borrows=True)
-def _postpone(memory, tail, longest, time, state, around):
-    """Puts a step's end into the queue in `memory`, see `sample_step`; whether there was room."""
+def _try_queue_step(memory, tail, longest, time, state, around):
     if memory[tail + 1] >= longest:
         return False
-    remember_step(memory[tail:], time, state, around)
+    queue_step(memory[tail:], time, state, around)
     return True
 
 
 @njit(cache=True)
 def _torque_at(held, after, torque):
-    """The motors' torque (n,) `after` now [s]; `held` as of `sample_step`."""
+    """Write the motors' torque (n,) at `after` from now [s]; `held` as in `sample_step`."""
     put(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -202,30 +196,29 @@ def sample_step(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
-    """Takes the samples that have become due in the steps since the last call.
+    """Take the samples due in the steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity; joints of what else moves, wrenches that are told).
-        sensor: (chain's constants, estimator's, where its memory begins, where the tail does,
+            acceleration by gravity; joints of other moving bodies, wrenches from Drake).
+        sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
             ideal).
         period: of the sensor [s].
         time: now [s], the end of a step.
         state: (2 n,) [q; v] now.
-        around: [the sheet's deflection and its rate, the plant's state if anything else moves] now.
-        held: torque (n,) now, of these steps' motors [N m], and at which rate it changed in them;
-            (0,) if it was held.
+        around: [deflection and rate of the sheet, plant's state if other bodies move] now.
+        held: motor torque (n,) now [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,), see `environment_wrench`.
         noise: for the chain.
         memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
             samples taken, length of the queue, time and x of each step's end in it].
-        until_now: whether the sample that may be due this very instant is taken.
-        touching_W: (6,) what contacts exert on the tool now, as the plant says, about the world's
-            origin, in W, or (0,), as `physics` says. A stiff contact multiplies the last digit of
-            a position by 2e5 N/m: what has the plant's own penetration is the plant's to 1e-12 N.
-        scratch: (9, 2 n + 6 + size of the plant's state), whatever it holds.
-        result: filled: [last sample before now (16 + n) | when that was taken [s] | memory, its
-            queue now's end alone].
+        until_now: whether to take a sample that is due now.
+        touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
+            in W; or (0,) to calculate it with `physics`. The plant's own penetration avoids
+            rounding errors of stiff contacts.
+        scratch: (9, 2 n + 6 + size of the plant's state).
+        result: output: [last sample before now (16 + n) | its time [s] | memory with now's end as
+            the only queue entry].
     """
     n = state.shape[0] // 2
     size, half, tau, joints = BEFORE_JOINTS + n, n + 1, scratch[7, :n], physics[4]
@@ -241,7 +234,7 @@ def sample_step(
     start_dot, end_dot = scratch[4, : 2 * half], now_dot
     now_wrench_W, wrench_W = scratch[5, :6], scratch[6, :6]
     assemble_state(state, around, now)
-    put(between, 2 * half, now, 2 * half, extra)  # for what is not interpolated of it: the arm
+    put(between, 2 * half, now, 2 * half, extra)  # only other bodies are interpolated there
     _torque_at(held, 0.0, tau)
     if touching_W.shape[0] > 0:
         none, sheet, plant = physics[2][:0], around[:2], around[2:]
@@ -258,7 +251,7 @@ def sample_step(
         if k < queued - 1:
             following = tail[2 + (k + 1) * width :][:width]
             until, end, end_dot = following[0], following[1:], scratch[8, : 2 * half]
-        if (count + _SAME) * period >= until:
+        if (count + _TIME_TOLERANCE) * period >= until:
             continue
         _torque_at(held, start[0] - time, tau)
         plant_rates(physics, start[1:], tau, applied_W, wrench_W, start_dot)
@@ -266,7 +259,7 @@ def sample_step(
             _torque_at(held, until - time, tau)
             plant_rates(physics, end, tau, applied_W, wrench_W, end_dot)
         h = until - start[0]
-        while (count + _SAME) * period < until:
+        while (count + _TIME_TOLERANCE) * period < until:
             u = (count * period - start[0]) / h
             _interpolate(h, u, start[1 : width - extra], start_dot, end, end_dot, between)
             if extra > 0:
@@ -274,21 +267,21 @@ def sample_step(
                 interpolate_bodies(joints, h, u, at_start, at_end, between[2 * half :])
             _torque_at(held, count * period - time, tau)
             plant_rates(physics, between, tau, applied_W, wrench_W, between_dot)
-            _take(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
+            _take_sample(physics, sensor, between[: 2 * half], between_dot, wrench_W, noise, after)
             count += 1.0
-    # A step that is all rounding may have ended a little before, and have taken this sample.
-    taken = (count - 1.0 + _SAME) * period > time
+    # A step of rounding length may have ended just before and have taken this sample.
+    taken = (count - 1.0 + _TIME_TOLERANCE) * period > time
     put(result, 0, after, size if taken else 0, size)
     result[size] = (count - (2.0 if taken else 1.0)) * period
-    if until_now and (count - _SAME) * period < time:
-        _take(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
+    if until_now and (count - _TIME_TOLERANCE) * period < time:
+        _take_sample(physics, sensor, now[: 2 * half], now_dot, now_wrench_W, noise, after)
         count += 1.0
     tail[0], tail[1] = count, 0.0
-    remember_step(tail, time, state, around)
+    queue_step(tail, time, state, around)
 
 
 class WristSensor(LeafSystem):
-    """Samples force, torque, motion of S and joint angles at the sensor's rate.
+    """Sensor of force, torque, motion of S and joint angles at its own rate.
 
     .. pydrake_system::
 
@@ -296,30 +289,30 @@ class WristSensor(LeafSystem):
         input_ports:
         - slave_state: [q; v] of the arm
         - joint_torque: (n,) of the motors now [N m]
-        - torque_rate: (n,) at which it changes [N m/s] (only with `ramps`)
-        - slave_acceleration: vdot of the arm, to see that nothing else moves it
+        - torque_rate: (n,) its rate of change [N m/s] (only with `ramps`)
+        - slave_acceleration: vdot of the arm, to detect unknown forces
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
-        - plant_state: [q; v] of the whole plant (only if anything else moves)
-        - contact_results: the plant's (only with something to touch)
+        - plant_state: [q; v] of the whole plant (only if other bodies move)
+        - contact_results: the plant's (only with surroundings)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
-        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, of whatever pushes it besides
+        - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
         output_ports:
-        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | when it was
-          taken [s] | memory]
+        - step: [the last sample before now: the parts of `sample_parts` (16 + n) | its time [s] |
+          memory]
 
     Args:
-        slave: the plant, for its numbers: the tool's true inertial parameters, shapes that touch.
+        slave: the plant; source of the tool's true inertial parameters and contact shapes.
         config: the sensor.
-        motion: how the motion of S is estimated from its readings.
+        motion: estimation of the motion of S.
         period: sampling period [s].
-        held: for how long the motors hold a torque, or its rate [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-        ramps: whether they hold a rate.
+        held: duration for which the motors hold a torque, or its rate [s].
+        q_start: (n,) joint angles at rest before the first sample [rad].
+        ramps: whether the motors hold a rate.
 
     Raises:
-        DrakeTeleopError: from the simulation, if something moves the arm that the sensor is not
-            told of: its samples would be wrong.
+        DrakeTeleopError: during simulation, if a force that the sensor does not receive moves the
+            arm, because its samples would be wrong.
     """
 
     __slots__ = ONE_DICT
@@ -345,32 +338,26 @@ class WristSensor(LeafSystem):
         first = sample_at_rest(arm, q_start)
         if not config.ideal:
             first[WRENCH] += config.offset
-        # Contact takes many steps for one torque, and to work off the queue takes longer than them.
-        self._beyond = contact.beyond
-        # To ask the plant takes as long as two samples. Noise is 1e9 times what that would tell.
-        self._exact = config.ideal or bool(contact.beyond)
-        self._longest = _LONGEST if slave.can_touch and not contact.beyond else 1
+        # Contact needs many steps per torque sample, so queueing them saves time.
+        self._beyond_contact_law = contact.beyond
+        # The plant's contact wrench costs as much as two samples; noise exceeds its gain by 1e9.
+        self._uses_plant_contact = config.ideal or bool(contact.beyond)
+        self._max_queued_steps = _MAX_QUEUED_STEPS if slave.can_touch and not contact.beyond else 1
         self._around = np.zeros(2 + contact.plant_size)
-        tail = np.zeros(2 + self._longest * (2 * n + 1 + len(self._around)))
+        tail = np.zeros(2 + self._max_queued_steps * (2 * n + 1 + len(self._around)))
         memory = np.concatenate([first, first, chain, estimator, tail])
         ends = np.cumsum([2 * len(first), len(chain), len(estimator)])
         self._sensor = (constants, motion_constants, *ends[1:].tolist(), config.ideal)
-        # Neither plant nor indices in it, which would hold the Diagram that holds this.
-        self._watched, self._moving, self._plant_size = (
-            contact.watched,
-            tuple(contact.moving),
-            contact.plant_size,
-        )
-        self._twins = slave.config, slave.environment, slave.start
+        # No reference to the plant: it would be a cycle with the Diagram that owns this block.
+        self._watched, self._plant_size = contact.watched, contact.plant_size
+        self._moving = tuple(contact.moving)
+        self._twin_arguments = slave.config, slave.environment, slave.start
         self._twin: ContactTwin | None = None
-        self._most_told = 2 * self._longest + int(held / period) + 4
+        self._max_twin_wrenches = 2 * self._max_queued_steps + int(held / period) + 4
         self._period = period
-        self._holds = (held, NOISE_BLOCK * period)
-        self._no_noise, self._nothing, self._no_rate = (
-            np.zeros(NOISE_SIZE),
-            np.zeros(6),
-            np.zeros(0),
-        )
+        self._event_periods = (held, NOISE_BLOCK * period)
+        self._no_noise, self._zero_wrench = np.zeros(NOISE_SIZE), np.zeros(6)
+        self._no_rate = np.zeros(0)
 
         self._state = self.DeclareVectorInputPort("slave_state", 2 * n)
         self._torque = self.DeclareVectorInputPort("joint_torque", n)
@@ -390,9 +377,9 @@ class WristSensor(LeafSystem):
             self._noise = self.DeclareVectorInputPort("noise", NOISE_SIZE)
         self.DeclareDiscreteState(memory)
         self._result = np.zeros(len(first) + 1 + len(memory))
-        self._remains = slice(len(first) + 1, None)  # of a step: the memory
+        self._memory_slice = slice(len(first) + 1, None)  # memory in the output
         self._scratch = np.empty((9, 2 * n + 6 + contact.plant_size))
-        # Not the acceleration: whatever changes in the plant would be passed on twice.
+        # Without the acceleration: each change in the plant would invalidate twice.
         pushes = (self._torque, self._rate, self._applied)
         around = (self._sheet, self._plant, self._contacts)
         seen = (self._state, *pushes, *around, self._noise)
@@ -401,7 +388,7 @@ class WristSensor(LeafSystem):
         self._step = self.DeclareVectorOutputPort(
             "step", len(self._result), weak_callback(self._calc_step), tickets
         )
-        if self._beyond:
+        if self._beyond_contact_law:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         else:
             self.DeclarePerStepDiscreteUpdateEvent(self._update)
@@ -409,35 +396,35 @@ class WristSensor(LeafSystem):
 
     @property
     def offset(self) -> Array:
-        """(6,) of force and torque [N, N m], a view: an offset may drift during a simulation."""
+        """(6,) offset of force and torque [N, N m]; a view that may be changed during a run."""
         return self._offset
 
     @property
     def phi(self) -> Array:
-        """(10,) of what hangs on the sensor, a view: something may be grasped in a simulation."""
+        """(10,) inertial parameters of the tool; a view that may be changed during a run."""
         return self._physics[1]
 
     @property
     def contact_pairs(self) -> Array:
-        """(k, 28) what may touch, see `Pairs`, a view."""
+        """(k, 28) contact pairs, see `Pairs`; a view."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
-        """What its own contact law does not know, see `Contact`."""
-        return self._beyond
+        """Contact outside the compiled contact law, see `Contact`."""
+        return self._beyond_contact_law
 
     @property
     def moves(self) -> str:
-        """What of the surroundings moves besides a leaf, as a sentence, or nothing."""
+        """Moving bodies of the surroundings besides a leaf, as a sentence, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Where in the discrete state stands what the motion has left there.
+        """Indices of the discrete state that depend on the motion.
 
-        Not counters and flags, nor random walks, nor the sample before the last one.
+        Counters, flags, random walks and the sample before the last one are excluded.
         """
         _, _, chain_end, end, _ = self._sensor
         size = sample_size(self._n)
@@ -446,51 +433,50 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Takes the samples before now, for who wants to see the state that results."""
-        seen = self._seen(context)
-        self._sample(context, seen, self._near(*seen), False, _BY_LAW, self._result)
-        context.SetDiscreteState(self._result[self._remains])
+        """Take the samples before now and store the resulting discrete state."""
+        seen = self._states(context)
+        self._sample(
+            context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
+        )
+        context.SetDiscreteState(self._result[self._memory_slice])
 
-    def bring_up_to_date(self, context: Context) -> None:
-        """Makes now the end of the last step, with the samples before now taken.
+    def reset_queue(self, context: Context) -> None:
+        """Reset the sample queue to the current time.
 
-        For who sets states by hand: as if the simulation had arrived here.
+        Call this after setting states manually.
         """
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
-        tail[0], tail[1] = np.ceil(time / self._period - _SAME), 0.0
-        remember_step(tail, time, *self._seen(context))
+        tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
+        queue_step(tail, time, *self._states(context))
 
-    def _seen(self, context: Context) -> tuple[Array, Array]:
-        """[q; v] of the arm, and `_surroundings`."""
+    def _states(self, context: Context) -> tuple[Array, Array]:
         return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
-        """[Deflection, rate] of the leaf, or [0, 0, the plant's state]."""
+        """Return [deflection, rate] of the leaf, or [0, 0, the plant's state]."""
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
         return self._around if self._sheet is None else self._sheet.Eval(context)
 
     def _applied_W(self, context: Context) -> Array:
-        return self._applied.Eval(context) if self._applied.HasValue(context) else self._nothing
+        return self._applied.Eval(context) if self._applied.HasValue(context) else self._zero_wrench
 
-    def _near(self, state: Array, around: Array) -> int:
-        """See `nearness`."""
+    def _contact_level(self, state: Array, around: Array) -> int:
         if self._contacts is None:
             return FAR
-        if self._beyond:
+        if self._beyond_contact_law:
             return TOUCHING
         arm, _, pairs, _, joints, _ = self._physics
         q = state[: self._n]
         return nearness(arm, pairs, self._watched, joints, q, around[:2], around[2:])
 
-    def _touching_W(self, context: Context) -> Array:
+    def _plant_contact_W(self, context: Context) -> Array:
         assert self._contacts is not None
         return contact_wrench_W(self._contacts.Eval(context), *self._tool)
 
-    def _touching_So_W(self, context: Context) -> Array:
-        """What contacts exert on the tool, about So, as what is applied to it."""
-        wrench_W = self._touching_W(context).copy()
+    def _plant_contact_So_W(self, context: Context) -> Array:
+        wrench_W = self._plant_contact_W(context).copy()
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self._physics[0], self._state.Eval(context)[: self._n], R_WS, p_WS)
         wrench_W[3:] -= np.cross(p_WS, wrench_W[:3])
@@ -513,14 +499,14 @@ class WristSensor(LeafSystem):
         )
 
     def _calc_step(self, context: Context, output: BasicVector) -> None:
-        seen = self._seen(context)
-        near = self._near(*seen)
+        seen = self._states(context)
+        near = self._contact_level(*seen)
         if near == FAR:
-            touching_W = self._nothing
-        elif near == WATCHED or self._exact:
-            touching_W = self._touching_W(context)
+            touching_W = self._zero_wrench
+        elif near == WATCHED or self._uses_plant_contact:
+            touching_W = self._plant_contact_W(context)
         else:
-            touching_W = _BY_LAW
+            touching_W = _USE_CONTACT_LAW
         self._sample(context, seen, near, True, touching_W, output.get_mutable_value())
 
     def _sample(
@@ -532,19 +518,19 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        """`sample_step`, with Drake's contact at each instant if the tool is watched."""
+        """Call `sample_step`, with Drake's contact at each instant near monitored shapes."""
         inputs = self._inputs(context, seen)
         if near != WATCHED:
             sample_step(*inputs, until_now, touching_W, self._scratch, result)
             return
         if self._twin is None:
-            self._twin = ContactTwin(*self._twins)
+            self._twin = ContactTwin(*self._twin_arguments)
         own = 2 * self._n + 2
         size = own + self._plant_size
-        told = np.zeros((1 + self._most_told, 2 + size))
+        told = np.zeros((1 + self._max_twin_wrenches, 2 + size))
         physics = (*self._physics[:-1], told)
-        # The state of each wrench that is asked for follows from those before.
-        for k in range(self._most_told):
+        # The state of each requested wrench depends on the previous wrenches.
+        for k in range(self._max_twin_wrenches):
             told[0, :2] = k, 0.0
             sample_step(physics, *inputs[1:], until_now, touching_W, self._scratch, result)
             if told[0, 1] <= k:
@@ -553,47 +539,48 @@ class WristSensor(LeafSystem):
             told[1 + k, :6] = self._twin.wrench_W(asked[:own], asked[own:])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._longest > 1 and not self._is_due(context.get_time()):
-            seen = self._seen(context)
-            if not self._watched.size or self._near(*seen) != WATCHED:
+        if self._max_queued_steps > 1 and not self._is_due(context.get_time()):
+            seen = self._states(context)
+            if not self._watched.size or self._contact_level(*seen) != WATCHED:
                 memory, time = discrete_state.get_mutable_value(0), context.get_time()
-                if _postpone(memory, self._sensor[3], self._longest, time, *seen):
+                if _try_queue_step(memory, self._sensor[3], self._max_queued_steps, time, *seen):
                     return
-        discrete_state.set_value(0, self._step.Eval(context)[self._remains])
+        discrete_state.set_value(0, self._step.Eval(context)[self._memory_slice])
 
     def _is_due(self, time: float) -> bool:
-        """Whether now the torque may change, or the noise."""
-        # Written out, because in contact it is asked at every step.
-        margin, (held, block) = _SAME * self._period, self._holds
+        # Inline for speed: called at every step in contact.
+        margin, (held, block) = _TIME_TOLERANCE * self._period, self._event_periods
         if abs(time - held * round(time / held)) < margin:
             return True
         return abs(time - block * round(time / block)) < margin
 
     def _check(self, context: Context) -> EventStatus:
         n = self._n
-        state, around = self._seen(context)
+        state, around = self._states(context)
         x, xdot = np.empty(2 * n + len(around)), np.empty(2 * n + 2)
         assemble_state(state, around, x)
-        if not np.isfinite(x).all():  # nothing is known; the samples say so
+        if not np.isfinite(x).all():  # the samples are flagged
             return EventStatus.Succeeded()
         torque, applied = self._torque.Eval(context), self._applied_W(context)
         physics = self._physics
-        if self._beyond or self._near(state, around) == WATCHED:
-            applied = applied + self._touching_So_W(context)
+        if self._beyond_contact_law or self._contact_level(state, around) == WATCHED:
+            applied = applied + self._plant_contact_So_W(context)
             physics = (*physics[:2], physics[2][:0], *physics[3:])
         plant_rates(physics, x, torque, applied, np.empty(6), xdot)
         vdot = self._acceleration.Eval(context)
-        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ALIKE * (1.0 + np.abs(vdot).max()):
+        if not np.abs(xdot[n + 1 : -1] - vdot).max() < _ACCELERATION_TOLERANCE * (
+            1.0 + np.abs(vdot).max()
+        ):
             raise DrakeTeleopError(
-                f"at {context.get_time():g} s something moves the slave that it knows nothing of",
+                f"at {context.get_time():g} s an unknown force moves the slave",
                 where="wrist_sensor.applied_wrench_W",
-                remedy="connect whatever pushes the tool to this port too",
+                remedy="connect every wrench on the tool to this port",
             )
         return EventStatus.Succeeded()
 
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
-    """The true sample (16 + n,) of the arm that rests at q (n,) [rad]: what stands before t = 0."""
+    """Return the true sample (16 + n,) of the arm at rest at q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
     touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
     true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
@@ -612,22 +599,12 @@ def AddWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Adds "wrist_sensor" and its noise, and what divides its port, for Drake numbers the parts.
+    """Add "wrist_sensor", its noise, and demultiplexers of its port; arguments as `WristSensor`.
 
-    What remains to be connected is the state, the acceleration and the torque of the arm.
-
-    Args:
-        builder: the diagram that holds the plant.
-        slave: the plant.
-        config: the sensor.
-        motion: how the motion of S is estimated.
-        period: sampling period [s].
-        held: for how long the motors hold a torque, or its rate [s].
-        q_start: (n,) where the arm rests before the first sample [rad].
-        ramps: whether they hold a rate.
+    State, acceleration and torque of the arm remain to be connected.
 
     Returns:
-        The ports by name: "sample", with each of its parts, see `sample_parts`, and "sample_time".
+        The ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)

@@ -1,24 +1,21 @@
-"""What the wrist sensor's noise looks like at rest: predicted from its parameters, and measured.
+"""Noise spectrum and Allan deviation of the wrist sensor at rest, predicted and measured.
 
-A reading at rest is a constant, a drift, and three random parts: white noise of variance sigma^2 in
-each raw sample; rounding to a quantum q, which adds q^2/12 and is as white, as long as the noise
-moves the readings over the steps (sigma of q/2 or more: at q/2 it is 1 % less than said; without
-noise it is a constant error); and a random walk that grows by K sqrt(t). With the sampling period
-T, and the low-pass H if it stands after the converter, the one-sided spectral density is
+White noise of variance sigma^2 per raw sample; rounding to a quantum q, which is white with q^2/12
+if sigma is at least q/2; random walk K sqrt(t). With sampling period T and low-pass H after the
+converter, the one-sided spectral density is
 
     S(f) = |H(f)|^2 (2 T (sigma^2 + q^2/12) + 2 K^2 T^2 / (2 sin(pi f T))^2)
 
-The Allan deviation at tau = m T is the root of half the mean square difference of neighbouring
-means of m samples; its square is the integral of S(f) 2 sin^4(pi f m T) / (m sin(pi f T))^2. White
-noise: sigma / sqrt(m), the slope -1/2; a random walk: K sqrt(tau / 3), the slope +1/2.
+The squared Allan deviation at m T is the integral of S(f) 2 sin^4(pi f m T) / (m sin(pi f T))^2:
+sigma / sqrt(m) for white noise, K sqrt(m T / 3) for a random walk.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.compiled import njit
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,
     NOISE_SIZE,
@@ -29,13 +26,13 @@ from drake_teleop.station.sensor.sensor_chain import (
 )
 
 _CHANNELS = 12
-_FILTER_LENGTHS = 32  # of 1 / bandwidth, after which its impulse response is gone
+_FILTER_LENGTHS = 32  # decay of the impulse response, in 1 / bandwidth
 
 
 def spectral_density(
     config: WristSensorConfig, frequency: ArrayLike, period: float
 ) -> NDArray[np.float64]:
-    """One-sided power spectral density of the 12 channels' readings at rest.
+    """Return the one-sided power spectral density of the 12 channels at rest.
 
     Args:
         config: the sensor.
@@ -55,22 +52,19 @@ def spectral_density(
 def predicted_allan_deviation(
     config: WristSensorConfig, samples: ArrayLike, period: float
 ) -> NDArray[np.float64]:
-    """Allan deviation of the 12 channels' readings at rest, drift left out.
+    """Return the Allan deviation (12, m) of the channels at rest, without drift.
 
     Args:
         config: the sensor.
         samples: (m,) averaging times, in samples.
         period: sampling period [s].
-
-    Returns:
-        (12, m) in the channels' units.
     """
     white, walk = _powers(config)
     lengths = np.asarray(samples, int)
     deviations = np.empty((_CHANNELS, len(lengths)))
     for column, m in enumerate(lengths):
-        # The response to one white sample ends, so the integral is a finite sum (Parseval), here on
-        # odd multiples of half the spacing because the walk has a pole at zero.
+        # The impulse response is finite, so the integral is a finite sum (Parseval), on odd
+        # multiples of half the spacing because the walk has a pole at zero.
         count = 2 * m + int(np.ceil(_FILTER_LENGTHS / (config.bandwidth_hz * period)))
         f = (np.arange(count) + 0.5) / (2 * count * period)
         sine2 = np.sin(np.pi * f * period) ** 2
@@ -82,14 +76,11 @@ def predicted_allan_deviation(
 
 
 def allan_deviation(record: NDArray[np.float64], samples: ArrayLike) -> NDArray[np.float64]:
-    """Overlapping Allan deviation of a record.
+    """Return the overlapping Allan deviation (channels, m) of a record.
 
     Args:
         record: (N, channels) samples at a constant rate.
         samples: (m,) averaging times in samples, each at most N / 2.
-
-    Returns:
-        (channels, m).
     """
     start = np.zeros((1, record.shape[1]))
     sums = np.concatenate([start, np.cumsum(record - record.mean(axis=0), axis=0)])
@@ -104,7 +95,7 @@ def allan_deviation(record: NDArray[np.float64], samples: ArrayLike) -> NDArray[
 def rest_record(
     config: WristSensorConfig, count: int, period: float, seed: int
 ) -> NDArray[np.float64]:
-    """(count, 12) readings of a sensor that carries nothing and hangs at rest under gravity.
+    """Return (count, 12) readings of a sensor without load at rest under gravity.
 
     Args:
         config: the sensor.
@@ -121,7 +112,7 @@ def rest_record(
     return record
 
 
-@njit(cache=True)
+@njit
 def _record_into(constants, memory, noise, truth, record):
     reading = np.empty(14)
     for k in range(record.shape[0]):
@@ -130,7 +121,7 @@ def _record_into(constants, memory, noise, truth, record):
 
 
 def _powers(config: WristSensorConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(12,) variance of a raw sample, and of a walk after one second."""
+    """Return (12,) variances of a raw sample, and of a walk after 1 s."""
     if config.ideal:
         return np.zeros(_CHANNELS), np.zeros(_CHANNELS)
     quantum = config.resolution * config.ranges()
@@ -140,7 +131,7 @@ def _powers(config: WristSensorConfig) -> tuple[NDArray[np.float64], NDArray[np.
 def _gain(
     config: WristSensorConfig, f: NDArray[np.float64], period: float
 ) -> NDArray[np.float64] | float:
-    """|H|^2 of what stands between the noise and the reading."""
+    """Return |H|^2 between noise and reading."""
     if config.low_pass != "after_converter":
         return 1.0
     z = np.exp(-2j * np.pi * f * period)
