@@ -31,7 +31,7 @@ from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.common.texts import read_json
 from drake_teleop.lab import new_station
 from drake_teleop.live.inputs import INPUTS, Inputs, read_inputs

@@ -30,8 +30,8 @@ from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.cli import main as cli
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
+from drake_teleop.common.files import models_dir, scenarios_dir, studies_dir
 from drake_teleop.common.parquet_sizes import check_parquet_content
-from drake_teleop.common.resources import models_dir, scenarios_dir, studies_dir
 from drake_teleop.common.texts import read_json, yaml_data
 from drake_teleop.lab.excitation.robot import RobotFromModel
 from drake_teleop.lab.studies import study

@@ -17,8 +17,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked_rows
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array, checked_rows
 from drake_teleop.common.vectors import put
 from drake_teleop.load.online.recursive_tls import (
     MomentEstimator,

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from inverse_kinematics import described
 from station import against_the_port, fastest
 
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.reproduction.speed import MakeBarePlant, MakeMovingStation
 from drake_teleop.lab.run import run_scenario

@@ -19,7 +19,7 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable, MultibodyForces
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.comparison.one_dof import ACTUAL, COMMAND, HAND, MOTOR
 from drake_teleop.lab.comparison.station_accounts import station_accounts
 from drake_teleop.load.contact.detection import NoiseFloor

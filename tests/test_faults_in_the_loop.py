@@ -13,8 +13,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from drake_teleop.common.blocks import Fault
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import Fault
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.run_warnings import run_warnings
 from drake_teleop.station.scenario import replace

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import drake_teleop
+from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import FieldInfo, fields_of
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.station.operator.operator import OperatorConfig
 from drake_teleop.station.operator.task import KINDS

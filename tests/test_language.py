@@ -57,7 +57,7 @@ def first_words() -> list[str]:
 
 def sentences(text: str) -> Iterator[str]:
     """Return the sentences outside of tables, lists and code."""
-    prose = re.sub(r"^(\s{2,}.*|.*={3,}.*|.*\S {2,}\S.*|- .*)$", "", text, flags=re.M)
+    prose = re.sub(r"^(\s{2,}.*|.*={3,}.*|.*\S {2,}\S.*|- .*|\|.*)$", "", text, flags=re.M)
     for sentence in re.split(r"(?<=[.!?:;])\s+|\n\n", prose):
         if "=" not in sentence and "`" not in sentence:
             yield " ".join(sentence.split())

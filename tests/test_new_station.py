@@ -14,7 +14,7 @@ from pydrake.math import RotationMatrix
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab import new_station
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import drake_teleop
 from drake_teleop.common.errors import install_extra
-from drake_teleop.common.resources import models_dir, scenarios_dir
+from drake_teleop.common.files import models_dir, scenarios_dir
 
 home = Path(drake_teleop.__file__).parent
 assert home.parent.name == "site-packages", home

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.quaternions import quaternion_of
+from drake_teleop.common.vectors import quaternion_of
 
 
 @pytest.mark.parametrize(

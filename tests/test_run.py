@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from shown import type_in
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.common.files import scenarios_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.lab.run import run_command
 from drake_teleop.lab.run_summary import _detection_figures, in_contact

@@ -12,7 +12,7 @@ from pydrake.common.yaml import yaml_load
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.common.files import scenarios_dir
 from drake_teleop.station import scenario_reference
 from drake_teleop.station.channel.network import NetworkConfig
 from drake_teleop.station.environment.slot import Slot

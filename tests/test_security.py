@@ -94,7 +94,7 @@ WRITING = {
     # A mark of one byte more.
     ("lab/studies/store.py", 'open("ab'),
     ("robots/changes.py", "json.dump"),  # to the process that asked
-    # Functions of the package that write by `common/writing.py`.
+    # Functions of the package that write by `common/files.py`.
     ("lab/run.py", ".save"), ("cli/logs.py", ".save"), ("cli/excitation.py", ".save"),
     ("lab/reproduction/reproduce.py", ".save"), ("lab/reproduction/reproduce.py", ".write_parquet"),
 }  # fmt: skip
@@ -123,7 +123,7 @@ def found(pattern: re.Pattern[str], folder: Path) -> set[tuple[str, str]]:
 )
 def test_what_runs_listens_writes_and_warns_is_explained(pattern, explained):
     there = found(pattern, ROOT / "drake_teleop")
-    assert {(file, what) for file, what in there if file != "common/writing.py"} == explained
+    assert {(file, what) for file, what in there if file != "common/files.py"} == explained
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
-from drake_teleop.common.writing import (
+from drake_teleop.common.files import (
     CannotWrite,
     make_folder,
     output_folder,

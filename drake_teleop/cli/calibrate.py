@@ -24,8 +24,8 @@ from rich.table import Table
 from rich.text import Text
 
 from drake_teleop.cli.logs import identify_command
+from drake_teleop.common.files import make_folder, write_json, write_picture
 from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, house_style
-from drake_teleop.common.writing import make_folder, write_json, write_picture
 from drake_teleop.load.tolerance import (
     QUANTITIES,
     UNITS,

@@ -21,15 +21,15 @@ import polars as pl
 from matplotlib.figure import Figure
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import show_progress
-from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
-from drake_teleop.common.writing import (
+from drake_teleop.common.files import (
     make_folder,
     output_folder,
     write_json,
     write_picture,
     write_table,
 )
+from drake_teleop.common.progress import show_progress
+from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
 from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film

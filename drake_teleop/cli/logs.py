@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.cli.printing import print_detection, print_elimination, print_identification
-from drake_teleop.common.writing import output_folder, write_json, write_picture, write_table
+from drake_teleop.common.files import output_folder, write_json, write_picture, write_table
 from drake_teleop.load.batch.methods import DEFAULT_METHOD
 from drake_teleop.load.contact.noise_floor import STATISTICS
 from drake_teleop.load.identification import Identification, identified_object

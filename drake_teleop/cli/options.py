@@ -13,9 +13,9 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
+from drake_teleop.common.config import in_short
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quantities import in_short
-from drake_teleop.common.resources import scenarios_dir, studies_dir
+from drake_teleop.common.files import scenarios_dir, studies_dir
 
 
 class Utf8Path(click.Path):

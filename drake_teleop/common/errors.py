@@ -6,12 +6,12 @@ import difflib
 import importlib.util
 import os
 import reprlib
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import RLock
 from typing import Any
-
-from drake_teleop.common.silence import silent_stderr
 
 _POLARS_PROCESS: list[int] = []  # PID of the first process
 
@@ -55,7 +55,7 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
 
 
 @contextmanager
-def reading(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
+def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
     """Convert any error to DrakeTeleopError.
 
     For damaged files zipfile, numpy and polars raise many different exceptions.
@@ -87,7 +87,7 @@ def refuse_fork() -> None:
         )
 
 
-def meant(name: object, names: Sequence[str], otherwise: str) -> str:
+def suggestion(name: object, names: Sequence[str], otherwise: str) -> str:
     """Return the remedy for an unknown name: a similar one, or `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean '{near[0]}'?" if near else otherwise
@@ -105,6 +105,30 @@ def require_library(module: str, library: str, extra: str, where: str) -> None:
         raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))
 
 
-def inside(where: str, name: Any) -> str:
+def field_place(where: str, name: Any) -> str:
     """Return the place `file:field`, or `file:field.inner`."""
     return f"{where}.{name}" if ":" in where else f"{where}:{name}"
+
+
+# stderr is global: two threads would restore it in the wrong order.
+_lock = RLock()
+
+
+@contextmanager
+def silent_stderr() -> Iterator[None]:
+    """Redirect the file descriptor of stderr to nowhere."""
+    with _lock:
+        try:
+            sys.stderr.flush()
+            saved = os.dup(2)
+        except (AttributeError, OSError, ValueError):  # no stderr
+            yield
+            return
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 2)
+        os.close(null)
+        try:
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)

@@ -1,8 +1,13 @@
-"""Self-contained HTML pages with a common style."""
+"""Self-contained HTML pages with a common style, and their Content-Security-Policy.
+
+Pages run only their own scripts, and load nothing.
+"""
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import re
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -35,3 +40,18 @@ def render(package: str, template: str, **values: Any) -> str:
 def embedded(path: Path) -> str:
     """Return a PNG file as a data: URL."""
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+_SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
+
+
+def policy(page: str, host: str = "") -> str:
+    """Return the policy of a page; `host` is its server's "address:port", "" for a file."""
+    scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
+    digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
+    own, stream = ("'self'", f"ws://{host}") if host else ("", "")
+    return (
+        f"default-src 'none'; script-src {own} {hashes}; connect-src {own} {stream} data: blob:; "
+        "style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'"
+    )

@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-from drake_teleop.common.errors import DrakeTeleopError, inside, one_line
+from drake_teleop.common.errors import DrakeTeleopError, field_place, one_line
 
 _MAX_VALUES = 50_000  # including repetitions by aliases
 _MAX_DEPTH = 50  # nested brackets
@@ -147,7 +147,7 @@ def read_json(path: str | Path) -> Any:
         found: dict[str, Any] = {}
         for name, value in pairs:
             if name in found:
-                raise DrakeTeleopError("is defined twice", where=inside(where, name))
+                raise DrakeTeleopError("is defined twice", where=field_place(where, name))
             found[name] = value
         return found
 
@@ -198,7 +198,7 @@ class _NodeConverter:
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG_PREFIX}str":
                 raise _error(f"a field's name is a word, not {_shown(key.value)}", key, place)
-            field = inside(place, key.value)
+            field = field_place(place, key.value)
             if key.value in found:
                 raise _error("is defined twice", key, field)
             if key.value == "_tag":

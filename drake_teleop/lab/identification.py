@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.arrays import Array, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, check_identified, one_blas_thread
 from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.excite import criteria_of, excite
@@ -166,7 +165,7 @@ def identify_load(
     with one_blas_thread():
         batch = batch_identification(scenario, wrench, s, omega, alpha, scenario.rates.log_hz)
     estimate = result["load_estimate"][-1]
-    learnt("load_estimate", estimate[6:])
+    check_identified("load_estimate", estimate[6:])
     method = METHODS[scenario.load_estimator.method].method
     return LoadIdentification(trajectory, result, estimate, batch, kappa, factor, method)
 

@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.files import CannotWrite, make_folder, models_dir, whole_file
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import Stage
-from drake_teleop.common.resources import models_dir
 from drake_teleop.common.version import __version__
-from drake_teleop.common.writing import CannotWrite, make_folder, whole_file
 from drake_teleop.lab.identification import identification_scenario, identify_load, slave_arm
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.identification import Identification

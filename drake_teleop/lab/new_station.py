@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import make_folder, whole_file
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import yaml_text
-from drake_teleop.common.writing import make_folder, whole_file
 from drake_teleop.lab.run import run_command
 from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM, Master
 from drake_teleop.station.master.phantom import FORCE_LIMIT

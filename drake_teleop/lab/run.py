@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.progress import Progress, Stage, show_progress
-from drake_teleop.common.writing import (
+from drake_teleop.common.files import (
     CannotWrite,
-    naming,
     output_folder,
     remove_log,
+    wrap_write_errors,
     write_json,
     write_picture,
     write_table,
 )
+from drake_teleop.common.progress import Progress, Stage, show_progress
 from drake_teleop.lab.identification import identify_load, simulate_with_timing
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.lab.run_summary import ScenarioRun, overview, summarise
@@ -121,7 +121,7 @@ def _run_with_log(
     # After an interruption, old files must not look like results of this run.
     remove_log(log)
     for name in _FINAL_FILES:
-        with naming(out / name):
+        with wrap_write_errors(out / name):
             (out / name).unlink(missing_ok=True)
     had_scenario = scenario_file.exists()
     write_scenario(scenario_file, setup)

@@ -29,9 +29,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import Array, learnt
-from drake_teleop.common.quaternions import conjugate, logarithm, multiply
+from drake_teleop.common.numeric import Array, check_identified
 from drake_teleop.common.style import contact_spans
+from drake_teleop.common.vectors import conjugate, logarithm, multiply
 from drake_teleop.lab.identification import sensor_samples, slave_arm
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.identification import Identification
@@ -78,7 +78,7 @@ def calculated_contact_wrench(result: SimulationResult) -> Array:
         DrakeTeleopError: if no load was identified.
     """
     estimate = result["load_estimate"][-1]
-    learnt("load_estimate", estimate[6:])
+    check_identified("load_estimate", estimate[6:])
     wrench, s, omega, alpha = sensor_samples(result)
     return contact_wrench(wrench, estimate[:6], s, omega, alpha, estimate[6:])
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.blocks import MEANINGS, Fault
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import MEANINGS, Fault
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.inputs import RANGES, Inputs
 from drake_teleop.station.scenario import Scenario

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quaternions import conjugate, logarithm, multiply
+from drake_teleop.common.vectors import conjugate, logarithm, multiply
 from drake_teleop.live.device_guard import COMMAND_TIMEOUT_S
 from drake_teleop.live.device_packets import (
     CLUTCH_OPEN,

@@ -18,10 +18,9 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import Fault, sound
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
 from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.master_side import CLUTCH_PERIOD

@@ -15,10 +15,20 @@ from pydrake.systems.framework import (
     DiagramBuilder,
 )
 
+from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.lifetime import ONE_DICT
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
-from drake_teleop.common.vectors import cross, plus, plus_cross, put, three, times
+from drake_teleop.common.vectors import (
+    conjugate,
+    cross,
+    exponential,
+    logarithm,
+    multiply,
+    plus,
+    plus_cross,
+    put,
+    three,
+    times,
+)
 from drake_teleop.live.station_swap import add_cross_fade
 from drake_teleop.station.master_side import MakeMasterSide
 from drake_teleop.station.operator.operator import (

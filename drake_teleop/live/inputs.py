@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quaternions import exponential, logarithm
 from drake_teleop.common.texts import read_text
+from drake_teleop.common.vectors import exponential, logarithm
 from drake_teleop.common.version import __version__
 from drake_teleop.station.channel.network import PRESETS as NETWORK_PRESETS
 from drake_teleop.station.operator.operator import GRIPS

@@ -16,7 +16,7 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError, one_line
-from drake_teleop.common.writing import CannotWrite
+from drake_teleop.common.files import CannotWrite
 from drake_teleop.lab.identified_load import IdentifiedLoad
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceLink

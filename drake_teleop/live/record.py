@@ -14,8 +14,8 @@ from pathlib import Path
 
 from pydrake.systems.analysis import Simulator
 
+from drake_teleop.common.files import make_folder, wrap_write_errors, write_text
 from drake_teleop.common.version import __version__
-from drake_teleop.common.writing import make_folder, naming, write_text
 from drake_teleop.lab.identified_load import IdentifiedLoad, write_load
 from drake_teleop.live.inputs import INPUTS, Inputs, header, row
 from drake_teleop.station.result import SimulationResult
@@ -59,7 +59,7 @@ class Record:
     ) -> None:
         make_folder(folder)
         self._folder, path, self._last = folder, folder / INPUTS, ""
-        with naming(path):  # mode x never overwrites another drive
+        with wrap_write_errors(path):  # mode x never overwrites another drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
             write_scenario(folder / SCENARIO, scenario)
@@ -81,7 +81,7 @@ class Record:
             self._last = line
 
     def _append(self, line: str) -> None:
-        with naming(Path(self._file.name)):
+        with wrap_write_errors(Path(self._file.name)):
             self._file.write(line)
             self._file.flush()
 
@@ -90,7 +90,7 @@ class Record:
         if not ms:
             return self._remove()
         self.write(ms, inputs)
-        with naming(Path(self._file.name)):
+        with wrap_write_errors(Path(self._file.name)):
             self._file.close()
 
     def _remove(self) -> None:

@@ -33,9 +33,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.policy import policy
+from drake_teleop.common.files import make_folder
+from drake_teleop.common.html import policy
 from drake_teleop.common.progress import Progress, Stage, show_progress
-from drake_teleop.common.writing import make_folder
 from drake_teleop.lab.identified_load import IdentifiedLoad, identified_load
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.device_link import DeviceConnection

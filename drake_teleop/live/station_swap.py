@@ -21,8 +21,8 @@ from pydrake.systems.framework import (
     System,
 )
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked, checked_rows, number
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows, number
 from drake_teleop.load.regressor import non_contact_wrench_into
 
 

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array, checked, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.writing import write_json
+from drake_teleop.common.files import write_json
+from drake_teleop.common.numeric import Array, check_identified, checked
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, pseudo_inertia
 
 VERDICTS = ("identified", "weakly", "not", "prior")
@@ -75,7 +75,7 @@ class Identification:
     prior_dominated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(16, dtype=bool))
 
     def __post_init__(self) -> None:
-        learnt("phi", checked("phi", self.phi, 10))
+        check_identified("phi", checked("phi", self.phi, 10))
         checked("offsets", self.offsets, 6)
 
     @property
@@ -199,7 +199,7 @@ class Identification:
             optional[name] = _read_degrees(f"{path}:{name}", document[name])
         if (name := "prior_dominated") in document:
             optional[name] = _read_flags(f"{path}:{name}", document[name])
-        phi = learnt(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
+        phi = check_identified(f"{path}:phi", numbers("phi", 10, largest=_MAX_VALUE))
         if phi[0] == 0.0:  # the natural scale is proportional to the mass
             raise DrakeTeleopError("has no mass", where=f"{path}:phi")
         result = cls(

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked
 
 # Tolerance for rounding, so that rods, plates and points are consistent.
 _ROUNDING = 1e-12

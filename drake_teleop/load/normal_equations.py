@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import fdtrc
 
-from drake_teleop.common.arrays import Array, checked, checked_rows, number, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows, number, positive
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.regressor import regressor_into
 

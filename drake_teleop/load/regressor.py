@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked, checked_rows
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array, checked, checked_rows
 from drake_teleop.common.vectors import apply, cross, plus, symmetric, three, times
 
 WRENCH = slice(0, 6)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITIES = ("mass", "com", "inertia")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.writing import write_text
+from drake_teleop.common.files import write_text
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.logs.pose_motion.rigid import load_coefficients
 from drake_teleop.logs.read.alignment import ends, low_pass, undelayed

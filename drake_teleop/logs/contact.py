@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.detection import RARE, ContactDetector, statistics, wrench_axis
 from drake_teleop.load.contact.noise_floor import MARGIN, NoiseFloor, statistic_index
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.logs.cause_lines import with_lines
 from drake_teleop.logs.causes.cause import Cause

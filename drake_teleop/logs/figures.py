@@ -88,7 +88,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import (
     PARAMETERS,

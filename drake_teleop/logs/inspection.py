@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, one_line
-from drake_teleop.common.writing import make_folder, output_folder, write_json, write_text
+from drake_teleop.common.files import make_folder, output_folder, write_json, write_text
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.draft import draft_description

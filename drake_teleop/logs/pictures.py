@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.files import whole_file
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import (
     BLACK,
     BLUE,
@@ -24,7 +25,6 @@ from drake_teleop.common.style import (
     house_style,
     shade_contact,
 )
-from drake_teleop.common.writing import whole_file
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import VERDICTS, Identification, natural_scale
 from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog

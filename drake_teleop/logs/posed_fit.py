@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.consistent import consistent_least_squares
 from drake_teleop.load.batch.methods import METHODS, BatchResult
 from drake_teleop.load.identification import Identification, worth_stating

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array, number
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, number, one_blas_thread
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
 from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta

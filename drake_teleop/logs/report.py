@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from drake_teleop.common.files import write_text
 from drake_teleop.common.html import embedded, render
-from drake_teleop.common.writing import write_text
 from drake_teleop.load.batch.uncertainty import intervals
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.pictures import VERDICT_WORDS

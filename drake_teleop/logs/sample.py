@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.files import output_folder, write_json, write_table, write_text
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import yaml_text
-from drake_teleop.common.writing import output_folder, write_json, write_table, write_text
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory

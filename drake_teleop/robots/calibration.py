@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.writing import set_aside
+from drake_teleop.common.files import set_aside
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.normal_equations import NormalEquations
 from drake_teleop.load.regressor import regressor
 from drake_teleop.load.tolerance import Tolerance, deviations_of, errors_of

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.cause import CHANGES, Cause, causes_of
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.causes.instants import S, instants

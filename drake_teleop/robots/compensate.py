@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.writing import set_aside
+from drake_teleop.common.files import set_aside
 from drake_teleop.load.identification import Identification
 from drake_teleop.robots.assembly import Assembly
 from drake_teleop.robots.changes import Changes

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.regressor import non_contact_wrench_into
 from drake_teleop.logs.processing import usable_phi

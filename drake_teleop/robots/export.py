@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.load.identification import PARAMETERS, Identification
 from drake_teleop.load.inertia import is_physically_consistent, mass_com_inertia, transform_phi

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
-from drake_teleop.common.writing import make_folder, naming
+from drake_teleop.common.files import make_folder, wrap_write_errors
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.lines import flag_names
 from drake_teleop.robots.streams import Compensated
@@ -81,7 +81,7 @@ class McapSink:
         import foxglove
 
         make_folder(path.parent)
-        with naming(path):
+        with wrap_write_errors(path):
             self._file = foxglove.open_mcap(
                 path, allow_overwrite=True, context=self._channel.context
             )

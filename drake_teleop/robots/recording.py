@@ -12,10 +12,10 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import write_table, write_text
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import yaml_text
-from drake_teleop.common.writing import write_table, write_text
 from drake_teleop.logs.read import canonical
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.rotations import rotation_matrices

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError, require_library
-from drake_teleop.common.quaternions import multiply, rotate
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.vectors import multiply, rotate
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.streams import DAMAGED_WRENCH, IMU, JOINTS, POSE, WRENCH, Compensated, Part
 

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from drake_teleop.common.errors import DrakeTeleopError, require_library
-from drake_teleop.common.quaternions import exponential
+from drake_teleop.common.vectors import exponential
 from drake_teleop.robots.address import Address
 from drake_teleop.robots.rtde_reader import SAMPLE
 from drake_teleop.robots.streams import ACCELERATION, POSE, WRENCH, Part

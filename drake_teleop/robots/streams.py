@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 
 _T = TypeVar("_T")
 VALUES = 15
@@ -51,8 +51,8 @@ class Reading(NamedTuple):
 class Part(NamedTuple):
     """Sample of one stream of several, on its own clock.
 
-    The values are the wrench of S (6), the pose X_WF of a frame on the wrist (7), specific force
-    and angular velocity of S (6), joint positions (n), or a tool acceleration (3).
+    The values are one of: the wrench of S (6); the pose X_WF of a frame on the wrist (7); specific
+    force and angular velocity of S (6); joint positions (n); a tool acceleration (3).
     """
 
     stream: str

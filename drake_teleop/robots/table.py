@@ -9,7 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.writing import make_folder, naming, part_of_log, remove_log, write_table
+from drake_teleop.common.files import (
+    make_folder,
+    part_of_log,
+    remove_log,
+    wrap_write_errors,
+    write_table,
+)
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.streams import Compensated
 
@@ -54,7 +60,7 @@ class TableSink:
         else:
             text = table.write_csv(include_header=not self._written).encode()
             mode = "r+b" if self._written else "wb"
-            with naming(self._path), self._path.open(mode, buffering=0) as file:
+            with wrap_write_errors(self._path), self._path.open(mode, buffering=0) as file:
                 file.seek(self._end)
                 if file.write(text) < len(text):  # a truncated number would be a wrong number
                     file.truncate(self._end)

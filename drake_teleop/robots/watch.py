@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.contact.detection import RARE, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import finite_covariance
 from drake_teleop.load.contact.noise_floor_fit import fit_noise_floor

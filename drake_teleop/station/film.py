@@ -28,9 +28,8 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_teleop.common.html import render
-from drake_teleop.common.policy import policy
-from drake_teleop.common.writing import make_folder, write_text
+from drake_teleop.common.files import make_folder, write_text
+from drake_teleop.common.html import policy, render
 
 Array = NDArray[np.float64]
 Show = Callable[[float, int], None]

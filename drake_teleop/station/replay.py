@@ -24,9 +24,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir, output_folder, write_json
 from drake_teleop.common.style import BLUE, VERMILION, contact_spans
-from drake_teleop.common.writing import output_folder, write_json
 from drake_teleop.station.film import (
     Arrow,
     Canvas,

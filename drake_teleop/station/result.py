@@ -13,10 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import numbers
-from drake_teleop.common.errors import DrakeTeleopError, expect, install_extra, reading, refuse_fork
+from drake_teleop.common.errors import (
+    DrakeTeleopError,
+    expect,
+    install_extra,
+    refuse_fork,
+    wrap_read_errors,
+)
+from drake_teleop.common.files import PARTS_OF_LOG, make_folder, part_of_log, write_table
+from drake_teleop.common.numeric import numbers
 from drake_teleop.common.parquet_sizes import check_parquet
-from drake_teleop.common.writing import PARTS_OF_LOG, make_folder, part_of_log, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -273,9 +279,9 @@ class SimulationResult:
         remedy = "give what SimulationResult.write_parquet or drake-teleop run wrote"
         parts = _log_parts(path)
         for part in parts:
-            with reading(part, remedy, "is not a simulation result"):
+            with wrap_read_errors(part, remedy, "is not a simulation result"):
                 check_parquet(part)
-        with reading(path, remedy, "is not a simulation result"):
+        with wrap_read_errors(path, remedy, "is not a simulation result"):
             text = pl.read_parquet_metadata(parts[0])[_METADATA_KEY]
             specs = [Signal(**entry) for entry in json.loads(text)]
             t = _read_columns(path, ["t"])[:, 0]
@@ -354,7 +360,7 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         columns = self._columns[name]
-        with reading(self._path, "write it again"):
+        with wrap_read_errors(self._path, "write it again"):
             return _read_only(_read_columns(self._path, columns))
 
     def __contains__(self, name: object) -> bool:
@@ -396,7 +402,7 @@ def _log_parts(path: Path) -> list[Path]:
 
 
 def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
-    """Return (N, k) columns of a Parquet file; the caller converts errors with `reading`."""
+    """Return (N, k) columns of a Parquet file."""
     import polars as pl
 
     refuse_fork()

@@ -2,7 +2,7 @@
 
 ============== ===================================================================================
 saturated      the wrist sensor is saturated
-fault          invalid numbers in the loop, see `drake_teleop.common.fault`
+fault          invalid numbers in the loop, see `drake_teleop.common.blocks`
 unreachable    the inverse kinematics have no solution
 clipped        a joint speed or motor torque, or the displayed force or torque, is at its limit
 leaf           the deflection is outside the validity of its model
@@ -23,7 +23,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.fault import MEANINGS, Fault
+from drake_teleop.common.blocks import MEANINGS, Fault
 from drake_teleop.common.style import contact_spans
 from drake_teleop.load.regressor import LOST
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets

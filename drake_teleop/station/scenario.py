@@ -12,17 +12,17 @@ from typing import Any, TypeAlias
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.common.errors import DrakeTeleopError, expect, meant
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import (
+from drake_teleop.common.config import (
     check_name,
     check_ranges,
     check_structure,
     choice,
     plain,
     quantity,
+    settings,
 )
-from drake_teleop.common.resources import scenarios_dir
+from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.files import scenarios_dir
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.station.channel.channel import LONGEST_TIMEOUT, Channel
 from drake_teleop.station.channel.network import NetworkConfig
@@ -233,7 +233,9 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
     if not os.path.isfile(path):  # False also for invalid file names
         raise DrakeTeleopError(
             f"there is no scenario '{name_or_path}'",
-            remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
+            remedy=suggestion(
+                name_or_path, names, f"give a YAML file or one of {', '.join(names)}"
+            ),
         )
     return read_yaml(path, tagged=True), str(path)
 

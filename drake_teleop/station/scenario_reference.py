@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from drake_teleop.common.config import FieldInfo, fields_of
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import FieldInfo, fields_of
+from drake_teleop.common.files import write_text
 from drake_teleop.common.texts import yaml_data, yaml_scalar
-from drake_teleop.common.writing import write_text
 from drake_teleop.station.scenario import Scenario, ScenarioFromData
 from drake_teleop.station.sensor.presets import preset_of
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig

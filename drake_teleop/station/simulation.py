@@ -11,11 +11,11 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Diagram
 
+from drake_teleop.common.blocks import MEANINGS, Fault
+from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError, expect
-from drake_teleop.common.fault import MEANINGS, Fault
+from drake_teleop.common.files import remove_log
 from drake_teleop.common.progress import Progress, show_progress
-from drake_teleop.common.quantities import check_ranges
-from drake_teleop.common.writing import remove_log
 from drake_teleop.station.operator.decision import DONE
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Simulation

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 
-from drake_teleop.common.arrays import checked, learnt
 from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.numeric import check_identified, checked
 from drake_teleop.load.contact.noise_floor import NoiseFloor
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.estimation.contact_detection import ContactDetection
@@ -329,7 +329,7 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
     if estimate is not None:
         estimate = checked("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
-            learnt("load_estimate", estimate[6:])
+            check_identified("load_estimate", estimate[6:])
     sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
     needed = not sigma_gripper == sigma_object == gamma
     if needed and not _has_load_estimate(scenario, estimate):

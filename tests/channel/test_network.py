@@ -13,7 +13,7 @@ from numba import njit
 from pydrake.common.yaml import yaml_load_typed
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quaternions import exponential, multiply
+from drake_teleop.common.vectors import exponential, multiply
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import (
     BACKWARD,

@@ -14,7 +14,7 @@ from pydrake.multibody.math import SpatialVelocity
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.lab.run_summary import ScenarioRun, summarise

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import sosfilt
 
+from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quantities import check_ranges
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.online.recursive import RecursiveEstimator, RecursiveLeastSquares
 from drake_teleop.load.online.recursive_tls import RecursiveTotalLeastSquares

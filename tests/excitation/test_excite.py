@@ -17,7 +17,7 @@ from shown import type_in
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.excitation.check import check, check_motion
 from drake_teleop.lab.excitation.excite import excite, sensor_motion
 from drake_teleop.lab.excitation.limits import LIMITS, empty_motions, motions_of, sensor_vectors

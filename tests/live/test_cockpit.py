@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.fault import MEANINGS, Fault
+from drake_teleop.common.blocks import MEANINGS, Fault
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.cockpit import Cockpit
 from drake_teleop.live.inputs import RANGES, Inputs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
 from drake_teleop.live.hand import LiveHand
 from drake_teleop.station.operator.operator import OperatorConfig
 

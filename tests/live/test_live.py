@@ -11,8 +11,8 @@ import pytest
 from full_disk import small_disk
 
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import CannotWrite
 from drake_teleop.common.progress import silent
-from drake_teleop.common.writing import CannotWrite
 from drake_teleop.live.live import FRAME, MAX_MESSAGE_BYTES, Live, parse
 from drake_teleop.live.pace import Pace
 from drake_teleop.live.session import Session, read_drive

@@ -11,8 +11,8 @@ from pydrake.systems.analysis import Simulator
 
 from drake_teleop.cli.main import main
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.files import models_dir
 from drake_teleop.common.progress import silent
-from drake_teleop.common.resources import models_dir
 from drake_teleop.lab.identification import slave_arm
 from drake_teleop.live.hand import LEAD_TIME_S
 from drake_teleop.live.inputs import INPUTS, RANGES, Inputs, header, read_inputs, row

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drake_teleop.common.fault import Fault
+from drake_teleop.common.blocks import Fault
 from drake_teleop.station.master import phantom
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display

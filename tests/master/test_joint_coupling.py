@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.channel.channel import Channel

@@ -7,7 +7,7 @@ import pytest
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.master import phantom
 
 #: qdot of the serial tree = SERIAL @ qdot of the device.

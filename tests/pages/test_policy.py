@@ -8,8 +8,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from drake_teleop.common.html import render
-from drake_teleop.common.policy import policy
+from drake_teleop.common.html import policy, render
 from drake_teleop.station.film import Film
 
 CODE = "const a = 1;\nlet b = 'é';"

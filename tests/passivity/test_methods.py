@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quantities import check_ranges
-from drake_teleop.common.quaternions import multiply, normalized, rotate
+from drake_teleop.common.vectors import multiply, normalized, rotate
 from drake_teleop.lab.comparison.one_dof import (
     OneDof,
     Task,

@@ -19,7 +19,7 @@ from test_compensator import DT, load, readings
 
 import drake_teleop.robots.udp as udp
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.writing import CannotWrite
+from drake_teleop.common.files import CannotWrite
 from drake_teleop.robots import table
 from drake_teleop.robots.compensate import Control, compensate_command, run
 from drake_teleop.robots.compensator import Compensator

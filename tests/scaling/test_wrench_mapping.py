@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 
-from drake_teleop.common.quaternions import exponential
+from drake_teleop.common.vectors import exponential
 from drake_teleop.station.scaling.force_scaling import wrench_to_master, wrench_to_master_into
 from drake_teleop.station.scaling.kinematic_scaling import scale_pose_into
 

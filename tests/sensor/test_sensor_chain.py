@@ -16,8 +16,8 @@ from pydrake.common.yaml import yaml_load, yaml_load_typed
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.common.config import check_ranges
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quantities import check_ranges
 from drake_teleop.station.sensor.presets import PRESETS, preset_of
 from drake_teleop.station.sensor.sensor_chain import (
     NOISE_BLOCK,

@@ -7,7 +7,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import WeldJoint
 
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 
 SEVEN_AXES = [
     (0, 0, 1),

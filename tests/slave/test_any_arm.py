@@ -15,7 +15,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.lab.analysis.linearization import linearize, linearize_station
 from drake_teleop.lab.identification import true_load
 from drake_teleop.station.channel.channel import Channel

@@ -9,7 +9,7 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave import inverse_kinematics as ik
 from drake_teleop.station.slave.arm import forward_kinematics
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from shown import type_in
 
-from drake_teleop.common.resources import studies_dir
+from drake_teleop.common.files import studies_dir
 from drake_teleop.lab.studies import scaling_study
 from drake_teleop.lab.studies.scaling_study import (
     SELECTIONS,

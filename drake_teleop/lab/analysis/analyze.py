@@ -37,9 +37,9 @@ import numpy as np
 from pydrake.math import RollPitchYaw
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.files import make_folder, output_folder, write_json
+from drake_teleop.common.numeric import one_blas_thread
 from drake_teleop.common.progress import Stage, show_progress
-from drake_teleop.common.writing import make_folder, output_folder, write_json
 from drake_teleop.lab.analysis import figures
 from drake_teleop.lab.analysis.cut_loop import cut_loop, loop_response
 from drake_teleop.lab.analysis.linearization import (

@@ -27,9 +27,9 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.systems.analysis import InitializeParams
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply
+from drake_teleop.common.numeric import checked
+from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply
 from drake_teleop.lab.analysis.one_axis import Complex
 from drake_teleop.lab.analysis.two_port import two_port
 from drake_teleop.station.channel.channel import Channel

@@ -13,6 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import (
     BLACK,
@@ -23,7 +24,6 @@ from drake_teleop.common.style import (
     Picture,
     house_style,
 )
-from drake_teleop.common.writing import write_picture, write_text
 from drake_teleop.lab.analysis import absolute_stability, transparency
 from drake_teleop.lab.analysis.maps import StabilityMap
 from drake_teleop.lab.analysis.one_axis import Complex, OneAxis

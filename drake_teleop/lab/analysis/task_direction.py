@@ -16,8 +16,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import checked
 from drake_teleop.lab.analysis.one_axis import OneAxis
 from drake_teleop.station.environment.point_contact import STIFFNESS
 from drake_teleop.station.environment.solids import Wall

@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.errors import DrakeTeleopError, meant
+from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.files import make_folder, output_folder, write_json, write_table
 from drake_teleop.common.progress import Stage, show_progress
-from drake_teleop.common.writing import make_folder, output_folder, write_json, write_table
 from drake_teleop.lab.comparison.decision import decide
 from drake_teleop.lab.comparison.delayed_contact import (
     LEAVES,
@@ -335,7 +335,7 @@ def _check_names(what: str, requested: Sequence[str], known: Sequence[str]) -> N
             raise DrakeTeleopError(
                 f"there is no {what} '{name}'",
                 where=f"{what}s",
-                remedy=meant(name, known, f"choose among {', '.join(known)}"),
+                remedy=suggestion(name, known, f"choose among {', '.join(known)}"),
             )
 
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.quaternions import quaternion_of
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import put, quaternion_of
 from drake_teleop.lab.comparison.one_dof import ACTUAL, HAND, Figures, Task, figures_of
 from drake_teleop.lab.comparison.station_accounts import load_work, start_energy, station_accounts
 from drake_teleop.lab.identification import slave_arm

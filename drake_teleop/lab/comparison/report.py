@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import embedded, render
 from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
-from drake_teleop.common.writing import write_picture, write_text
 from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS

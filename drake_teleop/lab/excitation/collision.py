@@ -35,8 +35,8 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.limits import capsule_distances, empty_motions, motions_of
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.regressor import regressor
 
 CRITERIA = ("kappa_w10", "kappa10", "kappa16", "A16", "D16")

@@ -8,8 +8,8 @@ from itertools import accumulate
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import Stage, show_progress
 from drake_teleop.lab.excitation.check import RATE, Use, check
 from drake_teleop.lab.excitation.criteria import CRITERIA, Criterion

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.criteria import regressor_gradient
 from drake_teleop.lab.excitation.link_gradients import (
     SEED_SIZE,

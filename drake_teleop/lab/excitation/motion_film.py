@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import Context
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLUE
 from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, sensor_motion

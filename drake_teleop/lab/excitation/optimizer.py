@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.lab.excitation.criteria import Criterion
 from drake_teleop.lab.excitation.limits import (
     LIMITS,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.load.inertia import inertia_about_origin
 from drake_teleop.load.regressor import regressor

@@ -13,8 +13,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Diagram
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
 from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
 from drake_teleop.lab.excitation.limits import Limits

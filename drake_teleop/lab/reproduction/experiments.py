@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.progress import Progress, Stage
 from drake_teleop.lab.identification import LoadIdentification, sensor_samples, slave_arm
 from drake_teleop.lab.run_summary import FILTER_TAIL_S, in_contact

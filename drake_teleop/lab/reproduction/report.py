@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drake_teleop.common.files import write_text
 from drake_teleop.common.html import embedded, render
-from drake_teleop.common.writing import write_text
 
 # Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (

@@ -13,9 +13,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from drake_teleop.common.progress import Progress, show_progress
-from drake_teleop.common.style import PAGE_DPI
-from drake_teleop.common.writing import (
+from drake_teleop.common.files import (
     make_folder,
     output_folder,
     write_json,
@@ -23,6 +21,8 @@ from drake_teleop.common.writing import (
     write_table,
     write_text,
 )
+from drake_teleop.common.progress import Progress, show_progress
+from drake_teleop.common.style import PAGE_DPI
 from drake_teleop.lab.identification import (
     LoadIdentification,
     identification_scenario,

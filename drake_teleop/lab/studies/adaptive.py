@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import ndtr
 from scipy.stats import norm
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 
 # Bounds of log length scale, in units of the design's span, and of log noise variance, in units of
 # the objective's variance.

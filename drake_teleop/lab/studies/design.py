@@ -9,10 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.common.errors import DrakeTeleopError, meant
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import check_ranges, choice, plain, quantity
+from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
+from drake_teleop.common.errors import DrakeTeleopError, suggestion
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.measures import MEASURES, default_measures
 
 Value: TypeAlias = float | str | bool | list[float]
@@ -132,7 +131,7 @@ class Study:
                 raise DrakeTeleopError(
                     f"there is no measure '{name}'",
                     where=f"{where}:measures",
-                    remedy=meant(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
+                    remedy=suggestion(name, MEASURES, f"choose among {', '.join(MEASURES)}"),
                 )
         for index, factor in enumerate(self.factors):
             factor.check(f"{where}:factors[{index}]")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.lab.studies.design import Factor, Study
 from drake_teleop.lab.studies.level_model import (
     CONFIDENCE,

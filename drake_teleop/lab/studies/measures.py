@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.station.operator.task import TASK_MEASURES
 from drake_teleop.station.result import SimulationResult
 

@@ -12,8 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from drake_teleop.common.files import write_picture
 from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, house_style
-from drake_teleop.common.writing import write_picture
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
 from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.files import CannotWrite
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.common.progress import Progress, show_progress
 from drake_teleop.common.version import __version__
-from drake_teleop.common.writing import CannotWrite
 from drake_teleop.lab.studies.design import Study, Values
 from drake_teleop.lab.studies.processes import Chunk, processes
 from drake_teleop.lab.studies.store import Store, open_store

@@ -16,15 +16,15 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.common.style import COLOURS, Picture, house_style
-from drake_teleop.common.writing import (
+from drake_teleop.common.files import (
     make_folder,
     output_folder,
     write_json,
     write_picture,
     write_table,
 )
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.style import COLOURS, Picture, house_style
 from drake_teleop.lab.studies.effects import estimated, numbers
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drake_teleop.common.errors import DrakeTeleopError, reading
+from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
+from drake_teleop.common.files import make_folder, wrap_write_errors, write_table, write_text
 from drake_teleop.common.parquet_sizes import check_parquet
-from drake_teleop.common.writing import make_folder, naming, write_table, write_text
 
 if TYPE_CHECKING:
     import polars as pl
@@ -52,7 +52,7 @@ class Store:
     def mark(self, run: int) -> None:
         """Count one more start of a chunk."""
         path = self._marks / str(run)
-        with naming(path):
+        with wrap_write_errors(path):
             self._marks.mkdir(exist_ok=True)
             with path.open("ab") as mark:
                 mark.write(b".")
@@ -77,9 +77,9 @@ class Store:
         remedy = "remove the damaged part and repeat the command"
         parts = self._parts()
         for part in parts:
-            with reading(part, remedy):
+            with wrap_read_errors(part, remedy):
                 check_parquet(part)
-        with reading(self.folder, remedy):
+        with wrap_read_errors(self.folder, remedy):
             return pl.read_parquet(parts).sort("run")
 
 
@@ -92,7 +92,7 @@ def _runs_in(parts: list[Path]) -> set[int]:
     import polars as pl
 
     if parts:
-        with suppress(DrakeTeleopError), reading(parts[0], ""):
+        with suppress(DrakeTeleopError), wrap_read_errors(parts[0], ""):
             for part in parts:
                 check_parquet(part)
             return set(pl.read_parquet(parts, columns=["run"])["run"])

@@ -24,11 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.common.errors import DrakeTeleopError, expect, meant
-from drake_teleop.common.quantities import check_ranges, check_structure
-from drake_teleop.common.resources import studies_dir
+from drake_teleop.common.config import check_ranges, check_structure
+from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
+from drake_teleop.common.files import output_folder, studies_dir, write_json, write_table
 from drake_teleop.common.texts import read_yaml
-from drake_teleop.common.writing import output_folder, write_json, write_table
 from drake_teleop.lab.run import run_scenario
 from drake_teleop.lab.studies.design import Factor, Study, Values
 from drake_teleop.lab.studies.effects import effects
@@ -129,7 +128,9 @@ def study_file(name_or_path: str | Path) -> Path:
         names = sorted(file.stem for file in studies_dir().glob("*.yaml"))
         raise DrakeTeleopError(
             f"there is no study '{name_or_path}'",
-            remedy=meant(name_or_path, names, f"give a YAML file or one of {', '.join(names)}"),
+            remedy=suggestion(
+                name_or_path, names, f"give a YAML file or one of {', '.join(names)}"
+            ),
         )
     return path
 

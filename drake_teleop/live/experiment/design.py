@@ -8,9 +8,15 @@ from typing import TypeAlias
 
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 
-from drake_teleop.common.errors import DrakeTeleopError, expect, meant
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import check_ranges, check_structure, choice, plain, quantity
+from drake_teleop.common.config import (
+    check_ranges,
+    check_structure,
+    choice,
+    plain,
+    quantity,
+    settings,
+)
+from drake_teleop.common.errors import DrakeTeleopError, expect, suggestion
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.live.inputs import NETWORKS, OWN
 from drake_teleop.station.operator.task import Insert
@@ -174,7 +180,7 @@ def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     if not os.path.isfile(path):
         raise DrakeTeleopError(
             f"there is no experiment '{path}'",
-            remedy=meant(path, names, f"give a YAML file or one of {', '.join(names)}"),
+            remedy=suggestion(path, names, f"give a YAML file or one of {', '.join(names)}"),
         )
     data = read_yaml(path, tagged=True)
     check_structure(Experiment, data, str(path))

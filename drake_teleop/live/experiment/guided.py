@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.writing import CannotWrite
+from drake_teleop.common.files import CannotWrite
 from drake_teleop.live.device_link import DeviceLink
 from drake_teleop.live.experiment.apparatus import Apparatus, IntervalLog
 from drake_teleop.live.experiment.design import PegInSlot

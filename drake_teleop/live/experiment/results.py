@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from drake_teleop.common.writing import write_picture, write_table
+from drake_teleop.common.files import write_picture, write_table
 from drake_teleop.live.experiment.design import ApparentMass, Experiment, PegInSlot, Task
 from drake_teleop.live.experiment.psychometrics import Estimate, Psi
 from drake_teleop.live.experiment.store import Row, Store
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _Z = 1.959964
-_SHOWN = (
+_PICTURED_QUANTITIES = (
     "threshold of contact [N at the tool]",
     "threshold of mass [kg at the hand]",
     "time to the floor [s]",
@@ -132,7 +132,9 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
 def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
     from drake_teleop.common.style import Picture, house_style
 
-    shown = [quantity for quantity in _SHOWN if any(r.quantity == quantity for r in found)]
+    shown = [
+        quantity for quantity in _PICTURED_QUANTITIES if any(r.quantity == quantity for r in found)
+    ]
     if not shown:
         return
     names = [condition.name for condition in experiment.conditions]

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import polars as pl
 
-from drake_teleop.common.errors import DrakeTeleopError, reading
+from drake_teleop.common.errors import DrakeTeleopError, wrap_read_errors
+from drake_teleop.common.files import make_folder, write_table
 from drake_teleop.common.version import __version__
-from drake_teleop.common.writing import make_folder, write_table
 from drake_teleop.lab.studies.store import claimed
 from drake_teleop.live.experiment.design import Experiment
 
@@ -79,7 +79,7 @@ class Store:
         if not path.exists():
             return []
         remedy = "remove it; the participant then starts again"
-        with reading(path, remedy):
+        with wrap_read_errors(path, remedy):
             table = pl.read_csv(path, schema=_SCHEMA)
         rows = [Row(**row) for row in table.iter_rows(named=True)]
         if (

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked
 from drake_teleop.load.inertia import is_physically_consistent, pseudo_inertia
 
 _BASIS = [pseudo_inertia(unit) for unit in np.eye(10)]

@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked_rows, number
 from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.numeric import Array, checked_rows, number
 from drake_teleop.load.batch.consistent import Ellipsoid, Prior, consistent_least_squares
 from drake_teleop.load.batch.covariance import (
     covariance_of,

@@ -16,9 +16,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked, checked_rows
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows
 from drake_teleop.load.regressor import regressor
 
 CHUNK = 2**15

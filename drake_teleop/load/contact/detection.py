@@ -18,9 +18,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, positive
 from drake_teleop.load.contact.noise_floor import (
     HELD_A,
     HELD_ALPHA,

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import Array, checked, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows, positive
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into
 

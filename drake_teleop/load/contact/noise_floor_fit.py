@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drake_teleop.common.arrays import checked
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import checked
 from drake_teleop.load.contact.detection import statistics
 from drake_teleop.load.contact.noise_floor import LENGTHS, NoiseFloor, checked_motion, write_sigmas
 

@@ -17,9 +17,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, checked_rows, positive
 from drake_teleop.common.vectors import cholesky, put
 from drake_teleop.load.identification import Identification, worth_stating
 from drake_teleop.load.inertia import phi_from_mass_com_inertia

@@ -12,9 +12,9 @@ from abc import ABC, abstractmethod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked_rows, positive
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked_rows, positive
 from drake_teleop.load.batch.uncertainty import prior_dominated
 from drake_teleop.load.identification import WORTH_STATING, Identification, worth_stating
 from drake_teleop.load.regressor import (

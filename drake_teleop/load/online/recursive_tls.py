@@ -18,9 +18,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.load.online.recursive import (
     PRIOR_STD,

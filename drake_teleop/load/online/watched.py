@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.vectors import put
 from drake_teleop.load.online import change
 from drake_teleop.load.online.change import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.changes import add_step
 from drake_teleop.logs.causes.contacts import contact_spans

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.identification import worth_stating
 from drake_teleop.load.inertia import mass_com_inertia
 from drake_teleop.logs.causes.candidates import similar_factors

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.model import DELAY, Step
 from drake_teleop.logs.causes.rows import Spans, in_spans

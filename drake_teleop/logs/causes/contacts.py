@@ -8,7 +8,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.changes import with_ramps, without_small_steps
 from drake_teleop.logs.causes.fit import regularized_inverse
 from drake_teleop.logs.causes.instants import FORCES

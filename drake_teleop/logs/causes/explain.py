@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.logs.causes.cause import Cause, Stretch, causes_of, stretches
 from drake_teleop.logs.causes.instants import Instants
 from drake_teleop.logs.causes.intervals import (

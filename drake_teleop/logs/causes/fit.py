@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.instants import FORCES, ORDER
 from drake_teleop.logs.causes.model import Model
 from drake_teleop.logs.causes.rows import Rows

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 
 ORDER = 4
 """Order of the autoregressive noise."""

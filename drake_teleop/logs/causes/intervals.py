@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.covariance import ARM
 from drake_teleop.load.identification import natural_scale
 from drake_teleop.logs.causes.candidates import Candidate, similar_factors

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.batch.moments import coefficients
 from drake_teleop.logs.causes.instants import (
     ALPHA,

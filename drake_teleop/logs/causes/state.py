@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.fit import Fit, fit
 from drake_teleop.logs.causes.instants import ORDER, PRODUCTS, RP, Instants, R
 from drake_teleop.logs.causes.model import Model

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.corrections import Finding
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.read.description import Description

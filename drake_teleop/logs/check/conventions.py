@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, one_blas_thread
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.check.against_load import against_load, drift_finding, payload_finding
 from drake_teleop.logs.check.channels import channel_findings

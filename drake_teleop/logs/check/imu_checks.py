@@ -11,7 +11,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.corrections import (
     MIN_CLOCK_ERROR_S,
     Edit,

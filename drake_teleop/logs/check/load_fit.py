@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtri
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured
 from drake_teleop.logs.read.canonical import Log

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.clocks import spread

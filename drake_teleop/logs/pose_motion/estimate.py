@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from drake_teleop.common.arrays import Array, checked
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.one_thread import one_blas_thread
+from drake_teleop.common.numeric import Array, checked, one_blas_thread
 from drake_teleop.common.vectors import cross_matrix
 from drake_teleop.logs.pose_motion.clock_rate import at_rate, clock_rate
 from drake_teleop.logs.pose_motion.imu_rows import compare_imu

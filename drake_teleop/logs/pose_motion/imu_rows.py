@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Inertial
 from drake_teleop.logs.pose_motion.spectra import Complex, end_taper, exclude
 from drake_teleop.logs.pose_motion.splines import ImuRows, PoseSplines

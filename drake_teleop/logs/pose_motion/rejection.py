@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.linear_model import ROUNDING, Spectra
 from drake_teleop.logs.pose_motion.spectra import Grid, distance
 from drake_teleop.logs.pose_motion.splines import MOTION_COLUMNS

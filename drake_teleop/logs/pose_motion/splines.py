@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 from scipy.linalg import solveh_banded
 from scipy.sparse import diags_array, eye_array
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Poses
 
 DEGREE = 5

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
 from drake_teleop.logs.read.lever_arm import LeverArm, lever_arm_from_wrench

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.writing import write_table
+from drake_teleop.common.files import write_table
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.clocks import MIN_RATE_HZ
 from drake_teleop.logs.read.description import Description

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array, checked, number
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked, number
 from drake_teleop.load.compensation import contact_wrench
 from drake_teleop.load.regressor import regressor
 from drake_teleop.logs.read.alignment import low_passed, measured, resample, widened

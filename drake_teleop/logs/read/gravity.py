@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.causes.instants import Instants, free_delay, instants
 from drake_teleop.logs.read.alignment import resample, undelayed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.alignment import resample
 from drake_teleop.logs.read.canonical import Log
 

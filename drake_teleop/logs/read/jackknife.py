@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 
 _BLOCKS = 20
 # Directions with smaller singular values, relative to the largest, are undetermined.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.alignment import low_passed, resample
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.imu_clock import best_shift, clock_drift, signal_pairs

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array, number
 from drake_teleop.common.errors import DrakeTeleopError, expect
+from drake_teleop.common.numeric import Array, number
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import (
     SMOOTHER_WINDOW,

@@ -6,7 +6,7 @@ from itertools import permutations, product
 
 import numpy as np
 
-from drake_teleop.common.arrays import Array
+from drake_teleop.common.numeric import Array
 
 WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vector": 3}
 """Number of columns of each form."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.pose_motion.poses import Inertial, Poses
 from drake_teleop.logs.read.alignment import low_pass, resample, spacing, uniform_times
 from drake_teleop.logs.read.description import Description, Orientation

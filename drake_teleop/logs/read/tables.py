@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.arrays import Array
-from drake_teleop.common.errors import DrakeTeleopError, reading, refuse_fork
+from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
+from drake_teleop.common.numeric import Array
 from drake_teleop.common.parquet_sizes import check_parquet
 from drake_teleop.logs.read.csv_text import read_csv
 from drake_teleop.logs.read.mat_file import read_mat
@@ -199,7 +199,7 @@ def read_table(path: Path, *, header: bool = True) -> Table:
     if not os.path.isfile(path):
         raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
     refuse_fork()
-    with reading(path, f"check that it is a valid {path.suffix} file"):
+    with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
         arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
         table = (
             _read_frame(path, header) if arrays is None else _table_from_arrays(path, arrays(path))

@@ -20,12 +20,10 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import sound
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.vectors import put
 from drake_teleop.station.channel import network
 from drake_teleop.station.channel.network import PRESETS, NetworkConfig

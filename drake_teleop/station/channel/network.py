@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import check_ranges, choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
 from drake_teleop.common.noise import random_bits
-from drake_teleop.common.quantities import check_ranges, choice, plain, quantity
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.packet import LOAD, POSE, VELOCITY, WRENCH, arrived, moved_into
 

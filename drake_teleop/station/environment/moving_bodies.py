@@ -26,8 +26,16 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.quaternions import conjugate, multiply, normalized, rotate
-from drake_teleop.common.vectors import cross, plus, three, times
+from drake_teleop.common.vectors import (
+    conjugate,
+    cross,
+    multiply,
+    normalized,
+    plus,
+    rotate,
+    three,
+    times,
+)
 
 Array = NDArray[np.float64]
 

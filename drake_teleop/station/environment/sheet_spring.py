@@ -15,9 +15,8 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, PrismaticSpring
 
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import (
     BodiesOfTool,
     Environment,

@@ -20,8 +20,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.station.environment.environment import ContactMaterial, Environment, Stand
 
 #: Balls of the peg [m]: radius, and z_S of the centres. The first is that of tool.sdf. The second

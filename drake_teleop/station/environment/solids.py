@@ -15,9 +15,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, SpatialInertia
 
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
 from drake_teleop.station.environment.environment import (
     BodiesOfTool,
     ContactMaterial,

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import sound
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT
-from drake_teleop.common.quantities import choice, quantity
+from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import FLAG, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.load.online.change import change_parameters
 from drake_teleop.load.online.recursive_tls import METHODS
 from drake_teleop.load.online.watched import (

@@ -35,9 +35,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
 from drake_teleop.station.master.leader_model import JOINTS, Leader

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import sound
-from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.vectors import put
 from drake_teleop.station.master.dynamics import HapticDevice, pose_into, step, twist_into
 from drake_teleop.station.master.force_display import ForceDisplay, initial_display

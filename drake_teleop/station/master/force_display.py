@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import Fault, sound
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import put
 from drake_teleop.station.master.dynamics import gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE

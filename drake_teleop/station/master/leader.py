@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import sound
-from drake_teleop.common.lifetime import ONE_DICT
-from drake_teleop.common.quaternions import quaternion_of
-from drake_teleop.common.vectors import cross, put, three
+from drake_teleop.common.vectors import cross, put, quaternion_of, three
 from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
 from drake_teleop.station.master.numbers import HAND_MASS, PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.slave.arm import (

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.station.master.leader import LeaderDevice, joint_parameters
 from drake_teleop.station.master.numbers import (
     HAND_INERTIA,

@@ -22,8 +22,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.quaternions import multiply
-from drake_teleop.common.vectors import cross, dot, plus, solve, times
+from drake_teleop.common.vectors import cross, dot, multiply, plus, solve, times
 from drake_teleop.station.master.numbers import COULOMB, HAND_INERTIA, HAND_MASS, VISCOUS
 
 GRAVITY = 9.81  # m/s^2, along -z_B

@@ -20,13 +20,11 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quantities import choice, plain, quantity
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply, rotate
-from drake_teleop.common.vectors import put
+from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply, put, rotate
 from drake_teleop.station.operator import decision
 from drake_teleop.station.operator import perception as feeling
 from drake_teleop.station.operator.decision import Training

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drake_teleop.common.arrays import checked, checked_rows
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
+from drake_teleop.common.numeric import checked, checked_rows
 
 Array = NDArray[np.float64]
 

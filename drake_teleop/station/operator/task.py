@@ -5,9 +5,8 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
 
 
 @dataclass

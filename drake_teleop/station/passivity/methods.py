@@ -23,9 +23,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import address_of, call_at, njit
+from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity import none
 from drake_teleop.station.passivity.force_limit import ForceLimitConfig

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.quaternions import conjugate, exponential, logarithm, multiply, normalized
+from drake_teleop.common.vectors import conjugate, exponential, logarithm, multiply, normalized
 from drake_teleop.station.passivity.memory import RECEIVED, Slots
 
 PACKET_SIZE = 38

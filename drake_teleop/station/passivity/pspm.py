@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import (
     COMMAND,

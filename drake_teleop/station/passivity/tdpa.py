@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import (
     COMMAND,
@@ -82,7 +81,7 @@ _RESERVE, _DRAG, _HAND_STIFFNESS = (
 _SPEED = _places.vector(2)
 # Memory of the master: withheld share of the wrench, kept energy.
 _places = own_memory()
-_WITHHELD_SHARE, _KEPT = _places.vector(2), _places.vector(2)
+_WITHHELD_SHARE, _RESERVED_ENERGY = _places.vector(2), _places.vector(2)
 # Memory of the slave: work in and out at the actual and the commanded motion; withheld command;
 # filtered wrench; contact stiffness; number of the packet that completed a quick onset.
 _places = own_memory()
@@ -154,7 +153,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
-    ledger, kept, withheld = memory[LEDGER], memory[_KEPT], memory[_WITHHELD_SHARE]
+    ledger, kept, withheld = memory[LEDGER], memory[_RESERVED_ENERGY], memory[_WITHHELD_SHARE]
     for g in range(2):
         limit(wrench, g, limits[g])
         share = min(1.0, 1.0 - withheld[g] + release)
@@ -192,7 +191,7 @@ def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
 @njit(cache=True)
 def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
     """Add drag along -dx to the wrench, which never drains the ledger."""
-    drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_KEPT][g]
+    drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
         damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
         for i in range(3 * g, 3 * g + 3):
@@ -204,7 +203,7 @@ def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 def _send_surplus(g, p, memory):
     """Send energy of the master beyond the reserve back to the slave."""
     ledger = memory[LEDGER]
-    surplus = ledger[g] + memory[_KEPT][g] - p[_RESERVE][g]
+    surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
     ledger[g] -= surplus
     memory[SENT][g] += surplus
@@ -213,7 +212,7 @@ def _send_surplus(g, p, memory):
 @njit(cache=True)
 def _account_for_work(g, drained, p, memory):
     """Subtract drained work from the ledger, then from the kept energy; or send the input."""
-    ledger, kept = memory[LEDGER], memory[_KEPT]
+    ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
         ledger[g] = max(ledger[g] - drained, 0.0)

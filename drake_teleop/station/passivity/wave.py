@@ -7,7 +7,7 @@ and the receiver plays the integral through a first-order filter within the rece
 energy. Lost packets cause no drift. Uneven arrival slows the filter; a playout buffer avoids this.
 
 A damper at the slave's command matches the line: free motion then reflects nothing, and the hand
-feels b v. In silence the slave keeps its command and reflects.
+displays b v. In silence the slave keeps its command and reflects.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import quantity
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.vectors import put
 from drake_teleop.station.passivity.memory import (
     COMMAND,

@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import Fault, sound
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quantities import quantity
 from drake_teleop.common.vectors import apply, rows, three, times, transposed
 from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
 from drake_teleop.load.regressor import (
@@ -95,7 +93,7 @@ def wrench_to_master(
 ) -> NDArray[np.float64]:
     """Return the wrench to render at the master for a wrench of the slave's sensor.
 
-    The operator feels the reaction of Eq. (1)'s wrench: for a load that is held up, the hand is
+    The device displays the reaction of Eq. (1)'s wrench: for a load that is held up, the hand is
     pulled down. The moment about the origin of S becomes the moment about E. Equal power at both
     ends needs the translation scale as force scale; the paper's 1/17.5 is smaller.
 

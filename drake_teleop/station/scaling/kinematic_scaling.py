@@ -11,19 +11,18 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quantities import quantity
-from drake_teleop.common.quaternions import (
+from drake_teleop.common.config import quantity, settings
+from drake_teleop.common.vectors import (
     conjugate,
     exponential,
     logarithm,
     multiply,
     normalized,
+    put,
     rotate,
 )
-from drake_teleop.common.vectors import put
 
 
 @settings

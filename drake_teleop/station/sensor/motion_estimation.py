@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import choice, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, quantity
 from drake_teleop.common.vectors import (
     apply,
     cross,

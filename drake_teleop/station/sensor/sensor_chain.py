@@ -21,11 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drake_teleop.common.blocks import LARGEST
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import LARGEST
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, plain, quantity
 from drake_teleop.common.vectors import apply, cross, cross_matrix, nine, plus_cross, put, three
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,

@@ -28,9 +28,9 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import Demultiplexer, RandomSource
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import apply, cross, minus, nine, put, three, transposed
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,

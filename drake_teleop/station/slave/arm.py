@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quaternions import quaternion_of
 from drake_teleop.common.vectors import (
     add_into,
     apply,
@@ -27,6 +26,7 @@ from drake_teleop.common.vectors import (
     nine,
     plus,
     plus_cross,
+    quaternion_of,
     symmetric,
     three,
     times,

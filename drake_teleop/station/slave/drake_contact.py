@@ -14,7 +14,7 @@ from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
 
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.plant_dynamics import add_force

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import sound
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import put
 from drake_teleop.station.slave.arm import SLIDES, ArmModel, forward_kinematics
 

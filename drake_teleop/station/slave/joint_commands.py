@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import sound
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import (

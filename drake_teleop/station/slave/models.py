@@ -29,8 +29,7 @@ from pydrake.multibody.tree import (
     WeldJoint,
 )
 
-from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.silence import silent_stderr
+from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
 from drake_teleop.common.texts import read_text
 from drake_teleop.station.slave.meshes import remove_unusable_meshes
 from drake_teleop.station.slave.model_check import WORLD, check_model, check_tree

@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.fault import sound
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quaternions import (
+from drake_teleop.common.vectors import (
     conjugate,
+    cross,
+    dot,
     logarithm,
     multiply,
     normalized,
+    put,
     quaternion_of,
+    three,
 )
-from drake_teleop.common.vectors import cross, dot, put, three
 from drake_teleop.station.slave.arm import (
     PHI,
     SLIDES,

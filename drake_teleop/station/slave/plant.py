@@ -18,8 +18,8 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ContactModel, M
 from pydrake.multibody.tree import BodyIndex, Frame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import DiagramBuilder
 
-from drake_teleop.common.arrays import Array
 from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.rotations import quaternions
 from drake_teleop.station.environment.environment import Environment
 from drake_teleop.station.slave.arm import FRICTION, ArmModel, forward_kinematics, pose_into

@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.compiled import njit
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
-from drake_teleop.common.quaternions import rotate
-from drake_teleop.common.vectors import add_into, cross, minus, plus, put, three
+from drake_teleop.common.vectors import add_into, cross, minus, plus, put, rotate, three
 from drake_teleop.station.environment.moving_bodies import POSE_AND_TWIST, bodies_into
 from drake_teleop.station.environment.point_contact import (
     BODY,

@@ -17,12 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
+from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fault import sound
-from drake_teleop.common.fields import settings
-from drake_teleop.common.lifetime import ONE_DICT
-from drake_teleop.common.quantities import quantity
 from drake_teleop.common.vectors import put
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 

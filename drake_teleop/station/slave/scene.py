@@ -20,10 +20,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, plain, quantity
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.environment.environment import Environment, LetFloat, ToolShapes
 from drake_teleop.station.slave.models import ParseScene
 from drake_teleop.station.slave.surroundings import supports_pose

@@ -10,10 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, SpatialInertia, WeldJoint
 
+from drake_teleop.common.config import choice, plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import choice, plain, quantity
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.joint_commands import AUTOMATIC, IK_METHODS
 from drake_teleop.station.slave.tool import Tool, steel_ball_radius
 

@@ -23,8 +23,8 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.station.environment.environment import Environment, ToolShapes
 from drake_teleop.station.environment.moving_bodies import (
     JOINT_WIDTH,

@@ -10,10 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia, WeldJoint
 
+from drake_teleop.common.config import plain, quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.fields import settings
-from drake_teleop.common.quantities import plain, quantity
-from drake_teleop.common.resources import models_dir
+from drake_teleop.common.files import models_dir
 from drake_teleop.station.slave.models import ParsedTool, ParseTool
 
 _STEEL_DENSITY = 7850.0  # kg/m^3

@@ -1,8 +1,9 @@
-"""Checks of input arrays."""
+"""Checks of input arrays, and single-threaded BLAS."""
 
 from __future__ import annotations
 
 import reprlib
+from contextlib import AbstractContextManager
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -83,7 +84,7 @@ def number(name: str, value: Any) -> float:
         ) from None
 
 
-def learnt(name: str, phi: Array) -> Array:
+def check_identified(name: str, phi: Array) -> Array:
     """Return `phi` (10,); raise DrakeTeleopError if it is zero, as without data."""
     if not phi.any():
         raise DrakeTeleopError(
@@ -100,3 +101,12 @@ def positive(name: str, value: ArrayLike, *shape: int) -> Array:
     if not (array > 0.0).all():
         raise DrakeTeleopError("is not positive throughout", where=name)
     return array
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """Limit BLAS to one thread; several change the last digits of sums."""
+    import scipy.linalg  # noqa: F401, what comes in later would have its threads
+    from threadpoolctl import threadpool_limits
+
+    limits: AbstractContextManager[object] = threadpool_limits(1)
+    return limits

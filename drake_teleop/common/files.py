@@ -1,4 +1,4 @@
-"""Output files, each complete or absent.
+"""Output files, each complete or absent, and folders of shipped files.
 
 A file is written under another name and then renamed, so that failures keep the previous one.
 """
@@ -48,7 +48,7 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
     try:
-        with naming(path):
+        with wrap_write_errors(path):
             yield temporary
             temporary.replace(path)
     except BaseException:
@@ -58,7 +58,7 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def wrap_write_errors(path: Path) -> Iterator[None]:
     """Convert OSError to CannotWrite with the file's name."""
     try:
         yield
@@ -112,7 +112,7 @@ def output_folder(
         CannotWrite: with the files written before.
     """
     make_folder(out)
-    with naming(out / last):
+    with wrap_write_errors(out / last):
         (out / last).unlink(missing_ok=True)
     before = _file_states(out)
     try:
@@ -148,7 +148,7 @@ def set_aside(*paths: Path) -> Path | None:
     if not existing:
         return None
     folders = (existing[0].with_name(f"earlier-{k}") for k in itertools.count(1))
-    with naming(existing[0]):
+    with wrap_write_errors(existing[0]):
         folder = next(folder for folder in folders if not folder.exists())
         folder.mkdir()
         for path in existing:
@@ -207,3 +207,22 @@ def _listed(names: Sequence[str]) -> str:
         return "nothing"
     more = f" and {len(names) - _MAX_LISTED_FILES} more" if len(names) > _MAX_LISTED_FILES else ""
     return ", ".join(names[:_MAX_LISTED_FILES]) + more
+
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def models_dir() -> Path:
+    """Return the folder of the models; the wheel contains it inside the package."""
+    packaged = _PACKAGE / "models"
+    return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
+
+
+def scenarios_dir() -> Path:
+    """Return the folder of the shipped scenarios."""
+    return _PACKAGE / "station" / "scenarios"
+
+
+def studies_dir() -> Path:
+    """Return the folder of the shipped studies."""
+    return _PACKAGE / "lab" / "studies"

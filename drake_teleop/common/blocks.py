@@ -1,13 +1,33 @@
-"""Invalid numbers in the control loop: the signals `fault` and `fault_at_hand`.
+"""Memory and faults of blocks in the loop.
 
-Forces computed from invalid, too large or too old numbers are not displayed (docs/station.md).
+A Python `LeafSystem` and its Diagram (2.5 MB) are never freed if C++ holds a bound method, or,
+in Python 3.11, if a subclass has no empty `__slots__`. Forces computed from invalid, too large
+or too old numbers are not displayed; the signals `fault` and `fault_at_hand` contain the cause
+(docs/station.md).
 """
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
 from drake_teleop.common.compiled import njit
+
+ONE_DICT: tuple[str, ...] = ()
+"""`__slots__` of a system; its attributes are in the `__dict__` of the bound class."""
+
+
+def weak_callback(method: Any) -> Callable[..., None]:
+    """Return a callback for C++ that does not keep its system alive."""
+    system, function = weakref.ref(method.__self__), method.__func__
+
+    def call(context: Any, output: Any) -> None:
+        function(system(), context, output)
+
+    return call
+
 
 #: Maximum magnitude of any force, torque, length, angle or speed of a station, in SI units.
 LARGEST = 1e6
