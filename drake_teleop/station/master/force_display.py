@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.fault import Fault, sound
 from drake_teleop.common.lifetime import ONE_DICT, weak_callback
 from drake_teleop.common.vectors import put
-from drake_teleop.station.master.dynamics import gravity_torque_into, jacobian_into
+from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.passivity.memory import Slots
 from drake_teleop.station.passivity.packet import limit
@@ -138,13 +137,6 @@ def _fade(device, numbers, period, drive):
             drive[_CHANGED] = 1.0
     if not fault:
         drive[_FAULT] = _RESUMING
-
-
-class DisplayDevice(Protocol):
-    """Device of any kind with `numbers`."""
-
-    @property
-    def numbers(self) -> NDArray[np.float64]: ...
 
 
 class ForceDisplay(LeafSystem):

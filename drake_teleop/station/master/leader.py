@@ -23,8 +23,9 @@ from drake_teleop.common.fault import sound
 from drake_teleop.common.lifetime import ONE_DICT
 from drake_teleop.common.quaternions import quaternion_of
 from drake_teleop.common.vectors import cross, put, three
+from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
-from drake_teleop.station.master.numbers import HAND_MASS, PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
     DAMPING,
     GRAVITY,
@@ -187,7 +188,7 @@ def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
 
 
 @dataclass(frozen=True)
-class LeaderDevice:
+class LeaderDevice(DisplayDevice):
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
@@ -214,14 +215,6 @@ class LeaderDevice:
     @property
     def num_joints(self) -> int:
         return self.arm.num_joints
-
-    @property
-    def peak_force(self) -> float:
-        return float(self.numbers[PEAK_FORCE])
-
-    @property
-    def peak_torque(self) -> Array:
-        return self.numbers[PEAK_TORQUE]
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
