@@ -117,12 +117,8 @@ def _fade(device, numbers, period, drive):
 
     Arguments as for `display_into`; `drive` contains command and fault, and is changed.
     """
-    displayed, last, limits, full = (
-        drive[_DISPLAYED],
-        device[_DISPLAYED],
-        np.empty(2),
-        _peak_wrench(numbers),
-    )
+    displayed, last = drive[_DISPLAYED], device[_DISPLAYED]
+    limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT
     drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
     # Complete within STOP, so that the direction does not jump either.

@@ -273,11 +273,8 @@ def calibration_matrices(
     uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
     """
     random = np.random.default_rng(config.unit)
-    gains, talk, axis = (
-        random.uniform(-1, 1, 6),
-        random.uniform(-1, 1, (6, 6)),
-        random.normal(size=3),
-    )
+    gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
+    axis = random.normal(size=3)
     acceleration_gains, acceleration_axis = random.uniform(-1, 1, 6), random.normal(size=3)
     ranges = config.ranges()[:6]
     wrench = config.cross_talk * talk * ranges[:, None] / ranges
