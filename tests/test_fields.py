@@ -100,6 +100,6 @@ def test_settings_can_be_copied_pickled_and_replaced() -> None:
 
 def test_help_contains_units_ranges_and_meanings() -> None:
     text = Simulation.__doc__ or ""
-    assert text.startswith("How long, and with which integrator.")
+    assert text.startswith("Duration and integrator of a simulation.")
     assert "    duration: logged time (0.001 to 36000 s; default 1)" in text.splitlines()
     assert "(runge_kutta3, runge_kutta2," in " ".join(text.split())

@@ -217,6 +217,7 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
+    """Return the colour of "#rrggbb" for Drake."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
@@ -251,6 +252,7 @@ class Arrow:
 
 @contextmanager
 def quiet_drake() -> Iterator[None]:
+    """Suppress log messages of Drake, such as the address of Meshcat."""
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)

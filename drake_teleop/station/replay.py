@@ -65,10 +65,8 @@ _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.4
 _P_EGRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
 _P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
 # Arrows inside arm and tool would be hidden.
-_WRIST_ARROW_OFFSET_W, _TIP_ARROW_OFFSET_W = (
-    np.array([0.07, -0.09, 0.0]),
-    np.array([-0.06, 0.0, 0.0]),
-)
+_WRIST_ARROW_OFFSET_W = np.array([0.07, -0.09, 0.0])
+_TIP_ARROW_OFFSET_W = np.array([-0.06, 0.0, 0.0])
 
 # Required signals, and signals that are shown if they were recorded.
 _REQUIRED_SIGNALS = ("slave_state", "measured_wrench_S", "load_estimate")

@@ -52,11 +52,8 @@ _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad
 _SETTLING_TIME_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
 # Smallest reported amplitude: hand and command [m], their orientation [rad], joint [rad].
-_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD, _MIN_JOINT_AMPLITUDE_RAD = (
-    5e-4,
-    np.deg2rad(0.5),
-    np.deg2rad(0.1),
-)
+_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
+_MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
 _REVERSAL_WINDOW_S = 0.25
 """A reversal within this time of a command's reversal is explained by it [s]."""
 # Reversals of an oscillation, and longest time between two of them [s].
@@ -176,7 +173,8 @@ def _check_limits(
     result: SimulationResult, scenario: Scenario, arm: ArmModel
 ) -> Iterator[tuple[str, Spans]]:
     t = result.t
-    yield "the wrist sensor saturates", find_spans(t, _saturated(result))
+    flag = result["saturated"][:, 0]
+    yield "the wrist sensor saturates", find_spans(t, (flag > 0) & (flag < LOST))
     if "ik_status" in result:
         for status in list(IkStatus)[1:]:
             happened = result["ik_status"][:, 0] == status
@@ -213,11 +211,6 @@ def _check_limits(
         )
 
 
-def _saturated(result: SimulationResult) -> Flags:
-    flag: Array = result["saturated"][:, 0]
-    return (flag > 0) & (flag < LOST)
-
-
 def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tuple[str, Spans]]:
     if "ports" not in result:
         return
@@ -231,15 +224,11 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     # An end without new packets uses the last one until `timeout`.
     window = longest_delay(scenario.channel.lines()[0]) + timeout
     sent, received = result["pose_command"], result["pose_received"]
-    far = lag_beyond_delay(t, sent[:, 4:], received[:, 4:], window)
-    turned = lag_beyond_delay(t, _rotation(sent, sent), _rotation(received, sent), window)
     by = f"{scenario.passivity.method}, network {scenario.channel.network}"
-    for values, least, unit, scale in (
-        (far, _MIN_LAG_M, "mm", 1e3),
-        (turned, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
-    ):
-        spans = find_spans(t, values > least, _MIN_DURATION_S)
-        largest = _maximum_within(t, values, spans)
+    for command, actual, least, unit, scale in _pose_parts(sent, received):
+        lag = lag_beyond_delay(t, command, actual, window)
+        spans = find_spans(t, lag > least, _MIN_DURATION_S)
+        largest = _maximum_within(t, lag, spans)
         yield (
             f"the channel ({by}) delays the slave's command: up to {scale * largest:.1f} {unit}"
             " more than its delay explains,",
@@ -262,18 +251,7 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
     limit = fastest(config, mass)
     then = t - _packet_ages(t, scenario)
     window = longest_delay(scenario.channel.lines()[0]) + _SETTLING_TIME_S
-    for g, per_s, command, actual, least, unit, scale in (
-        (0, "m/s", sent[:, 4:], received[:, 4:], _MIN_LAG_M, "mm", 1e3),
-        (
-            1,
-            "rad/s",
-            _rotation(sent, sent),
-            _rotation(received, sent),
-            _MIN_LAG_RAD,
-            "degrees",
-            _DEGREES_PER_RAD,
-        ),
-    ):
+    for g, (command, actual, least, unit, scale) in enumerate(_pose_parts(sent, received)):
         asked = np.column_stack([np.interp(then, t, x) for x in command.T])
         far = lag_beyond_delay(t, asked, actual, _SETTLING_TIME_S)
         way = np.linalg.norm(np.diff(command, axis=0, prepend=command[:1]), axis=1)
@@ -281,16 +259,27 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         held = (then >= t[0]) & (speed > limit[g]) & (far > least)
         if held.sum() * row < _MIN_DURATION_S:
             continue
-        enough = np.array(config.reserve)
+        enough, speed_unit = np.array(config.reserve), ("m/s", "rad/s")[g]
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
-            f"the ledger's reserve limits the slave to {limit[g]:.2g} {per_s}, and the hand moves"
-            f" at up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the slave's"
-            f" command is up to {scale * far[held].max():.1f} {unit} from the received pose (move"
+            f"the ledger's reserve limits the slave to {limit[g]:.2g} {speed_unit}, and the hand"
+            f" moves at up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the"
+            f" slave's command is up to {scale * far[held].max():.1f} {unit} from the received pose (move"
             f" more slowly, or increase the energy: passivity.ledger.reserve {_list_text(enough)}"
             f" and initial {_list_text(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )
+
+
+def _pose_parts(
+    command: Array, actual: Array
+) -> tuple[tuple[Array, Array, float, str, float], ...]:
+    """Return command, motion, smallest lag, unit and its scale, for position and rotation."""
+    rotations = _rotation(command, command), _rotation(actual, command)
+    return (
+        (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
+        (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
+    )
 
 
 def _packet_ages(t: Array, scenario: Scenario) -> Array:

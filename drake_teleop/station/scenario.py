@@ -197,6 +197,7 @@ def check_scenario(scenario: Any) -> None:
 
 
 def ScenarioNames() -> list[str]:
+    """Return the names of the shipped scenarios."""
     return sorted(path.stem for path in scenarios_dir().glob("*.yaml"))
 
 

@@ -205,6 +205,7 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
+        """Whether a leader arm commands the joints of the slave."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:

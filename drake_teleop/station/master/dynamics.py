@@ -93,8 +93,24 @@ def step(state, hand_wrench, motor, device, period, work, stages):
         state[k] += period * total[k]
 
 
+class DisplayDevice:
+    """Device of any kind with parameters `numbers` (NUMBERS,)."""
+
+    numbers: NDArray[np.float64]
+
+    @property
+    def peak_force(self) -> float:
+        """Largest displayed force [N]; some postures of a leader arm allow less."""
+        return float(self.numbers[PEAK_FORCE])
+
+    @property
+    def peak_torque(self) -> NDArray[np.float64]:
+        """(3,) largest displayed torques about the rotational axes [N m]."""
+        return self.numbers[PEAK_TORQUE]
+
+
 @dataclass(frozen=True)
-class HapticDevice:
+class HapticDevice(DisplayDevice):
     """Device with the hand's passive mass.
 
     Attributes:
@@ -105,22 +121,11 @@ class HapticDevice:
     numbers: NDArray[np.float64]
     name: str = "phantom_premium_15"
 
-    @property
-    def peak_force(self) -> float:
-        """Largest displayed force [N]."""
-        return float(self.numbers[PEAK_FORCE])
-
-    @property
-    def peak_torque(self) -> NDArray[np.float64]:
-        """(3,) largest displayed torques about the rotational axes [N m]."""
-        return self.numbers[PEAK_TORQUE]
-
-    @property
-    def num_joints(self) -> int:
-        return 6
+    num_joints = 6
 
     @property
     def friction_field(self) -> str:
+        """Scenario field of the friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:

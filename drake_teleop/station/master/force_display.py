@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, Fault, sound, weak_callback
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.vectors import put
-from drake_teleop.station.master.dynamics import gravity_torque_into, jacobian_into
+from drake_teleop.station.master.dynamics import DisplayDevice, gravity_torque_into, jacobian_into
 from drake_teleop.station.master.numbers import PEAK_FORCE, PEAK_TORQUE
 from drake_teleop.station.passivity.memory import Slots
 from drake_teleop.station.passivity.packet import limit
@@ -117,12 +116,8 @@ def _fade(device, numbers, period, drive):
 
     Arguments as for `display_into`; `drive` contains command and fault, and is changed.
     """
-    displayed, last, limits, full = (
-        drive[_DISPLAYED],
-        device[_DISPLAYED],
-        np.empty(2),
-        _peak_wrench(numbers),
-    )
+    displayed, last = drive[_DISPLAYED], device[_DISPLAYED]
+    limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT
     drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
     # Complete within STOP_TIME, so that the direction does not jump either.
@@ -137,13 +132,6 @@ def _fade(device, numbers, period, drive):
             drive[_CHANGED] = 1.0
     if not fault:
         drive[_FAULT] = _RESUMING
-
-
-class DisplayDevice(Protocol):
-    """Device of any kind with `numbers`."""
-
-    @property
-    def numbers(self) -> NDArray[np.float64]: ...
 
 
 class ForceDisplay(LeafSystem):

@@ -21,8 +21,9 @@ from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import cross, put, quaternion_of, three
+from drake_teleop.station.master.dynamics import DisplayDevice
 from drake_teleop.station.master.force_display import ForceDisplay, display_into, initial_display
-from drake_teleop.station.master.numbers import HAND_MASS, PEAK_FORCE, PEAK_TORQUE
+from drake_teleop.station.master.numbers import HAND_MASS
 from drake_teleop.station.slave.arm import (
     DAMPING,
     GRAVITY,
@@ -185,7 +186,7 @@ def _limit_to_motors(bare, arm, joints, q, wrench, shortened):
 
 
 @dataclass(frozen=True)
-class LeaderDevice:
+class LeaderDevice(DisplayDevice):
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
@@ -211,18 +212,12 @@ class LeaderDevice:
 
     @property
     def num_joints(self) -> int:
+        """Number of joints."""
         return self.arm.num_joints
 
     @property
-    def peak_force(self) -> float:
-        return float(self.numbers[PEAK_FORCE])
-
-    @property
-    def peak_torque(self) -> Array:
-        return self.numbers[PEAK_TORQUE]
-
-    @property
     def constants(self) -> tuple[Array, Array, Array]:
+        """Tables of the arm without and with the hand, and parameters of the joints."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
@@ -244,11 +239,13 @@ class LeaderDevice:
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
+        """Return X_BE (7,) at the joints q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
+        """Raise a DrakeTeleopError if a joint of q (n,) is outside its limits."""
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
                 f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
@@ -258,17 +255,21 @@ class LeaderDevice:
             )
 
     def at_an_end(self, q: Array) -> NDArray[np.bool_]:
+        """Return (N,) whether an end stop is active at the joints q (N, n)."""
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
+        """Return the Jacobian (6, n), rows [v; omega] of E in B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
+        """Return the mass matrix (n, n) at the joints q (n,)."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
+        """Return the damping matrix (n, n); `creeping` adds Coulomb friction."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 

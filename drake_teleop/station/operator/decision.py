@@ -136,6 +136,7 @@ _FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floo
 
 
 def initial_memory() -> Array:
+    """Return the memory at the start."""
     memory = np.zeros(MEMORY)
     memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory

@@ -328,11 +328,8 @@ class Operator(LeafSystem):
         )
         # Segments, their reference pose and its twist.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
-        self._intent_pose, self._intent_twist, self._commanded_pose = (
-            np.empty(7),
-            np.empty(6),
-            np.empty(7),
-        )
+        self._intent_pose, self._intent_twist = np.empty(7), np.empty(6)
+        self._commanded_pose = np.empty(7)
         self._no_memory, self._no_segments = np.empty(0), self._intent[0][:0]
         self._has_task = config.task is not None
         self._pose = self.DeclareVectorInputPort("pose_master", 7)

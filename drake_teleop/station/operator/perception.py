@@ -66,6 +66,7 @@ class Perception:
 
 
 def initial_memory() -> Array:
+    """Return the memory at the start."""
     memory = np.zeros(MEMORY_SIZE)
     memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory

@@ -1,4 +1,4 @@
-"""Motion of S at the wrench's sampling instant: specific force s at So, omega and alpha, all in S.
+"""Motion of S at the wrench's sampling instant (long: each source with its delay and noise).
 
 - `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
   No accelerometer; the whole sample has the delay of the low-pass.

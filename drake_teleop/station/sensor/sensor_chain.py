@@ -1,4 +1,4 @@
-"""The wrist sensor as a chain from true wrench, motion of S and joint angles to readings::
+"""The wrist sensor as a chain to its readings (long: parameters beside their functions)::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |
@@ -136,6 +136,7 @@ class WristSensorConfig:
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
+        """(12,) ranges of force, torque, acceleration and angular acceleration."""
         return np.concatenate(
             [
                 self.force_range,
@@ -272,11 +273,8 @@ def calibration_matrices(
     uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
     """
     random = np.random.default_rng(config.unit)
-    gains, talk, axis = (
-        random.uniform(-1, 1, 6),
-        random.uniform(-1, 1, (6, 6)),
-        random.normal(size=3),
-    )
+    gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
+    axis = random.normal(size=3)
     acceleration_gains, acceleration_axis = random.uniform(-1, 1, 6), random.normal(size=3)
     ranges = config.ranges()[:6]
     wrench = config.cross_talk * talk * ranges[:, None] / ranges

@@ -1,4 +1,4 @@
-"""The wrist sensor in the station: sampling instants and samples.
+"""The wrist sensor in the station: instants and samples (long: the step and its block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 

@@ -82,6 +82,7 @@ class ArmModel:
 
     @property
     def num_joints(self) -> int:
+        """Number of joints."""
         return len(self.joint_names)
 
     @property

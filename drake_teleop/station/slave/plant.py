@@ -86,6 +86,7 @@ class SlavePlant:
 
     @property
     def friction(self) -> NDArray[np.float64]:
+        """(n,) friction of the joints [N m]."""
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
@@ -95,6 +96,7 @@ class SlavePlant:
 
     @property
     def can_touch(self) -> bool:
+        """Whether the tool can touch anything."""
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property

@@ -85,6 +85,7 @@ class Slave:
 
     @property
     def X_WBase(self) -> RigidTransform:
+        """Pose of the base in the world."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:

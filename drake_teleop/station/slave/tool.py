@@ -31,10 +31,12 @@ class Ball:
 
     @property
     def shape(self) -> Shape:
+        """Shape for Drake."""
         return Sphere(self.radius)
 
     @property
     def pose(self) -> RigidTransform:
+        """Pose on the tool, in S."""
         return RigidTransform(self.position)
 
 
@@ -49,6 +51,7 @@ class Block:
 
     @property
     def shape(self) -> Shape:
+        """Shape for Drake."""
         return Box(*self.edges)
 
     @property
@@ -58,6 +61,7 @@ class Block:
 
     @property
     def pose(self) -> RigidTransform:
+        """Pose on the tool, in S."""
         return RigidTransform(RollPitchYaw(self.rpy), self.position)
 
 
