@@ -263,9 +263,9 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
         enough[g] *= (speed[held].max() / limit[g]) ** 2
         yield (
             f"the ledger's reserve limits the slave to {limit[g]:.2g} {speed_unit}, and the hand"
-            f" moves at up to {speed[held].max():.2g}: {100 * held.mean():.0f} % of the time the"
-            f" slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
-            f" pose (move more slowly, or increase the energy: passivity.ledger.reserve"
+            f" moves at up to {speed[held].max():.2g}: for {100 * held.mean():.0f} % of the time"
+            f" the slave's command is up to {scale * far[held].max():.1f} {unit} from the received"
+            " pose (move more slowly, or increase the energy: passivity.ledger.reserve"
             f" {_list_text(enough)} and initial {_list_text(enough + config.hand_reserve)}),",
             find_spans(t, held),
         )

@@ -66,7 +66,7 @@ class Rates:
     sensor_hz: float = quantity(8000.0, "Hz", 10.0, 1e5, "wrist sensor and encoders")
     hand_hz: float = quantity(2000.0, "Hz", 10.0, 1e5, "haptic device and channel")
     joint_control_hz: float = quantity(
-        2000.0, "Hz", 10.0, 1e5, "slave's joint control; what is beyond 2 kHz samples inside steps"
+        2000.0, "Hz", 10.0, 1e5, "joint control of the slave; above 2 kHz it samples inside steps"
     )
     estimator_hz: float = quantity(1000.0, "Hz", 10.0, 1e5, "load estimator, detection of contact")
     log_hz: float = quantity(1000.0, "Hz", 1.0, 1e5, "log")
@@ -89,12 +89,10 @@ class Simulation:
         "Drake's name of the integration scheme",
     )
     max_step: float = quantity(1e-3, "s", 1e-6, 0.1, "longest step; events cut it shorter")
-    accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "of error-controlled integrators")
-    seed: int = quantity(
-        0, "1", 0, 2**32 - 1, "of everything random; the same seed gives the same log"
-    )
+    accuracy: float = quantity(2e-4, "1", 1e-12, 0.1, "tolerance of error-controlled integrators")
+    seed: int = quantity(0, "1", 0, 2**32 - 1, "random seed; equal seeds give equal logs")
     end_with_task: bool = plain(
-        False, "end the run within 20 ms when the operator has done its task or given up"
+        False, "end the run within 20 ms after the operator finishes or gives up"
     )
     on_fault: str = choice(
         "continue",
@@ -126,7 +124,7 @@ class Scenario:
     sheet_spring: SheetSpring | None = None
     slot: Slot | None = None
     environment: list[Thing] = plain(
-        [], "all else there is to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
+        [], "further objects to touch, such as [!Wall {stiffness: 2e4}, !Block {}]"
     )
 
     @property

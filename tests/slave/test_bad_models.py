@@ -160,7 +160,7 @@ ERRORS = {
     "a limit that is none": ("urdf", with_limit('<limit lower="nan" upper="1"/>'),
                              "joint j3: lower 'nan' is not a number"),
     "an infinite limit": ("urdf", with_limit('<limit effort="inf"/>'),
-                          "joint j3: effort inf is not finite; leave out what has no limit"),
+                          "joint j3: effort inf is not finite; leave the limit out"),
     "a negative speed": ("urdf", with_limit('<limit velocity="-1"/>'), "velocity limit -1 is neg"),
     # Masses
     "a negative mass": ("urdf", with_inertial(('"2"', '"-2"')), "link l3: mass -2 kg is negative"),

@@ -78,33 +78,39 @@ class JointFriction:
 class DeviceFigures:
     """Data sheet of a device, see `task_space`; x of its base points to the operator, z up."""
 
-    apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "that the hand moves with the grip")
-    inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "likewise, about every axis")
-    friction: float = quantity(0.2, "N", 0.0, 50.0, "against the motion of the grip")
-    friction_torque: float = quantity(1e-3, "N m", 0.0, 2.0, "against its turning")
-    damping: float = quantity(0.1, "N s/m", 0.0, 100.0, "of its motion")
-    turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "of its turning")
-    peak_force: float = quantity(10.0, "N", 0.0, 500.0, "that it displays")
+    apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
+    inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")
+    friction: float = quantity(0.2, "N", 0.0, 50.0, "Coulomb friction of translation")
+    friction_torque: float = quantity(1e-3, "N m", 0.0, 2.0, "Coulomb friction of rotation")
+    damping: float = quantity(0.1, "N s/m", 0.0, 100.0, "viscous damping of translation")
+    turning_damping: float = quantity(5e-5, "N m s/rad", 0.0, 1.0, "viscous damping of rotation")
+    peak_force: float = quantity(10.0, "N", 0.0, 500.0, "largest displayed force")
     peak_torque: list[float] = quantity(
-        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: a turn is only measured"
+        [0.0, 0.0, 0.0], "N m", 0.0, 50.0, "about yaw, pitch and roll; 0: measured only"
     )
     size: list[float] = quantity(
-        [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "of the workspace along x, y, z"
+        [0.15, 0.15, 0.15], "m", 1e-3, 2.0, "size of the workspace along x, y, z"
     )
     centre: list[float] = quantity(
         [0.27, 0.0, 0.03],
         "m",
         -2.0,
         2.0,
-        "of the workspace, p_B; the default is where scenarios start",
+        "centre of the workspace, p_B; default: start of the scenarios",
     )
     turn: list[float] = quantity(
-        [1.2, 1.2, 2.4], "rad", 0.0, math.pi, "largest yaw, pitch (below 1.5) and roll, both ways"
+        [1.2, 1.2, 2.4],
+        "rad",
+        0.0,
+        math.pi,
+        "largest yaw, pitch (up to 1.5) and roll, in both directions",
     )
-    resolution: float = quantity(0.0, "m", 0.0, 0.01, "step in which its position is read; 0: none")
-    turn_resolution: float = quantity(0.0, "rad", 0.0, 0.1, "likewise of its turns")
+    resolution: float = quantity(0.0, "m", 0.0, 0.01, "position step of the encoders; 0: exact")
+    turn_resolution: float = quantity(
+        0.0, "rad", 0.0, 0.1, "rotation step of the encoders; 0: exact"
+    )
     rate_hz: float = quantity(
-        0.0, "Hz", 0.0, 1e5, "at which it is read and takes a force; 0, or above: rates.hand_hz"
+        0.0, "Hz", 0.0, 1e5, "update rate of the device; 0 or a larger rate: rates.hand_hz"
     )
 
 
@@ -170,7 +176,7 @@ class Master:
     model: str = choice(
         PHANTOM,
         (PHANTOM, *FIGURES, "custom", LEADER),
-        "the device; custom: by `figures` alone; leader: an arm of a file",
+        "device; custom: `figures` only; leader: arm from a file",
     )
     position: list[float] = quantity(
         [0.27, 0.0, 0.03], "m", -0.5, 0.5, "p_BE at the start, in the device's base frame"

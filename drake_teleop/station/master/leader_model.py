@@ -46,7 +46,7 @@ class Leader:
     package_paths: list[str] = plain(
         [], "folders for package:// addresses in it, from the scenario's folder"
     )
-    hand_frame: str = plain("", "frame or link of it where the hand holds it")
+    hand_frame: str = plain("", "frame or link at the grip")
     home: list[float] = plain(
         [], "joint positions at the start [rad, m]; by default 0, or the middle of their limits"
     )
@@ -54,21 +54,23 @@ class Leader:
         [0.0, 0.0, 0.0], "rad", -2 * math.pi, 2 * math.pi, "R_BBase: roll, pitch, yaw; B's z is up"
     )
     weight_carried: float = quantity(
-        1.0, "1", 0.0, 1.0, "share of its weight that motors or springs carry"
+        1.0, "1", 0.0, 1.0, "share of the arm's weight compensated by motors or springs"
     )
     friction: list[float] = plain(
         [], "Coulomb friction of the joints [N m], one for all or each; by default none"
     )
     damping: list[float] = plain(
-        [], "of the joints [N m s/rad], likewise, besides what the model has"
+        [], "joint damping [N m s/rad] in addition to the model's, one for all or each"
     )
-    torque_limit: list[float] = plain([], "of the motors [N m], likewise; by default the model's")
-    peak_force: float = quantity(30.0, "N", 0.0, 500.0, "that it displays at most")
-    peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "likewise, about each axis")
+    torque_limit: list[float] = plain(
+        [], "motor torque limits [N m], one for all or each; default: the model's"
+    )
+    peak_force: float = quantity(30.0, "N", 0.0, 500.0, "largest displayed force")
+    peak_torque: float = quantity(3.0, "N m", 0.0, 50.0, "largest displayed torque about each axis")
     leads: str = choice(
         "pose",
         ("pose", JOINTS),
-        "the pose of S; or each joint its own of a slave of the same kinematics, home to start",
+        "pose: commands X_WS; joints: each joint commands that of a slave with equal kinematics",
     )
 
     def check(self, where: str) -> None:

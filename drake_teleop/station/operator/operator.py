@@ -66,8 +66,8 @@ GRIPS = {
 class MinimumJerk:
     """Move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
 
-    t_start: float = quantity(0.0, "s", 0.0, 1e6, "when the move starts")
-    duration: float = quantity(1.0, "s", 1e-3, 1e6, "how long it takes")
+    t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
+    duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
     translation: list[float] = quantity([0.0, 0.0, 0.0], "m", -1.0, 1.0, "offset in B")
     rotation: list[float] = quantity(
         [0.0, 0.0, 0.0], "rad", -3.14, 3.14, "rotation vector of the offset, about axes of B"
@@ -82,7 +82,7 @@ class Sine:
     Between the ramps the offset is amplitude * sin(2 pi frequency (t - t_start) + phase).
     """
 
-    t_start: float = quantity(0.0, "s", 0.0, 1e6, "when it starts to fade in")
+    t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the first ramp")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "from start to end, both ramps included")
     ramp: float = quantity(0.1, "s", 1e-3, 1e6, "length of each ramp, at most half the duration")
     frequency: float = quantity(1.0, "Hz", 0.0, 100.0, "frequency")
@@ -100,7 +100,9 @@ class OperatorConfig:
 
     grip: str = choice("medium", tuple(GRIPS), "stiffness, damping and mass of the hand")
     intent: list[MinimumJerk | Sine] = plain([], "moves relative to the start pose; they add up")
-    task: Reach | Touch | Press | Insert | None = plain(None, "by eye and feel, beside the intent")
+    task: Reach | Touch | Press | Insert | None = plain(
+        None, "task with vision and force perception, in addition to the intent"
+    )
     perception: Perception = field(default_factory=Perception)
     movement: Movement = field(default_factory=Movement)
 

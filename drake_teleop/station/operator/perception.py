@@ -49,14 +49,14 @@ class Perception:
     """Accuracy and delay of human vision and force perception; see docs/operator.md."""
 
     weber_fraction: float = quantity(0.1, "1", 0.0, 1.0, "just noticeable difference of a force")
-    absolute_threshold: float = quantity(0.06, "N", 1e-3, 10.0, "least force that is noticed")
-    masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "time constant in which masking fades")
-    bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "of felt force and motion")
-    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a felt force to the hand's answer")
-    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from a picture to the hand's answer")
-    vision_noise: float = quantity(0.5e-3, "m", 0.0, 0.1, "of a seen position, at the tool")
-    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of how far away a surface is seen")
-    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of where a slot is seen, sideways")
+    absolute_threshold: float = quantity(0.06, "N", 1e-3, 10.0, "smallest detectable force")
+    masking_time: float = quantity(0.3, "s", 1e-3, 10.0, "decay time constant of masking")
+    bandwidth_hz: float = quantity(20.0, "Hz", 1.0, 50.0, "bandwidth of perceived force and motion")
+    reaction_time: float = quantity(0.16, "s", 0.0, 1.0, "from a force to the hand's reaction")
+    vision_delay: float = quantity(0.15, "s", 0.0, 1.0, "from vision to the hand's reaction")
+    vision_noise: float = quantity(0.5e-3, "m", 0.0, 0.1, "of a perceived position, at the tool")
+    depth_error: float = quantity(2e-3, "m", 0.0, 0.1, "of the perceived distance of a surface")
+    aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of the perceived position of a slot, lateral")
 
     def parameters(self, dt: float) -> Array:
         """Return (4,) Weber fraction, threshold [N], decay and smoothing per step."""

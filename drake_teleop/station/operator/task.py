@@ -11,7 +11,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 @dataclass
 class _Task:
-    t_start: float = quantity(0.5, "s", 0.0, 1e6, "when it begins, from the simulation's start")
+    t_start: float = quantity(0.5, "s", 0.0, 1e6, "start, from the start of the simulation")
     timeout: float = quantity(10.0, "s", 0.1, 3600.0, "after which the operator gives up")
     translation: list[float] = quantity(
         [0.0, 0.0, -0.1], "m", -2.0, 2.0, "from the tool at the start to the target, in W"
@@ -37,7 +37,9 @@ class Reach(_Task):
 class Touch(_Task):
     """Approach a surface at the target, detect contact, and stop."""
 
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
+    standoff: float = quantity(
+        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
+    )
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest after the stop")
 
 
@@ -46,10 +48,12 @@ class Touch(_Task):
 class Press(_Task):
     """Approach a surface at the target and press on it with a set force."""
 
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
-    force: float = quantity(8.0, "N", 0.1, 500.0, "to press with, tool on surface")
-    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "of that force")
-    hold: float = quantity(1.0, "s", 0.0, 60.0, "how long")
+    standoff: float = quantity(
+        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
+    )
+    force: float = quantity(8.0, "N", 0.1, 500.0, "set force of the tool on the surface")
+    tolerance: float = quantity(2.0, "N", 0.05, 100.0, "tolerance of the set force")
+    hold: float = quantity(1.0, "s", 0.0, 60.0, "duration of the set force")
 
 
 @settings
@@ -58,8 +62,10 @@ class Insert(_Task):
     """Insert the tool into a slot whose mouth is the target, and push it to the floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
-    standoff: float = quantity(0.015, "m", 0.0, 0.5, "from where on the approach is careful")
-    depth: float = quantity(0.04, "m", 1e-3, 0.5, "of the slot")
+    standoff: float = quantity(
+        0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
+    )
+    depth: float = quantity(0.04, "m", 1e-3, 0.5, "depth of the slot")
     push: float = quantity(10.0, "N", 0.1, 500.0, "force down, tool in slot")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "rest on the floor")
 
@@ -86,13 +92,17 @@ TASK_MEASURES = (
 class Movement:
     """Parameters of the operator's movements; see docs/operator.md."""
 
-    acceleration: float = quantity(1.5, "m/s^2", 0.01, 50.0, "peak, of the hand in a submovement")
-    shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
-    noise: float = quantity(0.05, "1", 0.0, 0.5, "standard deviation of its end over its length")
-    approach_speed: float = quantity(0.03, "m/s", 1e-3, 1.0, "careful, of the tool, at full trust")
-    gentle_force: float = quantity(
-        2.0, "N", 0.01, 100.0, "a contact that does no harm, at the tool"
+    acceleration: float = quantity(
+        1.5, "m/s^2", 0.01, 50.0, "peak acceleration of the hand in a submovement"
     )
+    shortest: float = quantity(0.2, "s", 0.05, 2.0, "least duration of a submovement")
+    noise: float = quantity(
+        0.05, "1", 0.0, 0.5, "standard deviation of the end point over the length"
+    )
+    approach_speed: float = quantity(
+        0.03, "m/s", 1e-3, 1.0, "speed of the tool in a careful approach, at full trust"
+    )
+    gentle_force: float = quantity(2.0, "N", 0.01, 100.0, "harmless contact force at the tool")
 
 
 def check_task(task: Task, where: str) -> None:

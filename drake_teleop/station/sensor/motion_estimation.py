@@ -86,9 +86,7 @@ _GRAVITY = 22
 class MotionEstimationConfig:
     """Source of the estimated motion of the sensor."""
 
-    source: str = choice(
-        "accelerometer", _SOURCES, "what angular velocity and accelerations come from"
-    )
+    source: str = choice("accelerometer", _SOURCES, "source of angular velocity and accelerations")
     encoder_bandwidth_hz: float = quantity(
         50.0, "Hz", 1.0, 1e4, "low-pass of the angles, 4th-order Butterworth (source `encoders`)"
     )

@@ -68,26 +68,36 @@ class WristSensorConfig:
             'defaults. In Python: `dataclasses.replace(PRESETS["ati_gamma_imu"], force_noise=0.1)`',
         },
     )
-    ideal: bool = plain(False, "the truth at the sampling instant, at So in S: none of the parts")
+    ideal: bool = plain(False, "true values at the sampling instant, at So in S, without all parts")
 
-    gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of force and torque")
-    cross_talk: float = quantity(0.0, "1", 0.0, 0.1, "largest, of one range for a full other one")
-    misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from S to the wrench's real axes")
-    acceleration_gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest of the accelerations")
-    acceleration_misalignment: float = quantity(0.0, "rad", 0.0, 0.2, "angle from A to real axes")
-    unit: int = plain(
-        0, "which of many sensors of the kind: draws the calibration errors inside their bounds"
+    gain_error: float = quantity(0.0, "1", 0.0, 0.1, "largest gain error of force and torque")
+    cross_talk: float = quantity(
+        0.0, "1", 0.0, 0.1, "largest cross-talk, share of range per full range"
     )
+    misalignment: float = quantity(
+        0.0, "rad", 0.0, 0.2, "angle from S to the real axes of the wrench"
+    )
+    acceleration_gain_error: float = quantity(
+        0.0, "1", 0.0, 0.1, "largest gain error of the accelerations"
+    )
+    acceleration_misalignment: float = quantity(
+        0.0, "rad", 0.0, 0.2, "angle from A to the real axes"
+    )
+    unit: int = plain(0, "seed of the calibration errors within their bounds")
 
     p_SoAo_S: list[float] = quantity(
-        [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "place of the acceleration part"
+        [0.0, 0.0, 0.0175], "m", -1.0, 1.0, "position of the accelerometer"
     )
     R_SA: list[float] = quantity(
-        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "1", -1.0, 1.0, "its axes, row by row"
+        [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "1",
+        -1.0,
+        1.0,
+        "axes of the accelerometer, row by row",
     )
 
     low_pass: str = choice(
-        "after_converter", _LOW_PASS_CHOICES, "where the low-pass stands, if anywhere"
+        "after_converter", _LOW_PASS_CHOICES, "position of the low-pass in the chain"
     )
     bandwidth_hz: float = quantity(500.0, "Hz", 1.0, 1e5, "4th-order Butterworth low-pass")
 
@@ -108,7 +118,7 @@ class WristSensorConfig:
         "N/s, N m/s",
         -10.0,
         10.0,
-        "thermal, of the offset",
+        "thermal drift of the offset",
     )
     acceleration_offset: list[float] = quantity(
         [0.0] * 6, "m/s^2, rad/s^2", -100.0, 100.0, "offset of specific force, angular acceleration"
@@ -117,15 +127,21 @@ class WristSensorConfig:
     resolution: float = quantity(2.5e-4, "1", 0.0, 0.1, "quantum as a fraction of the range")
     encoder_resolution: float = quantity(1.745e-5, "rad", 0.0, 0.1, "resolver step, 0.001 deg")
 
-    saturates: bool = plain(True, "readings end at the ranges, and `saturated` says so")
+    saturates: bool = plain(True, "readings are limited to the ranges and flagged by `saturated`")
     force_range: list[float] = quantity([200.0, 200.0, 400.0], "N", 1.0, 1e5, "fx, fy, fz")
     torque_range: list[float] = quantity([12.0, 12.0, 12.0], "N m", 0.01, 1e4, "about So")
     acceleration_range: float = quantity(50.0, "m/s^2", 1.0, 1e4, "specific force")
     angular_acceleration_range: float = quantity(500.0, "rad/s^2", 1.0, 1e5, "each axis")
 
-    force_latency: float = quantity(0.0, "s", 0.0, 0.1, "of force and torque, to whole samples")
-    acceleration_latency: float = quantity(0.0, "s", 0.0, 0.1, "of accelerations, to whole samples")
-    encoder_latency: float = quantity(0.0, "s", 0.0, 0.1, "of the joints' angles, likewise")
+    force_latency: float = quantity(
+        0.0, "s", 0.0, 0.1, "of force and torque, rounded to whole samples"
+    )
+    acceleration_latency: float = quantity(
+        0.0, "s", 0.0, 0.1, "of accelerations, rounded to whole samples"
+    )
+    encoder_latency: float = quantity(
+        0.0, "s", 0.0, 0.1, "of joint angles, rounded to whole samples"
+    )
 
     def noise_std(self) -> NDArray[np.float64]:
         """Return (12,) standard deviations of raw white noise [N, N m, m/s^2, rad/s^2]."""
