@@ -27,6 +27,8 @@ from drake_teleop.lab.identification import slave_arm
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.scenario import replace as with_values
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "analysis.md").read_text(encoding="utf-8")
 MARGINS, IN_PYTHON, DIAGRAM = re.findall("```python\n(.*?)```", TEXT, re.S)

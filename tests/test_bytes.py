@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 
 from drake_teleop.station.film import Film
 
+pytestmark = pytest.mark.checks
+
 # Learns while it moves, so that no identification comes first.
 SCENARIO = """
 simulation: {duration: 0.05, settle: 0.02}

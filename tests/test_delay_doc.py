@@ -12,6 +12,8 @@ import pytest
 
 from drake_teleop.station.scenario import LoadScenario
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "delay.md").read_text(encoding="utf-8")
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.checks
+
 DOC = Path(__file__).parents[1] / "docs" / "detection.md"
 
 

@@ -15,6 +15,8 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import evidence  # noqa: E402
 from evidence_claims import CLAIMS, RUNS, Claim, InTests  # noqa: E402
 
+pytestmark = pytest.mark.checks
+
 MEASURED = [claim for claim in CLAIMS if isinstance(claim, Claim)]
 KNOWN = evidence.records()
 

@@ -15,6 +15,8 @@ import pytest
 
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 
+pytestmark = pytest.mark.checks
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 CASES = Path(__file__).parent / "fuzz_cases"
 SAID = {

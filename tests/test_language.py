@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.checks
+
 PACKAGE = Path(__file__).parents[1] / "drake_teleop"
 NOT_FIRST = {
     *("What", "Of", "By", "That", "It", "How", "Where", "Who", "Which", "For", "With", "Without"),

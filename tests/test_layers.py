@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.checks
+
 PACKAGE = Path(__file__).parents[1] / "drake_teleop"
 LAYERS = ("cli", "live", "lab", "station", "robots", "logs", "load", "common")
 """From the top downwards; a module imports only its own layer and lower ones."""

@@ -120,6 +120,7 @@ def turned(rpy, tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_note_about_another_axis_along_the_last_joint(tmp_path, runs, capsys):
     for rpy, axis, back in (("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")):
         plan = plan_station(turned(rpy, tmp_path), "turned")
@@ -186,6 +187,7 @@ def odd_names(count: int) -> list[str]:
     return [*PIECES, *drawn][:count]
 
 
+@pytest.mark.long
 def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     """Names of the arm's file and folder, packages, tool, sensor frame."""
     plan = plan_station(ARM, "sensor")

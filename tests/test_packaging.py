@@ -19,6 +19,8 @@ import yaml
 import drake_teleop
 from drake_teleop.common.errors import install_extra
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 
 USE = """

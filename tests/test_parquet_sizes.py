@@ -123,6 +123,7 @@ for place in range(len(good)):
 """
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("bits", [1, 0x80, 0xFF])
 @pytest.mark.parametrize("options", [{}, {"row_group_size": 8, "compression": "uncompressed"}])

@@ -11,6 +11,8 @@ import pytest
 
 import drake_teleop
 
+pytestmark = pytest.mark.checks
+
 
 @pytest.mark.parametrize("name", drake_teleop.__all__)
 def test_every_name_is_there(name):

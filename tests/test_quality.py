@@ -12,9 +12,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 # The type stubs of numpy differ from one Python to the next, and with them what mypy finds.
-pytestmark = pytest.mark.skipif(
-    sys.version_info[:2] != (3, 11), reason="linted on one version of Python, that of .ci/run"
-)
+pytestmark = [
+    pytest.mark.checks,
+    pytest.mark.skipif(
+        sys.version_info[:2] != (3, 11), reason="linted on one version of Python, that of .ci/run"
+    ),
+]
 
 
 #: mypy as it is, but for its search for garbage, a quarter of its time, which it turns on itself,

@@ -18,6 +18,8 @@ from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.station import MakeTeleopStation
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 RECIPES = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
 

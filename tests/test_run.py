@@ -153,6 +153,7 @@ def test_load_errors_match_their_stated_deviations(identification):
     assert np.sum((low <= truth) & (truth <= high)) >= 13
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_files_are_reproducible_for_a_seed(quick):
     _, first = quick("first")
@@ -216,6 +217,7 @@ def test_bounces_belong_to_one_contact():
     np.testing.assert_array_equal(np.flatnonzero(contact), [*range(10, 22), 60])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_detector_notices_contact_before_the_operator(tmp_path, capsys):
     text = (scenarios_dir() / "touch.yaml").read_text()

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from shown import shell_blocks, the_block
 
+pytestmark = pytest.mark.checks
+
 #: What a test cannot have, in the words of the pages' comments.
 REASONS = {
     "it installs from the network",

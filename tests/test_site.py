@@ -22,6 +22,8 @@ from drake_teleop.cli.main import cli
 from drake_teleop.lab.studies.study import LoadStudy
 from drake_teleop.station.scenario import LoadScenario
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]

@@ -184,6 +184,7 @@ def start_and(kill: signal.Signals, folder: Path) -> tuple[str, int]:
     return process.communicate(timeout=60)[1], process.returncode
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_killed_run_leaves_rows_without_gaps(tmp_path, kill):

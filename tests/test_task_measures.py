@@ -111,7 +111,7 @@ AT = {"t_start": START + SETTLE}
 FAR = "the tip 100.0 mm from the target"
 FAILURES = {
     # Its operator is content, the truth is not.
-    "at 3.00 s that it was done, but the tool pressed with 6.00 N, not 5 ± 0.5 N": (
+    "at 3.00 s, but the tool pressed with 6.00 N, not 5 ± 0.5 N": (
         Press(force=5.0, tolerance=0.5),
         {},
     ),

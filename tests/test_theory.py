@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.checks
+
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
 METHOD, INDEX = TEXT.split("## Index")

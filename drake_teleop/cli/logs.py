@@ -50,7 +50,7 @@ def identify_command(
 ) -> dict[str, Any]:
     """Identify the load of a log, write the results into `out`, return the summary.
 
-    Files: identification.json; summary.json (names: docs/logs.md); report.html; fit.png and
+    Files: identification.json; summary.json (docs/log-summaries.md); report.html; fit.png and
     knowledge.png, and report.png with both; with a gripper's file also object.json.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)

@@ -194,7 +194,7 @@ cutoff = click.option(
     default=30.0,
     show_default=True,
     metavar="HZ",
-    help="Zero-phase low-pass on all signals [Hz].",
+    help="Low-pass on all signals [Hz]; zero-phase for logs, causal for live streams.",
 )
 delay = click.option(
     "--delay",

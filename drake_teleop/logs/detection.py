@@ -1,24 +1,5 @@
 """Contact detection in a log, above the noise floor of free motion.
 
-load                   the identification's file; null if it was identified from the log itself
-free                   the log of free motion that floor and threshold are of; null for the parts
-                       of the log itself in which nothing stands out, see
-                       `drake_teleop.logs.contact`
-free_s                 how much free motion that was
-statistic, threshold   see `drake_teleop.load.contact.detection`
-noise                  [f; tau], standard deviation at rest
-per_acceleration       (6, 2) how it grows per m/s^2 and per rad/s^2
-above_threshold        share of the samples whose statistic reaches the threshold
-in_contact             share of the samples in contact, with hysteresis
-force_threshold        a quarter above the largest |F_c| in the free motion: a threshold that is the
-                       same for all motions
-above_force_threshold  share of the samples above it: raw (tared at its first sample), gravity_only
-                       (null if no orientation is known) and eliminated
-contacts               list of start_s, stop_s, peak_N, peak_Nm; and at the peak of the force
-                       push (3), the direction in which the environment pushes, and point_m (3), of
-                       its line the point nearest to the origin of S; null if there is no force
-====================== ==========================================================================
-=======
 docs/detection.md explains the names in the summary of `drake-teleop detect`.
 """
 

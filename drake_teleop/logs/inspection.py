@@ -1,6 +1,6 @@
 """`drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
 
-docs/logs.md explains the names in its summary, section "Fields of the summary".
+docs/log-summaries.md explains the names in its summary.
 """
 
 from __future__ import annotations

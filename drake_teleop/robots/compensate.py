@@ -64,7 +64,7 @@ def run(
 
     Args:
         tare: tare once, after `TARE_S` of good readings.
-        say: callback for a tare, and the first fault of each kind.
+        report: callback for a tare, and the first fault of each kind.
 
     Returns:
         The number of wrenches, under "wrenches", and the number with each flag.

@@ -16,6 +16,8 @@ from drake_teleop.lab.analysis.task_direction import task_direction
 from drake_teleop.lab.analysis.verdict import verdict
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 
+pytestmark = pytest.mark.long
+
 PICTURES = ("bode", "nyquist", "passive", "widths", "maps")
 
 

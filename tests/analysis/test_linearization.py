@@ -296,6 +296,7 @@ def test_multipliers_predict_a_slow_decay():
     assert_same_rate(fitted_rate(height, predicted), predicted)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_multipliers_predict_growth_over_a_network():
     """Pressing on the leaf over 20 ms is unstable."""

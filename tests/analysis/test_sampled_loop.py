@@ -71,6 +71,7 @@ axes = st.builds(
 )
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [0, 1, 2, 7])
 @pytest.mark.parametrize(

@@ -88,6 +88,7 @@ def test_the_ports_count_the_work_of_the_hand(load_estimate):
     assert np.abs(work).max() > 1e-4
 
 
+@pytest.mark.long
 def test_load_wrench_is_transformed_as_the_wrench():
     """With a rotated base and unequal scales."""
     scaling = KinematicScalingConfig(0.5, 0.2, alignment=[0.3, -0.4, 1.9])

@@ -22,6 +22,8 @@ from drake_teleop.station.channel.network import PRESETS
 from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.scenario import LoadScenario
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.slow
 @pytest.mark.pictures

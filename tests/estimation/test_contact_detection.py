@@ -127,7 +127,7 @@ def test_station_without_detector_has_no_contact_signal(identified):
     plain = replace(scenario, contact_detection=None)
     station = MakeTeleopStation(plain, load_estimate=estimate)
     assert not station.HasSubsystemNamed("contact_detection")
-    with pytest.raises(DrakeTeleopError, match=r"contact_detection: .*pass the noise_floor"):
+    with pytest.raises(DrakeTeleopError, match=r"contact_detection: .*pass noise_floor"):
         MakeTeleopStation(scenario, load_estimate=estimate)
     unfitted = NoiseFloor(NOISE, np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.zeros(6))
     with pytest.raises(DrakeTeleopError, match="reached"):

@@ -296,6 +296,7 @@ def test_environment_of_the_scenario_is_avoided(name):
         assert not port.Eval(of_scene).HasCollisions()
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_readme_output(tmp_path, monkeypatch):
     (tmp_path / "models").symlink_to(models_dir())

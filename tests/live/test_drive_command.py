@@ -67,6 +67,7 @@ def log(folder: str) -> list[bytes]:
     return [part.read_bytes() for part in sorted(Path(folder, "log.parquet").iterdir())]
 
 
+@pytest.mark.long
 def test_a_drive_is_recorded_and_repeated(page, capsys):
     frames = page()
     type_in("docs/live.md", "drake-teleop drive contact_transition --record")

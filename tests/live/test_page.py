@@ -50,6 +50,7 @@ def speed_by_key(page: Page, slow: int) -> float:
     return float(np.polyfit(t, z, 1)[0])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_keys_move_the_hand_at_the_same_simulated_speed_in_slow_motion(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")
@@ -75,6 +76,7 @@ def test_a_machine_that_is_too_slow_offers_slow_motion_with_one_click(page):
     page.until("document.querySelectorAll('#words button').length === 0")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_page_drives(page):
     page.until("typeof frame !== 'undefined' && frame && frame.tool && target && viewer")

@@ -139,6 +139,7 @@ def test_rendered_wrench_cross_fades_at_a_constant_wrench():
     np.testing.assert_array_equal(rendered.Eval(context), wrench)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_force_limit_of_a_new_channel_ends_after_the_hand_eases_off(scenario, load):
     """A press is rendered at most 0.9 N harder, and in full from the next one on."""

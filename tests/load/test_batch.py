@@ -441,6 +441,7 @@ def test_every_tool_without_noise(utias, method):
         assert max(mass, com, inertia) < 1e-6, file.stem
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_utias_protocol(utias):
     for level, methods in utias.run(TOOLS, seeds=3).items():

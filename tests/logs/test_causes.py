@@ -121,6 +121,7 @@ def test_gripper_at_30_frames_a_second(name: str, said: list[str]) -> None:
     assert found.identification.mass == pytest.approx(GRIPPER, abs=0.005)
 
 
+@pytest.mark.long
 def test_eliminate_subtracts_inertia_alone_where_the_weight_is_removed(tmp_path: Path) -> None:
     log = CASES / "14_weight_removed_30hz.csv"
     load = identify_log(log).identification

@@ -79,6 +79,7 @@ def test_identify_finds_delay_and_load_in_a_noisy_log(tmp_path: Path) -> None:
     assert summary["not_identifiable"] == []
 
 
+@pytest.mark.long
 @pytest.mark.pictures
 @pytest.mark.slow
 def test_identify_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,6 +127,7 @@ REAL: list[tuple[Callable[[Data, Tables], None], str, str]] = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("plant", "name", "says", "record"),
@@ -255,6 +256,7 @@ def test_identify_and_eliminate_pass_findings_on(tmp_path: Path) -> None:
     assert [finding.name for finding in suspected] == ["sign"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("move", "force", "lag_s"),

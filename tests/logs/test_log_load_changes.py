@@ -102,6 +102,7 @@ def test_online_on_ntnu_records(ntnu: Path, tmp_path: Path, record: str) -> None
     assert 0.0 < after[np.argmax(grasped == CHANGED)] < 0.5
 
 
+@pytest.mark.long
 def test_ur5_pushes_are_no_load(ur5: Path, tmp_path: Path) -> None:
     """Eight pushes of up to 50 N on a handle of 0.1 kg."""
     record = f"{ur5}/No9_Singularity_Free_ForceSensor__"

@@ -117,6 +117,7 @@ def test_stated_gain_errors_increase_the_deviations(folder, method):
     assert 0.005 * load.mass < load.standard_deviations[6] < 0.03 * load.mass
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
     found = identify_log(described(folder, "gains"))

@@ -179,6 +179,7 @@ def test_joints_have_end_stops():
     ]
 
 
+@pytest.mark.long
 def test_inverse_kinematics_and_matrices_are_consistent():
     device = leader()
     q = device.home + 0.1

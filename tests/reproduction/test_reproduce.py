@@ -27,6 +27,8 @@ from drake_teleop.station.operator.operator import Sine
 from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, replace
 
+pytestmark = pytest.mark.long
+
 FORCE_SCALE = 1 / 17.5
 
 

@@ -150,6 +150,7 @@ def test_excluded_contact_causes_no_doubt(tmp_path: Path) -> None:
     assert at.doubts == () and at.sure.all() and at.advice == ""
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 @pytest.mark.parametrize(("name", "time"), [("zero change", 4.0), ("load change", 2.5)])
@@ -244,6 +245,7 @@ def test_wrong_stamps_of_one_stream_do_not_affect_the_other() -> None:
     assert recorder.began_anew <= 2
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_exit_status_is_1_if_the_tolerance_is_not_met(tmp_path: Path) -> None:

@@ -336,6 +336,7 @@ def test_redundant_arm_approaches_posture_at_pull_rate(scenario, free):
     assert free[1] < 0.9990
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_untouched_surroundings_change_no_multiplier(scenario, free):
     """The command displacement exceeds the tolerance of the kinematics in both cases."""

@@ -139,6 +139,7 @@ def two_runs(monkeypatch):
     monkeypatch.setattr(studies, "study_command", alone)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.pictures
 def test_commands_and_code_of_the_pages(two_runs, tmp_path, monkeypatch):
@@ -184,6 +185,7 @@ def test_table_has_a_row_for_each_run(serial):
     assert np.all(np.diff(mean.sort("force_scaling.sigma")["rms_force_to_master_N"]) > 0.1)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_processes_give_the_same_bytes(serial, files):
     out = files / "parallel"
@@ -193,6 +195,7 @@ def test_processes_give_the_same_bytes(serial, files):
     assert not (out / "running").exists(), "nothing is under way any more"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_local_dask_cluster_gives_the_same_bytes(serial, files, monkeypatch):
     out, write, seen = files / "dask", Store.write, set()
@@ -231,6 +234,7 @@ def test_stopped_study_of_stations_continues(serial, files, monkeypatch):
     assert parts(out) == parts(serial[1])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_kills_neither_lose_nor_duplicate_rows(tmp_path):
     names = ("fake.py", "killed", "whole", "kept.json")
@@ -346,6 +350,7 @@ def dying(own: int, at: float):
     return work
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", [None, "local"])
 def test_run_that_ends_its_process_is_a_row_with_an_error(tmp_path, cluster):
