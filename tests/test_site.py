@@ -33,6 +33,7 @@ TESTED = {
     "README.md": "tests/test_readme.py",
     "analysis.md": "tests/test_analysis_doc.py",
     "delay.md": "tests/test_delay_doc.py",
+    "delay-figures.md": "tests/test_delay_doc.py",
     "detection.md": "tests/test_detection_doc.py",
     "extend.md": "tests/test_recipes.py",
     "logs.md": "tests/logs/test_log_description.py",
