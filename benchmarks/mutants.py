@@ -1,10 +1,9 @@
 """Which mistakes in the numeric code would no test notice?
 
-Makes seeded mistakes, one at a time (`mutations.py`), in the files of the numeric rooms, a share of
-each that goes with the root of the number of places where one can be made. For each it runs the
-tests that are related to the file, the most direct and quickest first, until one fails. A mutant
-that all of them pass has survived: it wants a test, or a reason in `mutants_equivalent.yaml` why
-nothing that matters changes.
+Makes seeded mistakes, one at a time (`mutations.py`), in all files that compute. Each file gets a
+share in proportion to the root of its number of places for mistakes. For each mistake the related
+tests run, the most direct and quickest first, until one fails. A mutant that passes all of them has
+survived: it needs a test, or a reason in `mutants_equivalent.yaml` why no result changes.
 
     python benchmarks/mutants.py [--number 220] [--seed 0] [--only FILE] [--jobs 2] [--json FILE]
 
@@ -40,11 +39,11 @@ import yaml
 from mutations import Mutation, mutations
 
 PACKAGE = "drake_teleop"
-ROOMS = ("analysis", "channel", "environment", "estimation", "excitation", "load", "logs")
-ROOMS += ("master", "operator", "passivity", "scaling", "sensor", "slave")
-#: Tests of texts, and of what runs for minutes; none is about one number of one room.
-LEFT_OUT = {"test_benchmarks", "test_house", "test_notebooks", "test_packaging", "test_quality"}
-LEFT_OUT |= {"test_readme"}
+GROUPS = ("station", "lab", "live")
+"""Packages whose subpackages are counted separately."""
+#: Tests of texts and long runs; none of them checks one number of one package.
+LEFT_OUT = {"test_benchmarks", "test_layers", "test_notebooks", "test_packaging", "test_quality"}
+LEFT_OUT |= {"test_readme", "test_language"}
 #: Seconds of processor that one test may take before it counts as endless; compiling takes most.
 ENDLESS = 120
 _LIBRARIES = """pytest hypothesis.strategies numba scipy.linalg scipy.optimize scipy.stats
@@ -76,24 +75,22 @@ def main() -> None:
 
 
 def numeric_files(root: Path, only: str = "") -> list[str]:
-    """Files that compute and neither draw nor print: those of the rooms, and compiled ones."""
+    """Return the files that compute and neither draw nor print."""
     files = []
     for path in sorted((root / PACKAGE).rglob("*.py")):
         file, text = path.relative_to(root).as_posix(), path.read_text(encoding="utf-8")
-        room = path.relative_to(root).parts[1]
         shows = path.name == "verdict.py" or re.search(
-            rf"^\s*(from|import) (matplotlib|rich|{PACKAGE}\.pages)\b", text, re.M
+            rf"^\s*(from|import) (matplotlib|rich|{PACKAGE}\.common\.style)\b", text, re.M
         )
-        if (
-            only in file
-            and not shows
-            and (
-                room in ROOMS
-                or (room == path.name and re.search("^@(njit|register_jitable)", text, re.M))
-            )
-        ):
+        if only in file and not shows and "/cli/" not in file and path.name != "__init__.py":
             files.append(file)
     return files
+
+
+def package_of(file: str) -> str:
+    """Return the name of a file's package, which is that of the folder of its tests."""
+    parts = file.split("/")[1:-1]
+    return parts[1] if len(parts) > 1 and parts[0] in GROUPS else parts[0]
 
 
 def sample(root: Path, number: int, seed: int, only: str = "") -> list[Mutation]:
@@ -173,7 +170,9 @@ def distances(graph: dict[str, set[str]], start: str) -> dict[str, int]:
     reached, layer = {start: 0}, {start}
     while layer:
         # The command line can reach everything; a test of one command sees what that one uses.
-        layer = {f for file in layer - {f"{PACKAGE}/cli.py"} for f in graph[file]} - reached.keys()
+        layer = {
+            f for file in layer - {f"{PACKAGE}/cli/main.py"} for f in graph[file]
+        } - reached.keys()
         reached |= dict.fromkeys(layer, max(reached.values()) + 1)
     return reached
 
@@ -183,12 +182,12 @@ def related(
 ) -> list[str]:
     """Test files that can see `file`, the nearest and quickest first, of `budget` seconds.
 
-    First those that import it or are of its room; then those of the whole; then the rest.
+    First those that import it or are of its package; then those of the whole; then the rest.
     """
-    room = file.split("/")[1]
+    package = package_of(file)
 
     def key(test: str) -> tuple[int, float]:
-        direct, near = reach[test][file] == 1, test.split("/")[1] == room
+        direct, near = reach[test][file] == 1, test.split("/")[1] == package
         whole = test.count("/") == 1
         return 0 if direct and near else 1 if direct or near else 2 if whole else 3, seconds[test]
 
@@ -224,7 +223,7 @@ def tested(
     ]
     if wanted:
         reach, seconds = warmed(root, tree, folder, {mutant.file for mutant in wanted})
-    # In any order, so that an interrupted run is a sample of all rooms too.
+    # In any order, so that an interrupted run is a sample of all packages too.
     random.Random(arguments.seed).shuffle(wanted)
     running: dict[Any, tuple[Mutation, Fork]] = {}
     try:
@@ -481,11 +480,10 @@ def explanations() -> dict[tuple[str, str, str], str]:
 
 
 def summary(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Figures by name: of all, and of each room."""
+    """Return figures by name: of all, and of each package."""
     known, counts = explanations(), Counter()
     for record in records:
-        parts = record["file"].split("/")
-        for group in ("all", parts[1].removesuffix(".py")):
+        for group in ("all", package_of(record["file"])):
             counts[f"{group}.made"] += 1
             counts[f"{group}.{record['outcome'].replace(' ', '_')}"] += 1
             if record["outcome"] == "survived":
@@ -509,9 +507,9 @@ def report(records: list[dict[str, Any]], figures: dict[str, float]) -> None:
     print()
     names = ("made", "killed", "timed_out", "survived", "explained")
     print(f"{'':20s}" + "".join(f"{name:>11s}" for name in names))
-    for room in sorted({name.partition(".")[0] for name in figures}):
-        cells = [figures.get(f"{room}.{name}", 0.0) for name in names]
-        print(f"{room:20s}" + "".join(f"{cell:11.0f}" for cell in cells))
+    for package in sorted({name.partition(".")[0] for name in figures}):
+        cells = [figures.get(f"{package}.{name}", 0.0) for name in names]
+        print(f"{package:20s}" + "".join(f"{cell:11.0f}" for cell in cells))
     print(f"noticed: {figures['all.killed_percent']:.1f} %")
 
 
