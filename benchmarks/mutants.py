@@ -408,6 +408,8 @@ def _run(tree: Path, tests: list[str], found: Path) -> None:
         "--no-header",
         "-p",
         "no:cacheprovider",
+        "-m",
+        "not checks",
         f"--rootdir={tree}",
     ]
     options.append(f"--basetemp={tree.parent / 'temporary'}")

@@ -79,9 +79,9 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "matplotlib_animations": False,
     "capture_repr": (),
-    "reset_modules": ("matplotlib", "house.set_style"),
-    "image_scrapers": ("house.picture",),
-    "within_subsection_order": "house.Order",
+    "reset_modules": ("matplotlib", "gallery_style.set_style"),
+    "image_scrapers": ("gallery_style.picture",),
+    "within_subsection_order": "gallery_style.Order",
 }
 
 # The reference

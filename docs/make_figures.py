@@ -34,7 +34,7 @@ from drake_teleop.common.style import (
     ORANGE,
     VERMILION,
     Picture,
-    house_style,
+    plot_style,
     shade_contact,
 )
 from drake_teleop.lab.reproduction.reproduce import reproduce_command
@@ -59,7 +59,7 @@ MASTER, LINE, SLAVE = "#EEF4FA", "#F3F4F6", "#FBF1EA"
 def station_figure() -> Picture:
     """The paper's Fig. 4 with the blocks of this library."""
     operator, master, scaling, channel, ik, control, slave = COLUMNS
-    with house_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
+    with plot_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
         figure = Picture(figsize=(10.7, 4.32), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(0, 10.7), ylim=(-0.05, 4.27), aspect="equal")
@@ -194,7 +194,7 @@ def _line(
 
 def frames_figure() -> Picture:
     """World, sensor and posed frame of a log, and what a description says of them."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(6.4, 3.3), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(0, 6.4), ylim=(0, 3.3), aspect="equal")
@@ -243,7 +243,7 @@ def _pointer(axes: Axes, start: object, end: object, colour: str) -> None:
 
 def station_frames_figure() -> Picture:
     """Where the frames are: W, S, Bcm and contact at the slave, B and E at the master."""
-    with house_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
+    with plot_style(), mpl.rc_context({"mathtext.fontset": "dejavuserif"}):
         figure = Picture(figsize=(9.9, 3.3), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(0, 9.9), ylim=(0.1, 3.4), aspect="equal")
@@ -276,7 +276,7 @@ def signs_figure() -> Picture:
         ("swung upwards", 1.5, 0.0, "f = m (a − g)"),
         ("put on a table", 0.5, 0.5, "f = −m g − what the table does"),
     )
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(8.6, 2.9), facecolor="white", layout="none")
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(0, 8.6), ylim=(-0.15, 2.75), aspect="equal")
@@ -322,7 +322,7 @@ def noise_figure() -> Picture:
     """Spectrum and Allan deviation of fx at rest: predicted (lines), simulated for 5 min (dots)."""
     period, count = 125e-6, 300 * 8000
     lengths = np.unique(np.logspace(0, np.log10(count // 8), 31).astype(int))
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(8.2, 3.2), facecolor="white")
         spectrum, allan = figure.subplots(1, 2)
         for name, colour in (("jr3_85m35a3", BLUE), ("ati_gamma_imu", VERMILION)):
@@ -366,7 +366,7 @@ def log_figure(folder: Path) -> Picture:
         ("without the weight", log.gravity_only, ORANGE),
         ("contact force", log.contact, BLUE),
     )
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(8.2, 2.8), facecolor="white")
         axes = figure.subplots()
         for name, wrench, colour in curves:

@@ -112,7 +112,7 @@ def test_a_script_of_the_gallery_is_short_and_says_what_it_shows():
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 40, path.name
         assert text.startswith('"""\n'), path.name
-        assert f'"{path.stem}"' in (DOCS / "_ext" / "house.py").read_text(), path.name
+        assert f'"{path.stem}"' in (DOCS / "_ext" / "gallery_style.py").read_text(), path.name
 
 
 def test_every_block_says_what_it_is():

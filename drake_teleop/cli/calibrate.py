@@ -25,7 +25,7 @@ from rich.text import Text
 
 from drake_teleop.cli.logs import identify_command
 from drake_teleop.common.files import make_folder, write_json, write_picture
-from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, house_style
+from drake_teleop.common.style import BLACK, COLOURS, GREY, Picture, plot_style
 from drake_teleop.load.tolerance import (
     QUANTITIES,
     UNITS,
@@ -145,7 +145,7 @@ def _verdict(at: Evaluation, k: int) -> str:
 
 def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
     """Draw half-widths of the 95 % intervals over the tolerances, with the advice."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()
         t = np.array([at.t for at in looks])

@@ -29,7 +29,7 @@ from drake_teleop.common.files import (
     write_table,
 )
 from drake_teleop.common.progress import show_progress
-from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, house_style
+from drake_teleop.common.style import BLACK, BLUE, COLOURS, GREY, Picture, plot_style
 from drake_teleop.lab.excitation.check import RATE
 from drake_teleop.lab.excitation.excite import Excitation, excite, sensor_motion
 from drake_teleop.lab.excitation.motion_film import write_motion_film
@@ -203,7 +203,7 @@ def table(found: Excitation) -> pl.DataFrame:
 
 def draw(found: Excitation) -> Figure:
     """Draw joint angles, wrench of the heaviest load with its limit, and the criterion."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9, 8))
         joints, forces, torques, progress = figure.subplots(4, 1, height_ratios=(3, 2, 2, 2))
         _draw_joints(joints, found)

@@ -47,7 +47,7 @@ _STYLE: dict[Any, Any] = {
 }
 
 
-def house_style() -> AbstractContextManager[None]:
+def plot_style() -> AbstractContextManager[None]:
     """Return a context with the common fonts, colours and grid."""
     return mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)})
 

@@ -88,12 +88,12 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
 
 def draw_detection(found: DetectedLog) -> Any:
     """Draw |F| before and after elimination, and the statistic with its threshold."""
-    from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, house_style, shade_contact
+    from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, plot_style, shade_contact
 
     eliminated = found.eliminated
     inner = ~eliminated.edge
     t = eliminated.log.t[inner]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10, 6))
         top, below = figure.subplots(2, 1, sharex=True)
         raw = np.linalg.norm((eliminated.measured - eliminated.measured[0])[inner, :3], axis=1)

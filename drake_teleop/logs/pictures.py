@@ -22,7 +22,7 @@ from drake_teleop.common.style import (
     PURPLE,
     VERMILION,
     Picture,
-    house_style,
+    plot_style,
     shade_contact,
 )
 from drake_teleop.load.batch.uncertainty import intervals
@@ -52,7 +52,7 @@ _MEASURED = "#A3AAB5"
 
 def draw_fit(found: IdentifiedLog) -> Figure:
     """Draw measured wrench, V phi and residual, without offsets; rejected samples are shaded."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10, 7))
         _fit_into(figure, found)
     return figure
@@ -60,7 +60,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
 def draw_knowledge(found: IdentifiedLog) -> Figure:
     """Draw residual spectrum, intervals and identifiability."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10, 7.4))
         _knowledge_into(figure, found)
     return figure
@@ -196,7 +196,7 @@ def draw_elimination(found: EliminatedLog) -> Figure:
     inner = ~found.edge
     curves = [(name, wrench[inner], colour) for name, wrench, colour in curves]
     t, touched, static = found.log.t[inner], found.touched[inner], found.log.static
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10, 9))
         top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1, 2.6])[:, 0]
         magnitude = top.subplots()

@@ -297,10 +297,10 @@ class SimulationResult:
         Raises:
             KeyError: for an unknown name.
         """
-        from drake_teleop.common.style import Picture, house_style, shade_contact
+        from drake_teleop.common.style import Picture, plot_style, shade_contact
 
         panels = [panel for name in names or self.signals for panel in self._panels(name)]
-        with house_style():
+        with plot_style():
             figure = Picture(figsize=(8.0, 0.6 + 1.9 * len(panels)))
             rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
             for axes, (name, unit, indices) in zip(rows, panels, strict=True):

@@ -22,7 +22,7 @@ from drake_teleop.common.style import (
     PAGE_DPI,
     VERMILION,
     Picture,
-    house_style,
+    plot_style,
 )
 from drake_teleop.lab.analysis import absolute_stability, transparency
 from drake_teleop.lab.analysis.maps import StabilityMap
@@ -127,7 +127,7 @@ def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
         "free motion": np.zeros_like(s),
         f"wall of {stiffness / 1e3:.3g} kN/m": damping + stiffness / s,
     }
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9.0, 5.4))
         grid = figure.subplots(2, 2, sharex=True, sharey="row")
         for column, (name, environment) in enumerate(environments.items()):
@@ -161,7 +161,7 @@ def _degrees(felt: Complex) -> Any:
 
 def draw_nyquist(curves: Curves) -> Figure:
     """Draw the loop at the wall for each grip; it must not encircle -1."""
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
         near.set_xlim(-2.0, 1.0)
@@ -188,7 +188,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
     wall = absolute_stability.ImpedanceRange((0.0, 0.0), (0.0, 10.0), (0.0, curves.wall[0]))
     hands = absolute_stability.range_of_grips()
     bounded = absolute_stability.bounded_singular_value(curves.H, curves.omega, hands, wall)
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.semilogx(hertz, absolute_stability.llewellyn_parameter(curves.H), color=COLOURS[0])
@@ -217,7 +217,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(9.0, 3.6))
         left, right = figure.subplots(1, 2)
         left.fill_between(
@@ -245,7 +245,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
 
 def draw_maps(curves: Curves, grip: str) -> Figure:
     """Draw stability over two parameters, for all grips."""
-    with house_style():
+    with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
         cells = figure.subplots(rows, 2, squeeze=False).ravel()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.files import write_picture, write_text
 from drake_teleop.common.html import embedded, render
-from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, house_style
+from drake_teleop.common.style import BLACK, COLOURS, GREY, PAGE_DPI, Picture, plot_style
 from drake_teleop.lab.comparison.decision import HOLDS, LEAKS, LEFT_BEHIND, UNSTABLE, decide
 from drake_teleop.lab.comparison.release_and_taps import TAP_RATES
 from drake_teleop.station.channel.network import PRESETS
@@ -79,7 +79,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 def draw_decision(summary: Mapping[str, Any]) -> Figure:
     """Draw the verdict of each method (a row) over each network (a column)."""
     methods, networks, table = summary["methods"], summary["networks"], decide(summary)
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(1.75 * len(networks) + 1.5, 0.72 * len(methods) + 1.1))
         axes = figure.subplots()
         for (method, network), cell in table.items():
@@ -131,7 +131,7 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
             lambda row: 100 * row["tap_shares"][1],
         ),
     )
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10.0, 0.36 * len(methods) + 1.5))
         columns = figure.subplots(1, len(panels), sharey=True)
         for axes, (title, scale, value) in zip(columns, panels, strict=True):
@@ -184,7 +184,7 @@ def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 def _draw_grid(summary: Mapping[str, Any], traces: Traces, draw: Any, unit: str) -> Figure:
     methods, networks = summary["methods"], summary["networks"]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(max(3.0 * len(networks), 7.5), 1.5 * len(methods) + 0.8))
         grid = figure.subplots(len(methods), len(networks), squeeze=False, sharex="col")
         for i, method in enumerate(methods):
@@ -207,7 +207,7 @@ def draw_limits(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the longest stable round trip of each method: a panel for each wall."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     walls = sorted({row["wall_N_per_m"] for row in rows})
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(3.6 * len(walls), 0.36 * len(methods) + 1.3))
         for axes, wall in zip(
             figure.subplots(1, len(walls), squeeze=False, sharey=True)[0], walls, strict=True

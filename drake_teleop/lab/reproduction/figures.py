@@ -16,7 +16,7 @@ from drake_teleop.common.style import (
     GREY,
     VERMILION,
     Picture,
-    house_style,
+    plot_style,
     shade_contact,
 )
 
@@ -41,7 +41,7 @@ def scaling_figure(
     """
     time, time_unit = _time(t)
     traces = [np.asarray(trace, float) for trace in values]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(7.6, 1.2 + 1.75 * len(traces)))
         rows = figure.subplots(len(traces), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         for axes, trace, sigma in zip(rows, traces, sigmas, strict=True):
@@ -87,7 +87,7 @@ def contact_figure(
     per_second = 1e3 if time_unit == "ms" else 1.0
     traces = [np.asarray(trace, float) for trace in (measured, contact_force)]
     touched = np.asarray(contact, bool)
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(7.6, 5.0))
         rows = figure.subplots(2, 1, sharex=True, sharey=True)
         titles = ("Measured force", "Calculated contact force, σ = 0")

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from drake_teleop.common.files import write_picture
-from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, house_style
+from drake_teleop.common.style import BLUE, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.studies import effects
 from drake_teleop.lab.studies.design import Study
 from drake_teleop.lab.studies.effects import PARETO, numbers, pair_means, pareto, varied
@@ -56,7 +56,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
     """Draw the mean of each measure at each level; bars are effect intervals."""
     factors, fitted, reasons = varied(study), False, set[str]()
-    with house_style():
+    with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
         figure = Picture(figsize=size)
         grid = figure.subplots(len(measures), len(factors), squeeze=False, sharey="row")
@@ -124,7 +124,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
         return None
     columns = min(len(maps), 3)
     lines = -(-len(maps) // columns)
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(1.0 + 3.1 * columns, 0.6 + 2.6 * lines))
         grid = figure.subplots(lines, columns, squeeze=False)
         low, high = (end([end(found.mean) for found in maps]) for end in (np.nanmin, np.nanmax))
@@ -155,7 +155,7 @@ def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
     points = points.filter("complete")
     on_front = points.filter("front")
     factors = [factor.field for factor in varied(study)]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10.0, 4.2))
         for axes, name in zip(figure.subplots(1, 2), PARETO[1:], strict=True):
             axes.plot(points[name], points[PARETO[0]], "o", ms=3, color=GREY, alpha=0.5)

@@ -24,7 +24,7 @@ from drake_teleop.common.files import (
     write_table,
 )
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.style import COLOURS, Picture, house_style
+from drake_teleop.common.style import COLOURS, Picture, plot_style
 from drake_teleop.lab.studies.effects import estimated, numbers
 from drake_teleop.lab.studies.store import Store
 from drake_teleop.lab.studies.study import LoadStudy, study_command
@@ -231,7 +231,7 @@ def criteria_picture(
 ) -> Figure:
     """Draw each criterion over sigma, a line for each gamma."""
     tasks = [task for task in TASKS if "force" in TASKS[task]]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(len(tasks), 3, sharex=True)
         for line, task in zip(grid, tasks, strict=True):
@@ -261,7 +261,7 @@ def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list
     ends = 2.0**-farthest, 2.0**farthest
     scale = LogNorm(*ends)
     colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
         grid = figure.subplots(2, 2)
         for axes, (selection, found) in zip(grid.ravel(), answers.items(), strict=True):

@@ -130,7 +130,7 @@ def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
 
 
 def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> None:
-    from drake_teleop.common.style import Picture, house_style
+    from drake_teleop.common.style import Picture, plot_style
 
     shown = [
         quantity for quantity in _PICTURED_QUANTITIES if any(r.quantity == quantity for r in found)
@@ -138,7 +138,7 @@ def _write_picture(path: Path, experiment: Experiment, found: list[Result]) -> N
     if not shown:
         return
     names = [condition.name for condition in experiment.conditions]
-    with house_style():
+    with plot_style():
         figure = Picture(figsize=(2.9 * len(shown), 0.9 + 0.62 * len(names)))
         grid = figure.subplots(1, len(shown), squeeze=False, sharey=True)
         for axes, quantity in zip(grid[0], shown, strict=True):

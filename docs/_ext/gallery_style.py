@@ -9,15 +9,15 @@ import matplotlib as mpl
 from matplotlib import pyplot as plt
 from sphinx_gallery.scrapers import figure_rst
 
-from drake_teleop.common.style import PAGE_DPI, house_style
+from drake_teleop.common.style import PAGE_DPI, plot_style
 
-with house_style():
-    _HOUSE = dict(mpl.rcParams)
-_STYLE = {name: value for name, value in _HOUSE.items() if value != mpl.rcParams[name]}
+with plot_style():
+    _OURS = dict(mpl.rcParams)
+_STYLE = {name: value for name, value in _OURS.items() if value != mpl.rcParams[name]}
 
 
 def set_style(_settings: dict[str, Any], _file: str) -> None:
-    """That of the house: scripts of the gallery need not ask for it."""
+    """Set the plot style of the project for all scripts of the gallery."""
     mpl.rcParams.update(_STYLE)
 
 
