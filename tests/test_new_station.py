@@ -84,9 +84,7 @@ def test_place_is_in_front_with_a_reachable_cube():
         pose = np.array([*w, *(place + half * np.array(signs))])
         assert find_posture(arm, pose, q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
-    with pytest.raises(
-        DrakeTeleopError, match="no place found where the arm can hold z_S downwards"
-    ):
+    with pytest.raises(DrakeTeleopError, match="no posture found in which z_S points down"):
         find_place(stiff)
 
 

@@ -429,7 +429,7 @@ def test_empty_load_estimate_is_rejected(sigma):
     """Otherwise weight and inertia of the tool (96 N) would count as contact."""
     scenario = replace(Scenario(), force_scaling__sigma=sigma)
     offsets_alone = np.repeat([1.0, 0.0], [6, 10])
-    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* never learnt; identify it"):
+    with pytest.raises(DrakeTeleopError, match=r"load_estimate: .* not identified; identify it"):
         MakeTeleopStation(scenario, load_estimate=offsets_alone)
     # Of which a learning estimator may begin.
     learning = replace(scenario, load_estimator__enabled=True)

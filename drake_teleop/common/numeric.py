@@ -88,7 +88,7 @@ def check_identified(name: str, phi: Array) -> Array:
     """Return `phi` (10,); raise DrakeTeleopError if it is zero, as without data."""
     if not phi.any():
         raise DrakeTeleopError(
-            "is zero throughout, so this load was never learnt",
+            "is zero throughout, so this load is not identified",
             where=name,
             remedy="identify it first: identify_load for a scenario, identify_log for a log",
         )

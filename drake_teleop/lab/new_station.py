@@ -257,7 +257,7 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     best = max(found, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
-            "no place found where the arm can hold z_S downwards and move in all directions",
+            "no posture found in which z_S points down and the arm can move in all directions",
             where="new",
             remedy=_axis_advice(arm) or "check joint limits and the orientation of sensor_frame",
         )

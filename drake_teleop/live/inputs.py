@@ -220,7 +220,7 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
             raise _cannot_repeat(changed if name == "files" else what, path)
     changes = list(_parse_rows(lines[2:], path))
     if not changes or changes[-1][0] == 0:
-        raise DrakeTeleopError("contains no simulated time", where=str(path))
+        raise DrakeTeleopError("has a duration of 0 s", where=str(path))
     return changes
 
 

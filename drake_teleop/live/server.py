@@ -423,7 +423,7 @@ def drive_command(
     for folder in live.recorded:
         print(f"recorded; repeat it: drake-teleop run --inputs {shlex.quote(folder)}")
     if live.ended:
-        raise DrakeTeleopError(f"had stopped: {live.ended}", where="drive")
+        raise DrakeTeleopError(f"the session has ended: {live.ended}", where="drive")
 
 
 def start_condition(device: str | None) -> str:

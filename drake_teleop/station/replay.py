@@ -126,7 +126,7 @@ def write_replay(
         raise DrakeTeleopError(
             f"cannot be shown: it contains no {', '.join(missing) or 'samples'}",
             where="replay",
-            remedy="give the log of a station with its own slave",
+            remedy="give the log of a station with a simulated slave",
         )
     times, slow_motion = frame_times(float(result.t[0]), float(result.t[-1]), slow_motion)
     rows = _nearest_rows(result.t, times)

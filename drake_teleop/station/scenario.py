@@ -330,7 +330,7 @@ def _check_channel(scenario: Scenario, where: str) -> None:
     scales = (scaling.translation_scale, scaling.rotation_scale)
     if scenario.passivity.method != "none" and min(scales) == 0.0:
         raise DrakeTeleopError(
-            "a motion that is scaled to zero carries no energy",
+            "requires kinematic scales above 0",
             where=f"{where}:passivity.method",
             remedy="set both scales of kinematic_scaling above 0, or method: none",
         )

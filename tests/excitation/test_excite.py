@@ -399,7 +399,11 @@ def test_chain_with_an_unsupported_joint_is_refused(urdf, joint, expected):
     ("old", "new", "expected"),
     [
         ('<parent link="l0"/>', '<parent link="l3"/>', "joints form a circle through l"),
-        ('<child link="finger"/>', '<child link="l3"/>', "l3 hangs on two joints, j3 and slide"),
+        (
+            '<child link="finger"/>',
+            '<child link="l3"/>',
+            "l3 is the child of two joints, j3 and slide",
+        ),
         (
             'lower="0.1" upper="2.6"',
             'lower="2.6" upper="0.1"',
@@ -445,7 +449,7 @@ def _joint(parent, child):
     ("ends", "expected"),
     [
         (("ab", "bc", "ca"), "a circle through m::m::b"),
-        (("ab", "cb"), "m::m::b hangs on two joints, ab and cb"),
+        (("ab", "cb"), "m::m::b is the child of two joints, ab and cb"),
     ],
 )
 def test_included_models_are_checked(tmp_path, ends, expected):
@@ -477,7 +481,7 @@ def test_undefined_xml_entity_is_refused(urdf, entity):
 
 def test_world_as_child_of_a_joint_is_refused(urdf):
     urdf.write_text(urdf.read_text().replace('"l6"', '"world"'))
-    with pytest.raises(DrakeTeleopError, match="world hangs on j6"):
+    with pytest.raises(DrakeTeleopError, match="world is the child of j6"):
         ParseModel(MultibodyPlant(0.0), urdf, "l3")
 
 

@@ -148,7 +148,7 @@ def test_stopped_drive_ends_with_the_reason_and_status_2(page, capsys, monkeypat
     monkeypatch.setattr(Session, "advance", fail)
     assert drive() == 2
     message = capsys.readouterr().err
-    assert message.endswith("error: drive: had stopped: joint 2 leaves its range\n")
+    assert message.endswith("error: drive: the session has ended: joint 2 leaves its range\n")
 
 
 def test_incomplete_record_has_status_2(page, capsys, monkeypatch):

@@ -292,8 +292,8 @@ def test_inputs_are_clipped_and_invalid_ones_ignored():
     ("text", "message"),
     [
         ("", "is not a record of a drive"),
-        (HEADER, "contains no simulated time"),
-        (HEADER + row(0, Inputs()), "contains no simulated time"),
+        (HEADER, "has a duration of 0 s"),
+        (HEADER + row(0, Inputs()), "has a duration of 0 s"),
         (HEADER + row(5, Inputs()), "5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(-5, Inputs()), "-5 ms is not a valid time"),
         (HEADER + row(0, Inputs()) + row(5, Inputs(x=1_000_000)), ":4.*x = 1000000 is outside"),

@@ -271,7 +271,7 @@ def hole(document):
         (put("phi", [1.0] * 9), r"json:phi: has shape \(9,\) instead of \(10,\)"),
         (put("phi", [float("nan")] * 10), "json:phi: is not finite"),
         (put("phi", None), "json:phi: "),
-        (put("phi", [0.0] * 10), "json:phi: .* never learnt"),
+        (put("phi", [0.0] * 10), "json:phi: .* not identified"),
         (put("offsets", ["a"] * 6), "json:offsets: holds no numbers"),
         (put("covariance", [[1.0] * 16] * 15), "json:covariance: is not a"),
         (put("covariance", [[1.0] * 16] * 15 + [[1.0]]), "json:covariance: is not a"),
@@ -297,7 +297,7 @@ def test_spoilt_file(tmp_path, spoil, message):
 
 def test_a_load_that_was_never_learnt_is_none():
     found = identify(record(99)[0], *record(99)[1])
-    with pytest.raises(DrakeTeleopError, match=r"phi: .* never learnt"):
+    with pytest.raises(DrakeTeleopError, match=r"phi: .* not identified"):
         replace(found, phi=np.zeros(10))
     with pytest.raises(DrakeTeleopError, match=r"offsets: has shape \(10,\)"):
         replace(found, offsets=np.zeros(10))

@@ -211,7 +211,7 @@ def test_arm_without_visuals_is_shown_as_sticks(scenario):
         ({"base_pose": [0.1, 0, 0, 0, 0, 0]}, "welds base to the world itself"),
         ({"inverse_kinematics": "closed_form"}, "closed form is that of an RX90"),
         ({"tool": Tool(mass=90.0)}, "hold its 90.9 kg at the start: j4 needs 566 of its 400 N;"),
-        ({"sensor_frame": "finger"}, "nothing with a mass hangs on finger"),
+        ({"sensor_frame": "finger"}, "no body with a mass is attached to finger"),
         ({"model": "absent.urdf"}, "absent.urdf: there is no such file"),
         ({"tool": Tool(model="a.sdf", mass=1.0)}, "slave.tool.mass: both a file and a mass"),
         ({"tool": Tool(shapes=[Ball()])}, "require a mass"),

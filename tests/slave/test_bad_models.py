@@ -116,14 +116,14 @@ ERRORS = {
     "URDF called SDF": ("sdf", arm(), "arm.sdf: cannot be read as a robot"),
     "URDF called MJCF": ("xml", arm(), "does not contain a mujoco tag"),
     "no such kind": ("usda", "#usda 1.0", "not a recognized type.*give a URDF, SDF, MJCF"),
-    "a macro by its name": ("urdf.xacro", arm(), "is a macro; run it through xacro first"),
+    "a macro by its name": ("urdf.xacro", arm(), "is a xacro file; run it through xacro first"),
     "a macro by what is in it": ("urdf", '<robot name="a" xmlns:xacro="x"><xacro:arm/></robot>',
-                                 "arm.urdf: is a macro; run it through xacro first"),
+                                 "arm.urdf: is a xacro file; run it through xacro first"),
     "a macro's number": ("urdf", with_inertial((MASS, '<mass value="${m}"/>')),
                          "link l3: mass '..m.' is not a number"),
     # Trees
     "a loop": ("urdf", arm(beyond=joint(9, parent="l6", child="l2")),
-               "l2 hangs on two joints, j2 and j9"),
+               "l2 is the child of two joints, j2 and j9"),
     "a circle": ("urdf", arm(j3=joint(3, parent="l5")), "joints form a circle through l"),
     "a joint on itself": ("urdf", arm(j3=joint(3, parent="l3")), "a circle through l3"),
     "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "form a loop, by drake:"),
@@ -324,7 +324,7 @@ def test_rounded_inertia_is_preserved(tmp_path):
         ({"tip": [0.0, 0.1]}, "slave.tip: must be a list"),
         ({"tool": Tool(mass=90.0)}, "slave.tool: the arm cannot hold its 90 kg .* j2 needs"),
         ({"tool": Tool(model="none.sdf")}, "none.sdf: there is no such file"),
-        ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: nothing with a mass hangs on tcp"),
+        ({"tool": None, "sensor_frame": "tcp"}, "slave.tool: no body with a mass is attached"),
     ],
 )  # fmt: skip
 def test_invalid_settings_of_valid_model_raise_error(tmp_path, change, expected):

@@ -631,7 +631,7 @@ def _check_rates(scenario: Scenario) -> None:
     rates = scenario.rates
     if rates.joint_control_hz != rates.hand_hz or rates.sensor_hz % rates.hand_hz != 0.0:
         raise DrakeTeleopError(
-            "the loops can only be cut at instants that hand and joint control share",
+            "the gains of the loops require equal rates of hand and joint control",
             where="rates",
             remedy="set joint_control_hz to hand_hz, and sensor_hz to a multiple of it",
         )

@@ -143,7 +143,7 @@ def encirclements(
     if not np.all(np.abs(steps) < np.pi / 2):
         raise DrakeTeleopError(
             "1 + L turns by more than a right angle between two frequencies",
-            remedy="take more frequencies there; a loop at its limit cannot be counted",
+            remedy="add frequencies there; at its stability limit a loop has no count",
         )
     if not sampled and not np.all(np.abs(difference[-1] - 1) < 1):
         raise DrakeTeleopError("|L| is not below 1 at the last frequency", remedy="go further up")

@@ -144,8 +144,8 @@ def _sphere_and_box(
     if isinstance(sphere, Sphere) and isinstance(edges, Box):
         return sphere, edges
     raise DrakeTeleopError(
-        f"the wrist sensor feels spheres on boxes only, not a {type(sphere).__name__} on a "
-        f"{type(edges).__name__}",
+        "the wrist sensor measures contact of spheres with boxes only, not of a"
+        f" {type(sphere).__name__} on a {type(edges).__name__}",
         where=inspector.GetName(box),
         remedy="build the tool's tip of spheres and the environment of boxes",
     )
@@ -170,7 +170,7 @@ def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[fl
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
             raise DrakeTeleopError(
-                "leaves stiffness or dissipation to Drake",
+                "has no stiffness or no dissipation",
                 where="drake:proximity_properties",
                 remedy="give drake:point_contact_stiffness and drake:hunt_crossley_dissipation",
             )

@@ -213,7 +213,7 @@ class WristSensorConfig:
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
             raise DrakeTeleopError(
-                "is not a rotation: its rows are not unit vectors at right angles, right-handed",
+                "is not a rotation: its rows must be orthogonal unit vectors with determinant +1",
                 where=f"{where}.R_SA",
                 remedy="give nine numbers row by row; its columns are the axes of A in S",
             )

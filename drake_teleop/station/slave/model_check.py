@@ -96,7 +96,7 @@ def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, 
         if child in parents or child == WORLD:
             on = f"two joints, {parents[child][1]} and {name}" if child in parents else name
             raise DrakeTeleopError(
-                f"{child} hangs on {on}",
+                f"{child} is the child of {on}",
                 where=where,
                 remedy="an arm is a tree: each link is the child of one joint, the world of none",
             )

@@ -25,7 +25,7 @@ def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
         roots = {path: read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
     for file, root in roots.items():
         if any(element.tag.startswith("xacro:") for element in root.iter()):
-            raise DrakeTeleopError("is a macro", where=str(file), remedy=XACRO)
+            raise DrakeTeleopError("is a xacro file", where=str(file), remedy=XACRO)
     return roots
 
 

@@ -196,7 +196,7 @@ def _parse(
     if not os.path.isfile(path):
         raise DrakeTeleopError("there is no such file", where=str(path))
     if path.suffix.lower() == ".xacro":
-        raise DrakeTeleopError("is a macro", where=str(path), remedy=XACRO)
+        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=XACRO)
     kind = path.suffix.lower().removeprefix(".")
     if kind == "xml":
         read_text(path)  # raises an error for invalid encoding

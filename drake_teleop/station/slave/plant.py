@@ -226,9 +226,9 @@ class ParsedSlave:
         arm = ArmModelFromPlant(self.plant, frame.model_instance(), frame.name())
         if not arm.phi_load[0] > 0.0:
             raise DrakeTeleopError(
-                f"nothing with a mass hangs on {frame.name()}",
+                f"no body with a mass is attached to {frame.name()}",
                 where="slave.tool",
-                remedy="give the tool, or a sensor_frame before the model's own",
+                remedy="set slave.tool, or a sensor_frame between the arm and the model's own tool",
             )
         check_size(arm, str(self.slave.path))
         arm, assumed = with_all_limits(arm, str(self.slave.path))
