@@ -74,9 +74,8 @@ def test_ci_runs_the_readmes_test_commands(tmp_path):
     assert answer.stderr.startswith(command + "\n")  # bash prints the commands that it runs
     assert answer.stdout.splitlines() == [
         "python3 -m venv --upgrade-deps .venv-test",
-        "pip install -q --no-compile -e .[test]",
-        "pytest -n 2 --dist worksteal",
         "pip install -q --no-compile -e .[test,docs]",
+        "pytest -n 2 --dist worksteal",
         "pytest -n 2 --dist worksteal -m checks or long",
         "python benchmarks/fuzz.py --seconds 20 --seed 1",
         "sphinx-build -q -W --keep-going -j 2 docs out/site",
