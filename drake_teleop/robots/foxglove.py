@@ -1,4 +1,4 @@
-"""Wrenches for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
+"""Sinks for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
 
 from __future__ import annotations
 
