@@ -1,4 +1,4 @@
-"""Design of an experiment: its YAML file."""
+"""Design of an experiment, from its YAML file."""
 
 # No postponed annotations: yaml_load_typed reads the types of the fields.
 import os
@@ -128,7 +128,7 @@ class Experiment:
         """Check the experiment without its scenarios.
 
         Raises:
-            DrakeTeleopError: with the field.
+            DrakeTeleopError: for an invalid field.
         """
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
@@ -164,7 +164,7 @@ class Experiment:
 
 
 def ExperimentNames() -> list[str]:
-    """Return the shipped names."""
+    """Return the names of the shipped experiments."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
@@ -172,7 +172,7 @@ def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment by file or name, and its scenarios.
 
     Raises:
-        DrakeTeleopError: with the invalid field.
+        DrakeTeleopError: for an invalid field.
     """
     expect((str, Path), path, "study")
     names = ExperimentNames()
