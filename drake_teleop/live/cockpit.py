@@ -51,7 +51,7 @@ def _columns_at_limit(values, limits):
 
 @njit(cache=True)
 def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work of new rows to `energy` (2,) [J].
+    """Add the work at hand and tool in new rows to `energy` (2,) [J].
 
     `before` (4,) is [t, p_WS] of the previous row, nan if there is none.
     """

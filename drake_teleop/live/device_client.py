@@ -47,7 +47,7 @@ class Device(Protocol):
         """Limits of force, torque and their slew rates."""
 
     def read(self) -> DevicePose | None:
-        """Return the next pose, None after half a second."""
+        """Return the next pose, None if none comes for half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the base frame B [N, N m]."""

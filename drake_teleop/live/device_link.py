@@ -183,7 +183,7 @@ def _is_loopback(host: str) -> bool:
 
 
 class DeviceConnection:
-    """Link to a haptic device, and the client process if it is started here.
+    """Link to a haptic device, with the client process of a haply:// address.
 
     Args:
         address: udp://127.0.0.1:PORT for a client, or haply://HOST:PORT of an Inverse3.

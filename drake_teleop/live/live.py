@@ -212,7 +212,7 @@ class Live:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice or frame [s]."""
+        """Return the time until the next simulation slice or frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
@@ -284,7 +284,7 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for pages."""
+        """Return the values that pages show now (a frame)."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(

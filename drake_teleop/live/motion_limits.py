@@ -37,7 +37,7 @@ class RateInputs:
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
-        """Return the inputs of the next slice."""
+        """Return the inputs of the next simulation slice."""
         if not self._rates:
             return inputs
         if now > self._end_time:

@@ -33,7 +33,7 @@ class Pace:
         self._starts.clear()
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice [s]."""
+        """Return the time until the next slice is due [s]."""
         return self._due - now
 
     def begin(self, now: float) -> None:

@@ -45,7 +45,7 @@ class Record:
     """Folder of a recorded drive without its log.
 
     Raises:
-        CannotWrite: if it contains a drive, or the disk is full.
+        CannotWrite: if the folder contains a drive, or the disk is full.
     """
 
     def __init__(

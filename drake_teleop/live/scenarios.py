@@ -44,7 +44,7 @@ SCENES = ("own", *_SHIPPED)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return a scenario without intent, task and settling, with error-controlled steps."""
+    """Return the scenario with intent, task and settling removed and error-controlled steps."""
     return replace(
         scenario,
         operator__intent=[],
@@ -126,7 +126,7 @@ def _object_phi(scenario: Scenario) -> Array:
 
 
 def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) for the masses and the tared sensor of the scenario `now`."""
+    """Return the load estimate (16,) adapted to load and sensor offsets of the scenario `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()

@@ -432,5 +432,4 @@ def start_condition(device: str | None) -> str:
 
 
 def _print_note(text: str) -> None:
-    """Print on stderr."""
     print(text, file=sys.stderr, flush=True)

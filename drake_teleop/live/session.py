@@ -1,4 +1,4 @@
-"""Station that runs in slices and takes its inputs between them.
+"""Station that is simulated in slices of time and takes its inputs between them.
 
 The motion depends on the inputs alone: `Drive.repeat` gives the same log for any slices.
 """
@@ -215,7 +215,7 @@ class Session:
         """Set and record the inputs from now on.
 
         Raises:
-            DrakeTeleopError: if no station has these inputs; then nothing has changed.
+            DrakeTeleopError: if no such station is possible; then nothing has changed.
         """
         before = self.inputs
         if inputs == before:
@@ -323,7 +323,7 @@ class Session:
         return with_all_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        """Return the rows in memory."""
+        """Return the log in memory."""
         parts = [*self._earlier_rows, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])

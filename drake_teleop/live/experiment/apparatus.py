@@ -136,7 +136,7 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows."""
+        """Add the newest rows of the log."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])

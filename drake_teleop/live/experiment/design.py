@@ -58,7 +58,7 @@ class _Task:
 @settings
 @dataclass
 class ContactDetection(_Task):
-    """In which of two intervals was the contact rendered? The tool touches in both."""
+    """Task to find the interval of two with rendered contact. The tool touches in both."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -71,7 +71,7 @@ class ContactDetection(_Task):
 @settings
 @dataclass
 class ApparentMass(_Task):
-    """In which of two intervals was the tool heavier? It is moved back and forth in both."""
+    """Task to find the interval of two with a heavier tool. It moves back and forth in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
