@@ -44,7 +44,7 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One or two sources of parts as one; raise DrakeTeleopError if none has motion.
+    """One or two sources of parts as one source; raise DrakeTeleopError if none has motion.
 
     Attributes:
         motion_stream: stream of the motion: poses if available, else an IMU.
@@ -125,7 +125,7 @@ class PosedByJoints:
 
 
 class MotionWindow:
-    """Motions of the sensor S from poses of a frame F, or from IMU samples, on a uniform time grid.
+    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU samples.
 
     Args:
         cutoff_hz: cut-off of the smoothing; None for the shortest window.
@@ -231,7 +231,7 @@ class Assembly:
     Args:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
         track: load for tracking this delay; None for a constant delay.
-        X_FS: (7,) pose of the sensor in the posed frame, [w x y z, position].
+        X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
         weight_removed: the robot has removed the weight from the wrench. Readings contain the
             acceleration instead of the specific force; an IMU raises DrakeTeleopError.
 

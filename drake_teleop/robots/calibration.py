@@ -150,7 +150,7 @@ def best_motion(
 
     Args:
         motion: s, omega, alpha of the record, (N, 3) each.
-        errors: (k, 16) from `errors_of`.
+        errors: (k, 16) matrix from `errors_of`.
         noise: (6,) standard deviation of a sample's wrench [N, N m].
     """
     rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)

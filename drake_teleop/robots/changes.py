@@ -132,7 +132,7 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
 
 
 def _decisive(state: State, time: float) -> bool:
-    """Return whether S has moved since `time`, and the other kind of change fits much worse."""
+    """Return whether the sensor moved after `time` and the other kind of change fits much worse."""
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:

@@ -1,4 +1,4 @@
-"""Opening of sources and sinks by their addresses."""
+"""Functions that open sources and sinks by their addresses."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the noise (6,) of a reading [N, N m] from the low-passed residual, assumed white."""
+    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
