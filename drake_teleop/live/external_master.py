@@ -64,7 +64,7 @@ def _pose_on_path(path, time, out):
 
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
-    """Write wrench, fault and allowed share (8,) after `period` to `now`; `limits` (2,) [N, N m]."""
+    """Write wrench, fault and allowed share (8,) after `period` to `now`; `limits`: [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH

@@ -57,7 +57,7 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion from `lift` to -`depth` [m] and back; `hold`: share of time at -`depth`."""
+    """Return a hand motion from `lift` to -`depth` [m] and back; `hold`: share of time below."""
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

@@ -106,7 +106,7 @@ class Procedure:
 
     @property
     def number(self) -> int:
-        """Number of the present trial, from 0."""
+        """Number of the trial, from 0."""
         return len(self._rows)
 
     @property
