@@ -1,1 +1,1 @@
-"""Shared by all packages: errors, settings, compiled mathematics, files and pages."""
+"""Modules for all packages: errors, settings, compiled mathematics, files and pages."""

@@ -1,4 +1,4 @@
-"""Memory and faults of blocks in the loop.
+"""Lifetime and fault codes of Drake systems.
 
 A Python `LeafSystem` and its Diagram (2.5 MB) are never freed if C++ holds a bound method, or,
 in Python 3.11, if a subclass has no empty `__slots__`. Forces computed from invalid, too large
@@ -20,7 +20,7 @@ ONE_DICT: tuple[str, ...] = ()
 
 
 def weak_callback(method: Any) -> Callable[..., None]:
-    """Return a callback for C++ that does not keep its system alive."""
+    """Return a callback for C++ with a weak reference to the system of `method`."""
     system, function = weakref.ref(method.__self__), method.__func__
 
     def call(context: Any, output: Any) -> None:
@@ -34,7 +34,7 @@ LARGEST = 1e6
 
 
 class Fault(IntEnum):
-    """Causes, by priority."""
+    """Causes of a suppressed force, by priority."""
 
     NONE = 0
     STALE = 1
@@ -55,12 +55,12 @@ MEANINGS = {
     Fault.HAND: "the hand's joint angles are no numbers",
     Fault.RESUMING: "the force at the hand comes back after a fault",
 }
-"""Texts for warnings."""
+"""Warning text of each fault."""
 
 
 @njit(cache=True)
 def sound(numbers):
-    """Return whether all magnitudes are finite and at most `LARGEST`."""
+    """Return whether all numbers are finite and at most `LARGEST` in magnitude."""
     good = True
     for x in numbers:
         good = good and abs(x) <= LARGEST

@@ -1,4 +1,4 @@
-"""`njit` with a cache that follows calls between files and that processes can share.
+"""`njit` with a disk cache that processes can share and that detects changed callees in any file.
 
 numba's own cache ignores changes of callees in other files. It numbers signatures without a lock,
 so that two processes can exchange their code. Here each signature has its own file, named by a
@@ -35,11 +35,11 @@ _PLAIN_TYPES = (int, float, complex, str, bytes, slice, type(None), type(...), n
 
 
 def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
-    """Compile as `numba.njit`; with `cache=True` store the code.
+    """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
 
     Args:
         borrows: omit reference counting, which costs two atomic operations per view. The function
-            creates no arrays and receives none from callees; its caller holds the arguments.
+            creates no arrays and receives none from callees; its caller owns the arguments.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not borrows
@@ -56,10 +56,10 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
 
 
 def call_at(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function (address, arguments) that calls a function without result.
+    """Return a compiled function (address, arguments) that calls a function that returns nothing.
 
-    numba inlines a function called by name at every level of the call tree; one called by its
-    `address_of` is compiled once. Exceptions propagate.
+    numba inlines a function called by name at every level of the call tree. A function called by
+    its `address_of` is compiled once. Exceptions propagate.
     """
 
     @intrinsic
@@ -87,7 +87,7 @@ def call_at(arguments: tuple[types.Type, ...]) -> Any:
 
 
 def address_of(function: Dispatcher, arguments: tuple[types.Type, ...]) -> int:
-    """Return the address of a function without result, valid as long as the function."""
+    """Return the address of a function that returns nothing, valid as long as the function."""
     code = function.get_compile_result(types.void(*arguments))._asdict()
     return code["library"].get_pointer_to_function(code["fndesc"].llvm_func_name)
 
@@ -99,7 +99,7 @@ class _Cache(FunctionCache):
 
 
 class _CacheFiles:
-    """Files of one function, one for each signature and processor."""
+    """Cache files of one function, one for each signature and processor."""
 
     def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
         function = dispatcher.py_func
@@ -164,7 +164,7 @@ def fingerprint(dispatcher: Dispatcher) -> str:
 
 @cache
 def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
-    """Return the function's code with its constants, and its callees."""
+    """Return the text of a function's code and constants, and its callees."""
     function = getattr(compiled, "py_func", compiled)
     constants = dict(_referenced_values(function))
     options = getattr(compiled, "targetoptions", {})
@@ -181,13 +181,13 @@ def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
 
 
 def _is_callee(value: Any, package: str) -> bool:
-    """Return whether it is compiled into its caller (also plain `register_jitable` functions)."""
+    """Return whether numba compiles `value`, a function of this package, into its caller."""
     plain = isinstance(value, FunctionType) and value.__module__.partition(".")[0] == package
     return plain or isinstance(value, Dispatcher)
 
 
 def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of globals and closure variables that the code reads."""
+    """Yield name and value of globals and closure variables that a function reads."""
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents
@@ -198,7 +198,7 @@ def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
         for name in names & scope.keys():
             value = scope[name]
             yield f"{scope['__name__']}.{name}", value
-            # `module.function`; other packages change only with their version.
+            # For calls `module.function`; other packages change only with their version.
             ours = isinstance(value, ModuleType) and value.__name__.partition(".")[0] == package
             if ours and all(known is not vars(value) for known in scopes):
                 scopes.append(vars(value))

@@ -1,4 +1,4 @@
-"""Dataclass fields with unit, plausible range and meaning; their checks and list."""
+"""Dataclass fields with unit, plausible range and meaning, and checks of their values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from drake_teleop.common.errors import DrakeTeleopError, field_place, suggestion
 
 KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
-"""Types of values, in words."""
+"""Name of each value type in messages."""
 
 
 def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
@@ -25,7 +25,7 @@ def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
 
     Args:
         unit: SI unit, "1" if dimensionless.
-        low, high: the closed plausible range.
+        low, high: plausible range, limits included.
         doc: meaning, with frame and source.
     """
     metadata = {"unit": unit, "low": low, "high": high, "doc": doc}
@@ -36,19 +36,19 @@ def quantity(default: Any, unit: str, low: float, high: float, doc: str) -> Any:
 
 
 def choice(default: str, choices: Sequence[str], doc: str) -> Any:
-    """Return a dataclass field for one of several words."""
+    """Return a dataclass field for one of the words `choices`."""
     return dataclasses.field(default=default, metadata={"choices": tuple(choices), "doc": doc})
 
 
 def plain(default: Any, doc: str) -> Any:
-    """Return a dataclass field for a flag, word, integer, or a list."""
+    """Return a dataclass field for a flag, word, integer or list."""
     if isinstance(default, list):
         return dataclasses.field(default_factory=lambda: list(default), metadata={"doc": doc})
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
 def in_short(value: Any) -> str:
-    """Return a short text for a message."""
+    """Return a short text of a value for a message."""
     if value is None:
         return "nothing"
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -58,15 +58,15 @@ def in_short(value: Any) -> str:
 
 
 def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False) -> None:
-    """Check parsed YAML against a dataclass before it is loaded.
+    """Check field names and types of parsed YAML against a dataclass.
 
     Args:
-        data: mappings, sequences, scalars; the tag of a variant has the key "_tag".
+        data: mappings, sequences, scalars; the key "_tag" contains a mapping's tag.
         where: `file` or `file:field`.
-        tagged: whether a tag may select one of several kinds.
+        tagged: whether a tag may select one of several dataclasses.
 
     Raises:
-        DrakeTeleopError: for an unknown field, or a value of the wrong kind.
+        DrakeTeleopError: for an unknown field, or a value of the wrong type.
     """
     if not isinstance(data, dict):
         raise DrakeTeleopError(
@@ -86,7 +86,7 @@ def check_structure(schema: type, data: Any, where: str, *, tagged: bool = False
 
 
 def check_name(schema: type, name: Any, where: str) -> None:
-    """Raise DrakeTeleopError, with a similar name, unless the dataclass has this field."""
+    """Raise DrakeTeleopError, with a similar name, if the dataclass has no field `name`."""
     names = _field_names(schema)
     if name not in names:
         remedy = suggestion(name, names, f"fields: {', '.join(names)}")
@@ -97,7 +97,7 @@ def check_ranges(config: Any, where: str) -> None:
     """Check all values of a dataclass, recursively.
 
     Raises:
-        DrakeTeleopError: for another kind or length, or a value outside its range or choices.
+        DrakeTeleopError: for a wrong type or length, or a value outside its range or choices.
     """
     kinds = _field_types(config.__class__)
     for field in dataclasses.fields(config):
@@ -153,7 +153,7 @@ class Kind(NamedTuple):
 
 @functools.cache
 def kind_of(hint: Any) -> Kind:
-    """Return the structure of a type."""
+    """Return the structure of a type hint."""
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
@@ -165,7 +165,7 @@ def kind_of(hint: Any) -> Kind:
 
 
 def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
-    """Check a value; blocks from a file are mappings, and numbers may be words such as 1e-3."""
+    """Check a value's type; in a file a block is a mapping, and 1e-3 may be a string."""
     first = kind.items[0]
     if value is None and kind.optional:
         return
@@ -187,7 +187,7 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
 
 
 def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
-    """Return the dataclass that a tag selects, by default the first."""
+    """Return the dataclass that the value's tag selects, by default the first."""
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -225,16 +225,16 @@ _Class = TypeVar("_Class", bound=type)
 
 @dataclass(frozen=True)
 class FieldInfo:
-    """Description of a field.
+    """Description of a dataclass field.
 
     Attributes:
         kind: "number", "whole number", "true or false", "word" or "block", of the innermost items.
-        lists: number of enclosing lists, 0 for one value.
-        length: of the list; None if any.
-        optional: whether it may be null.
-        unit: "1" for a dimensionless quantity; empty if it is no quantity.
-        low, high: the closed range of a quantity.
-        choices: the allowed words; empty: any.
+        lists: number of nested lists, 0 for one value.
+        length: required length of the list, or None.
+        optional: whether the value may be null.
+        unit: "1" for a dimensionless quantity; empty if the field is no quantity.
+        low, high: range of a quantity, limits included.
+        choices: the allowed words; empty if all are allowed.
         blocks: the allowed dataclasses of a block, selected by a tag such as !Touch.
     """
 
@@ -253,7 +253,7 @@ class FieldInfo:
 
     @property
     def range(self) -> str:
-        """Range with unit, or choices, or kinds of block."""
+        """Text of the allowed range, words or dataclasses."""
         if self.unit:
             unit = "" if self.unit == "1" else f" {self.unit}"
             return f"{self.low:.7g} to {self.high:.7g}{unit}"
@@ -263,7 +263,7 @@ class FieldInfo:
 
     @property
     def text(self) -> str:
-        """Line of a help text."""
+        """Line of a help text for the field."""
         metadata = [self.range] if self.range else []
         if self.default is None or self.kind != "block":
             metadata.append(f"default {_shown(self.default)}")
@@ -271,7 +271,7 @@ class FieldInfo:
 
 
 def settings(block: _Class) -> _Class:
-    """Make a dataclass refuse unknown attributes and list its fields in its help."""
+    """Make a dataclass reject unknown attributes, and list its fields in its docstring."""
     block.__setattr__ = _set_checked_attribute  # type: ignore[assignment]
     wrap = TextWrapper(width=96, initial_indent=" " * 4, subsequent_indent=" " * 8)
     lines = [wrap.fill(entry.text) for entry in fields_of(block)]
@@ -286,9 +286,9 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 
 
 def fields_of(config: Any) -> list[FieldInfo]:
-    """Return the fields of a settings dataclass or of an instance.
+    """Return the descriptions of the fields of a settings dataclass or instance.
 
-    For an inner block call this with its `default`, which depends on the place.
+    For an inner block pass its `default`, which depends on the outer field.
     """
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 

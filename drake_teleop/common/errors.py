@@ -13,20 +13,20 @@ from pathlib import Path
 from threading import RLock
 from typing import Any
 
-_POLARS_PROCESS: list[int] = []  # PID of the first process
+_POLARS_PROCESS: list[int] = []  # PID of the process that first used polars
 
 LONGEST_LINE = 1000
 """Maximum length of an error line of the command line."""
 
 
 class DrakeTeleopError(ValueError):
-    """Unusable input, with a one-line message for the command line.
+    """Error in the input, with a one-line message for the command line.
 
     Programming errors remain ordinary exceptions.
 
     Args:
         where: the place, as ``file:field`` or the name of a port.
-        remedy: what to do.
+        remedy: the action that fixes it.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -37,7 +37,7 @@ class DrakeTeleopError(ValueError):
 
 
 def one_line(text: str, max_length: int = LONGEST_LINE) -> str:
-    """Return the text as one printable line, shortened in its middle."""
+    """Return the text as one printable line; cut out the middle of a long text."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:
         return text
@@ -46,7 +46,7 @@ def one_line(text: str, max_length: int = LONGEST_LINE) -> str:
 
 
 def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = "") -> None:
-    """Raise DrakeTeleopError for argument `where` unless the value is of this kind."""
+    """Raise DrakeTeleopError for argument `where` unless the value has type `kind`."""
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join("None" if one is type(None) else one.__name__ for one in kinds)
@@ -56,7 +56,7 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
 
 @contextmanager
 def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
-    """Convert any error to DrakeTeleopError.
+    """Convert any error while reading a file to DrakeTeleopError.
 
     For damaged files zipfile, numpy and polars raise many different exceptions.
     """
@@ -64,7 +64,7 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
         with silent_stderr():  # a panic in polars writes pages from another thread
             yield
     except BaseException as error:
-        # This panic is a BaseException only.
+        # The PanicException of polars is derived from BaseException only.
         panic = type(error).__name__ == "PanicException"
         if not (panic or isinstance(error, Exception)):
             raise
@@ -88,25 +88,25 @@ def refuse_fork() -> None:
 
 
 def suggestion(name: object, names: Sequence[str], otherwise: str) -> str:
-    """Return the remedy for an unknown name: a similar one, or `otherwise`."""
+    """Return the remedy for an unknown name: a similar name, or `otherwise`."""
     near = difflib.get_close_matches(str(name), names, n=1)
     return f"did you mean '{near[0]}'?" if near else otherwise
 
 
 def install_extra(name: str) -> str:
-    """Return the remedy for a missing library."""
+    """Return the remedy for a missing library: installing the extra `name`."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
 
 def require_library(module: str, library: str, extra: str, where: str) -> None:
-    """Raise DrakeTeleopError unless the library of an extra is installed."""
+    """Raise DrakeTeleopError if the library of an extra is not installed."""
     if importlib.util.find_spec(module) is None:
         what = f"needs the library {library}, which is not installed"
         raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))
 
 
 def field_place(where: str, name: Any) -> str:
-    """Return the place `file:field`, or `file:field.inner`."""
+    """Return the place of a field: `file:field`, or `file:field.inner`."""
     return f"{where}.{name}" if ":" in where else f"{where}:{name}"
 
 
@@ -116,7 +116,7 @@ _lock = RLock()
 
 @contextmanager
 def silent_stderr() -> Iterator[None]:
-    """Redirect the file descriptor of stderr to nowhere."""
+    """Discard all output to stderr, also that of C and Rust code."""
     with _lock:
         try:
             sys.stderr.flush()

@@ -1,6 +1,6 @@
 """Output files, each complete or absent, and folders of shipped files.
 
-A file is written under another name and then renamed, so that failures keep the previous one.
+A file is written under another name and then renamed; after a failure the previous one remains.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ PARTS_OF_LOG = _PART_NAME.format(0).replace("0", "?")
 
 
 class CannotWrite(DrakeTeleopError):
-    """File that cannot be written."""
+    """Error for a file that cannot be written."""
 
 
 @contextmanager
 def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -> Iterator[Path]:
-    """Yield the temporary name to write under; rename it afterwards.
+    """Yield a temporary name to write under; then rename the file to `path`.
 
     Args:
-        aside: path beside the temporary file, if the folder of `path` is read as one table.
+        aside: the temporary file is beside this path; use it if the folder of `path` is read as one
+            table.
         shared: other processes may write the same file now; the temporary name is unique.
             Otherwise it is reused, so that killed processes leave one file only.
 
     Raises:
-        CannotWrite: the file is then unchanged.
+        CannotWrite: if writing fails; `path` is then unchanged.
     """
     place, ending = aside or path, uuid4().hex if shared else "unfinished"
     temporary = place.with_name(f"{place.name}.{ending}")
@@ -78,7 +79,7 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def write_picture(path: Path, figure: Figure, **options: Any) -> None:
-    """Write a figure in the format of the file's ending."""
+    """Write a figure in the format of the file's extension."""
     with whole_file(path) as temporary:
         figure.savefig(temporary, format=path.suffix.removeprefix("."), **options)
 
@@ -86,7 +87,7 @@ def write_picture(path: Path, figure: Figure, **options: Any) -> None:
 def write_table(
     path: Path, table: pl.DataFrame, *, aside: Path | None = None, **options: Any
 ) -> None:
-    """Write CSV, or Parquet for other endings; `options` are for polars."""
+    """Write CSV, or Parquet for other extensions; pass `options` to polars."""
     import polars as pl
 
     refuse_fork()
@@ -102,14 +103,14 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create the output folder of a command; it is complete when `last` exists.
+    """Create the output folder of a command; the output is complete when `last` exists.
 
     Args:
-        last: final file; that of an earlier command is removed first.
+        last: final file; one of an earlier command is removed first.
         kept: earlier files that remain, for the error message.
 
     Raises:
-        CannotWrite: with the files written before.
+        CannotWrite: if writing fails; with the files written before.
     """
     make_folder(out)
     with wrap_write_errors(out / last):
@@ -136,10 +137,10 @@ def make_folder(folder: Path) -> None:
 
 
 def set_aside(*paths: Path) -> Path | None:
-    """Move recordings of a folder into the first absent `earlier-1`, `earlier-2`, ... beside them.
+    """Move existing recordings into a new folder `earlier-1`, `earlier-2`, ... beside them.
 
     Returns:
-        The new folder; None if no file exists.
+        The new folder; None if no recording exists.
 
     Raises:
         CannotWrite: if they cannot be moved.
@@ -157,12 +158,12 @@ def set_aside(*paths: Path) -> Path | None:
 
 
 def part_of_log(folder: Path, first_row: int) -> Path:
-    """Return the file of a part, named after its first row."""
+    """Return the file of a log's part, named after its first row."""
     return folder / _PART_NAME.format(first_row)
 
 
 def remove_log(path: Path) -> None:
-    """Remove a log; raise DrakeTeleopError if its folder contains other files."""
+    """Remove a log (file or folder); raise DrakeTeleopError if the folder has other files."""
     if not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -178,7 +179,7 @@ def remove_log(path: Path) -> None:
 
 
 def _reason(error: OSError) -> str:
-    """Return the system's message without numbers and names, from C or Rust."""
+    """Return the system's message without error number and file name."""
     if found := _RUST_ERROR.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__

@@ -16,11 +16,11 @@ import jinja2
 
 
 def render(package: str, template: str, **values: Any) -> str:
-    """Return the page of a template, which may extend page.html.j2.
+    """Return the page of a Jinja template, which may extend page.html.j2.
 
     Args:
-        package: of the template, such as "drake_teleop.logs".
-        values: variables, escaped; a missing one is an error.
+        package: package of the template, such as "drake_teleop.logs".
+        values: template variables, escaped; a missing one is an error.
     """
 
     def source(name: str) -> str:
@@ -46,7 +46,7 @@ _SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def policy(page: str, host: str = "") -> str:
-    """Return the policy of a page; `host` is its server's "address:port", "" for a file."""
+    """Return a page's security policy; `host` is its server's "address:port", "" for a file."""
     scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

@@ -1,4 +1,4 @@
-"""Random numbers without hidden state: a hash of key and counter."""
+"""Random numbers without hidden state: hashes of key and counter."""
 
 from __future__ import annotations
 

@@ -18,11 +18,11 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
     """Return `value` as a finite float64 array.
 
     Args:
-        name: for the error message.
+        name: argument name for the error message.
         leading: allow further dimensions in front of `shape`.
 
     Raises:
-        DrakeTeleopError: if it is not numeric, has another shape, or is not finite.
+        DrakeTeleopError: if `value` is not numeric, has another shape, or is not finite.
     """
     expected = ", ".join(["..."] * leading + [str(n) for n in shape])
     expected = f"({expected},)" if len(shape) == 1 and not leading else f"({expected})"
@@ -38,7 +38,7 @@ def checked(name: str, value: ArrayLike, *shape: int, leading: bool = False) -> 
 
 
 def numbers(name: str, value: ArrayLike, remedy: str = "") -> Array:
-    """Return a float64 array; raise DrakeTeleopError for complex, masked or other data."""
+    """Return `value` as a float64 array; raise DrakeTeleopError for complex or masked data."""
     try:
         if np.iscomplexobj(value) or np.ma.is_masked(value):
             raise ValueError("complex" if np.iscomplexobj(value) else "masked")
@@ -52,7 +52,7 @@ def checked_rows(**arrays: tuple[ArrayLike, int]) -> tuple[tuple[int, ...], list
     """Return the common leading shape, and each array as a contiguous table (N, n).
 
     Args:
-        arrays: name -> (value (..., n), n).
+        arrays: for each name an array (..., n) and n.
 
     Raises:
         DrakeTeleopError: see `checked`, or if the leading shapes do not match.
@@ -85,7 +85,7 @@ def number(name: str, value: Any) -> float:
 
 
 def check_identified(name: str, phi: Array) -> Array:
-    """Return `phi` (10,); raise DrakeTeleopError if it is zero, as without data."""
+    """Return `phi` (10,); raise DrakeTeleopError if it is zero, that is, unidentified."""
     if not phi.any():
         raise DrakeTeleopError(
             "is zero throughout, so this load is not identified",
@@ -96,7 +96,7 @@ def check_identified(name: str, phi: Array) -> Array:
 
 
 def positive(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return a `checked` array of positive numbers."""
+    """Return a `checked` array; raise DrakeTeleopError unless it is positive."""
     array = checked(name, value, *shape)
     if not (array > 0.0).all():
         raise DrakeTeleopError("is not positive throughout", where=name)
@@ -104,8 +104,8 @@ def positive(name: str, value: ArrayLike, *shape: int) -> Array:
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread; several change the last digits of sums."""
-    import scipy.linalg  # noqa: F401, what comes in later would have its threads
+    """Limit BLAS to one thread; several threads change the last digits of sums."""
+    import scipy.linalg  # noqa: F401 (a BLAS that is loaded later is not limited)
     from threadpoolctl import threadpool_limits
 
     limits: AbstractContextManager[object] = threadpool_limits(1)

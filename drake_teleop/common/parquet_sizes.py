@@ -2,7 +2,7 @@
 
 polars reserves memory for the number of values in a page header. A damaged number, such as -57,
 requests 2^61 bytes, and Rust aborts the process without an exception. `check_parquet` compares
-the numbers of the footer with each other and with the length of the file, and those of each page
+the sizes in the footer with each other and with the length of the file, and those of each page
 with the footer. Call it before each function of polars that reads Parquet.
 
 Format: https://github.com/apache/parquet-format; metadata are structs in Thrift's compact protocol
@@ -20,7 +20,7 @@ _MAGIC = b"PAR1"
 _FOOTER_END = 8  # bytes: length of the footer, and magic
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _REPEATED = 2
-# Types of Thrift.
+# Type codes of Thrift.
 _TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _STRUCT = 1, 2, 3, 7, 8, 12
 _INTEGERS, _LISTS = (4, 5, 6), (9, 10)
 _MAX_DEPTH = 32
@@ -30,13 +30,13 @@ _Struct = dict[int, Any]
 
 
 def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file whose sizes would abort the process.
+    """Reject a Parquet file whose sizes would abort the process.
 
     Args:
         path: one file, not a folder.
 
     Raises:
-        ValueError: with the column and the wrong number.
+        ValueError: for a wrong size; with the column and the number.
         OSError: if the file cannot be opened.
     """
     with path.open("rb") as file:
@@ -47,7 +47,7 @@ def check_parquet(path: Path) -> None:
 
 
 def check_parquet_content(content: bytes | mmap.mmap) -> None:
-    """Refuse the content of such a file; raise ValueError."""
+    """Raise ValueError if sizes in a Parquet file's content are wrong."""
     try:
         _check(content)
     except (IndexError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
@@ -89,7 +89,7 @@ def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
 def _check_column(
     content: bytes | mmap.mmap, end: int, column: _Struct, name: str, rows: int | None
 ) -> None:
-    """Compare the pages of a column in a row group with the footer, which starts at `end`."""
+    """Compare the pages of a column in a row group with the footer, which starts at byte `end`."""
     values = _size(column, 5, f"values in {name}")
     _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
     largest, length = _size(column, 6, f"bytes in {name}"), _size(column, 7, f"bytes in {name}")
@@ -109,7 +109,7 @@ def _check_column(
 
 
 def _values(page: _Struct, length: int, where: str) -> int:
-    """Check the numbers of a page; return the number of values that it adds to its column."""
+    """Check the sizes in a page header; return the number of column values in the page."""
     kind, what = page[1], f"values in {where}"
     if kind == _DATA_PAGE:
         return _size(page[5], 1, what)

@@ -9,23 +9,23 @@ from contextlib import contextmanager
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[..., None]
-"""Called with the completed fraction, 0 to 1, and an optional status text."""
+"""Function that displays a completed fraction, 0 to 1, and an optional status text."""
 Stage: TypeAlias = Callable[[str], Progress]
-"""Starts a stage with a name."""
+"""Function that begins a stage of work by its name, and returns its `Progress`."""
 
 
 def silent(name: str) -> Progress:
-    """Return a stage that shows nothing."""
+    """Return a progress function that shows nothing."""
     return lambda fraction, words="": None
 
 
 @contextmanager
 def show_progress(progress: bool | Stage, *, after: float = 0.0) -> Iterator[Stage]:
-    """Show progress within the context.
+    """Yield a `Stage` that shows progress within the context.
 
     Args:
         progress: whether to show it, or the `Stage` of the caller.
-        after: duration before a bar appears [s].
+        after: time until a bar or line appears [s].
     """
     if callable(progress):
         yield progress

@@ -18,7 +18,7 @@ BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#1A1A1A", "#6B7280"
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 
-#: Resolution of pictures in pages.
+#: Resolution of pictures in HTML pages [dots per inch].
 PAGE_DPI = 160
 
 _STYLE: dict[Any, Any] = {
@@ -62,13 +62,13 @@ class Picture(Figure):
 
 
 def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
-    """Shade the spans of the times t (N,) in which `contact` (N,) is true."""
+    """Shade the time spans in which `contact` (N,) is true; t: (N,) times."""
     for start, stop in contact_spans(t, contact):
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
 
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
-    """Return the spans (start, stop) of `t` in which `contact` (N,) is true."""
+    """Return the time spans (start, stop) in which `contact` (N,) is true; t: (N,) times."""
     times = np.asarray(t, float)
     edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1

@@ -1,8 +1,8 @@
 """YAML and JSON files as plain data, without ambiguity.
 
-YAML has the core schema of version 1.2: `1:30` and `yes` are words, `1e-3` is a number. Repeated or
-non-string keys, integers with leading 0 (octal in YAML 1.1) or beyond 64 bits, and huge files are
-rejected. Tags never execute code.
+YAML has the core schema of version 1.2: `1:30` and `yes` are strings, `1e-3` is a number. Repeated
+or non-string keys, integers with leading 0 (octal in YAML 1.1) or beyond 64 bits, and huge files
+are rejected. Tags never execute code.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _CORE_SCHEMA = (
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's parser with the scalars of YAML 1.2."""
+    """PyYAML's parser with the scalar types of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
@@ -56,7 +56,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's emitter; it quotes texts that are not words in YAML 1.1 and 1.2."""
+    """PyYAML's emitter; it quotes strings that YAML 1.1 or 1.2 reads as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -81,10 +81,10 @@ def read_yaml(path: str | Path, *, tagged: bool = False) -> Any:
     """Return the data of a YAML file.
 
     Args:
-        tagged: allow tags of mappings, such as `!Touch`, returned under "_tag".
+        tagged: allow tags of mappings, such as `!Touch`, returned under the key "_tag".
 
     Raises:
-        DrakeTeleopError: with file, field and line.
+        DrakeTeleopError: for invalid YAML; with file, field and line.
     """
     return yaml_data(read_text(path), str(path), tagged=tagged)
 
@@ -112,7 +112,7 @@ def yaml_text(
 
     Args:
         head: comment lines at the top.
-        comments: comments behind fields, by place, "block.field".
+        comments: comments at line ends, by field, "block.field".
     """
     lines, place, left = [f"# {one_line(text)}" for text in head], list[str](), comments or {}
     for line in yaml_scalar(data, flow=None).splitlines():
@@ -175,7 +175,7 @@ def read_text(path: str | Path) -> str:
 
 
 class _NodeConverter:
-    """Conversion of nodes to data, with a limited number of values."""
+    """Converter of YAML nodes to data, with a limited number of values."""
 
     def __init__(self, tagged: bool) -> None:
         self._tagged = tagged

@@ -1,6 +1,6 @@
-"""Vectors of 3, rotations of 9 numbers (by rows) and unit quaternions for compiled code.
+"""Vectors of 3, rotation matrices of 9 numbers (by rows) and unit quaternions for compiled code.
 
-Nothing is allocated. In Python the functions of vectors accept any scalar of Drake. Sums are
+The functions allocate no memory. In Python those of vectors accept any scalar of Drake. Sums are
 evaluated from left to right. Quaternions are tuples (w, x, y, z).
 """
 
@@ -17,19 +17,19 @@ from drake_teleop.common.compiled import njit
 
 @register_jitable
 def three(x, i):
-    """Return the vector at index i of x."""
+    """Return the vector (3 numbers) at index i of x."""
     return x[i], x[i + 1], x[i + 2]
 
 
 @register_jitable
 def nine(x, i):
-    """Return the rotation at index i of x."""
+    """Return the rotation matrix (9 numbers) at index i of x."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]
 
 
 @register_jitable
 def rows(R):
-    """Return the rotation of a (3, 3) array."""
+    """Return a matrix (3, 3) as a tuple of 9, by rows."""
     return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
 
 
@@ -41,7 +41,7 @@ def transposed(R):
 
 @register_jitable
 def add_into(x, i, a):
-    """Add a to the vector at index i of x."""
+    """Add the vector a to 3 numbers of the array x, from index i."""
     x[i] += a[0]
     x[i + 1] += a[1]
     x[i + 2] += a[2]
@@ -71,7 +71,7 @@ def minus(a, b):
 
 @register_jitable
 def times(k, a):
-    """Return k a, of a number and a vector."""
+    """Return the product k a of a number and a vector."""
     return k * a[0], k * a[1], k * a[2]
 
 
@@ -99,7 +99,7 @@ def plus_cross(c, a, b):
 
 @register_jitable
 def apply(R, a):
-    """Return R a, also for any other 3 x 3 matrix."""
+    """Return the vector R a, for any 3 x 3 matrix R."""
     return (
         R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
         R[3] * a[0] + R[4] * a[1] + R[5] * a[2],
@@ -109,7 +109,7 @@ def apply(R, a):
 
 @register_jitable
 def symmetric(x, i):
-    """Return the matrix of xx, xy, xz, yy, yz, zz at index i of x."""
+    """Return the symmetric matrix of xx, xy, xz, yy, yz, zz at index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
@@ -143,7 +143,7 @@ def solve(M, b, n):
 
 
 def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return [a x] (..., 3, 3) of vectors (..., 3)."""
+    """Return the matrices [a x] (..., 3, 3) of vectors (..., 3)."""
     matrix = np.zeros((*a.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         matrix[..., k, j], matrix[..., j, k] = a[..., i], -a[..., i]
@@ -152,7 +152,7 @@ def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def multiply(a, b):
-    """Return a b; R(a b) = R(a) R(b)."""
+    """Return the quaternion a b; R(a b) = R(a) R(b)."""
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -163,13 +163,13 @@ def multiply(a, b):
 
 @njit(cache=True)
 def conjugate(a):
-    """Return the inverse rotation."""
+    """Return the quaternion of the inverse rotation."""
     return (a[0], -a[1], -a[2], -a[3])
 
 
 @njit(cache=True)
 def rotate(a, v):
-    """Return R(a) v."""
+    """Return the rotated vector R(a) v."""
     axis = three(a, 1)
     t = times(2.0, cross(axis, v))
     return plus_cross(plus(v, times(a[0], t)), axis, t)
@@ -187,7 +187,7 @@ def exponential(v):
 
 @njit(cache=True)
 def logarithm(a):
-    """Return the rotation vector [rad], |v| <= pi; a and -a give the same."""
+    """Return the rotation vector [rad], |v| <= pi; it is equal for a and -a."""
     sine = math.sqrt(a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     scale = 2.0 * math.atan2(sine, abs(a[0])) / sine if sine > 1e-12 else 2.0
     if a[0] < 0.0:
@@ -197,7 +197,7 @@ def logarithm(a):
 
 @njit(cache=True)
 def normalized(a):
-    """Return a / |a|."""
+    """Return the unit quaternion a / |a|."""
     scale = 1.0 / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     return (scale * a[0], scale * a[1], scale * a[2], scale * a[3])
 

@@ -1,1 +1,1 @@
-"""Live drives of a running station, from the browser or by a haptic device."""
+"""Live sessions with a simulated station, driven from the browser or by a haptic device."""

@@ -1,4 +1,4 @@
-"""Forces, energy, contact and warnings of a running station, for the page."""
+"""Forces, energy, contact and warnings of a running station, for the browser page."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _norm_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _columns_at_limit(values, limits):
-    """Return a bit mask of the columns of (n, k) that reach `limits` (k,)."""
+    """Return a bit mask of the columns of values (n, k) that reach `limits` (k,)."""
     found = 0
     for row in range(len(values)):
         for k in range(len(limits)):
@@ -51,9 +51,9 @@ def _columns_at_limit(values, limits):
 
 @njit(cache=True)
 def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
-    """Add the work of new rows to `energy` (2,) [J].
+    """Add the work at hand and tool in new rows to `energy` (2,) [J].
 
-    `before` (4,) is [t, p_WS] of the previous row, nan without one.
+    `before` (4,) is [t, p_WS] of the previous row, nan if there is none.
     """
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     for row in range(len(t)):
@@ -71,7 +71,7 @@ def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Frames of the page. Loops are compiled, as NumPy calls are slow between slices."""
+    """Calculator of the values on the page. Loops are compiled, as NumPy calls are too slow."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
@@ -89,8 +89,8 @@ class Cockpit:
         """Return finite values of at least one new row, for JSON.
 
         "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": of
-        the hand into the device, of the tool into the environment [J]; "tool", "stylus" [m];
-        "words": warnings.
+        the hand into the device, of the tool into the environment [J]; "tool", "stylus": positions
+        [m]; "words": warnings.
         """
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)

@@ -3,7 +3,7 @@
     python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
     python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
 
-A separate process, so that the station cannot delay its safety functions (`device_guard`).
+The client is a separate process, so that the station cannot delay its safety functions.
 """
 
 from __future__ import annotations
@@ -47,21 +47,21 @@ class Device(Protocol):
         """Limits of force, torque and their slew rates."""
 
     def read(self) -> DevicePose | None:
-        """Return the next pose, None after half a second."""
+        """Return the next pose, None if none comes for half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
-        """Display [f; tau] in B [N, N m]."""
+        """Render the wrench [f; tau] in the base frame B [N, N m]."""
 
     def close(self) -> None:
-        """Release the device without force."""
+        """Disconnect the device with zero force."""
 
 
 class Client:
-    """Connection of a device and a station.
+    """Connection of a haptic device and a station.
 
     Attributes:
         guard: safety functions.
-        behind: age of the position that each force answers [s].
+        behind: ages of the positions that the received forces answer [s].
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -75,7 +75,7 @@ class Client:
         self._last_tick: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
-        """Return the displayed wrench after one exchange; None without a pose."""
+        """Exchange pose and force once; return the displayed wrench, None without a pose."""
         pose = self._device.read()
         now = clock()
         self._receive()
@@ -121,13 +121,13 @@ class Client:
             return
 
     def close(self) -> None:
-        """Release the device and close the socket."""
+        """Close the device and the socket."""
         self._device.close()
         self._socket.close()
 
 
 class RealTimeDevice:
-    """Virtual device in real time."""
+    """Virtual device that runs in real time."""
 
     limits = Limits(force=10.0)
 
@@ -143,7 +143,7 @@ class RealTimeDevice:
         if self._due > now:
             time.sleep(self._due - now)
         now = time.perf_counter()
-        if now - self._due > _MAX_LATENESS_S:  # missed ticks are not made up for
+        if now - self._due > _MAX_LATENESS_S:  # missed ticks are skipped
             self._due = self._simulated_until = now
         self.virtual.move(self._wrench[:3], max(now - self._simulated_until, 1e-6))
         self._simulated_until = now
@@ -158,7 +158,7 @@ class RealTimeDevice:
 
 
 def open_device(address: str, grip: str, depth: float) -> Device:
-    """Return the device of an address: `virtual` or haply://HOST:PORT."""
+    """Return the device at an address: `virtual` or haply://HOST:PORT."""
     if address == "virtual":
         return RealTimeDevice(VirtualDevice(tapping(depth), grip))
     if address.startswith("haply://"):
@@ -169,7 +169,7 @@ def open_device(address: str, grip: str, depth: float) -> Device:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run until the time is over, Ctrl-C, or the device disconnects."""
+    """Run the client until the time is over, Ctrl-C, or the device disconnects."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("device", help="virtual, or haply://HOST:PORT")
     parser.add_argument("station", help="udp://127.0.0.1:PORT")

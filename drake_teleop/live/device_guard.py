@@ -1,11 +1,11 @@
 """Safety functions between force commands and the motors of a haptic device.
 
-* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms; its limit then
-  rises by 100 N/s.
+* Timeout: the force fades from 20 ms after the last command and is zero at 50 ms. Afterwards its
+  limit rises from zero by 100 N/s.
 * Limits of force, torque and their slew rates.
-* Passivity observer (Hannaford and Ryu 2002) of the energy E += -f_k . (x_k+1 - x_k), at most
-  0.3 J. A force that would return more than E along the extrapolated displacement is reduced, by
-  at most a damper of 100 N s/m; a reserve of 30 uJ covers the extrapolation error.
+* Passivity observer (Hannaford and Ryu 2002) of the stored energy E += -f_k . (x_k+1 - x_k), at
+  most 0.3 J. A force that would return more than E along the extrapolated displacement is reduced,
+  at most to that of a damper of 100 N s/m; a reserve of 30 uJ covers the extrapolation error.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Limits:
 
 
 class DeviceGuard:
-    """Safety functions of one device.
+    """Safety functions of one haptic device.
 
     Attributes:
-        energy: of the hand into the device since the start [J].
-        slowed: number of forces that the observer has changed.
+        energy: energy from the hand into the device since the start [J].
+        slowed: number of forces that the observer has reduced.
     """
 
     def __init__(self, limits: Limits, *, observe: bool = True) -> None:
@@ -56,9 +56,10 @@ class DeviceGuard:
         """Return the wrench to display (6,) [N, N m].
 
         Args:
-            position: (3,) [m].
-            wrench: (6,) last command [N, N m], with its age [s].
-            period: since the last tick [s].
+            position: (3,) position of the device [m].
+            wrench: (6,) last commanded wrench [N, N m].
+            age: age of this command [s].
+            period: time since the last tick [s].
         """
         x = (float(position[0]), float(position[1]), float(position[2]))
         last = self._position or x

@@ -34,11 +34,11 @@ _CLUTCH_OPEN_S = 0.05
 
 
 class DeviceLink:
-    """UDP link to one device client on this machine; 50 ms of silence admit another one.
+    """UDP link to one device client on this machine; 50 ms of silence admit another client.
 
     Attributes:
         refused: number of invalid packets and packets of other senders.
-        refusal: last reason.
+        refusal: reason of the last refusal.
         lost: number of missing or overtaken packets.
         port: UDP port.
 
@@ -68,7 +68,7 @@ class DeviceLink:
         self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
     def poll(self, now: float) -> DeviceState | None:
-        """Receive waiting packets; return the newest state, None after silence."""
+        """Receive waiting packets; return the newest device state, None after silence."""
         self._polled_at = now
         for _ in range(_MAX_PACKETS):
             try:
@@ -102,7 +102,7 @@ class DeviceLink:
         return now - self._last_arrival > COMMAND_TIMEOUT_S
 
     def send(self, wrench: np.ndarray) -> None:
-        """Answer the newest state with the wrench (6,) [N, N m]."""
+        """Answer the newest device state with the wrench (6,) [N, N m]."""
         if self._state is None or self._peer is None:
             return
         command = ForceCommand(self._state.number, self._state.t, tuple(wrench.tolist()))
@@ -116,7 +116,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the pose; a silent device releases the hand."""
+        """Return the `Inputs` of the device's pose; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -131,7 +131,7 @@ class DeviceLink:
         return values
 
     def figures(self, now: float) -> dict[str, float]:
-        """Return packet rate, losses, and lateness of packets and force [ms]."""
+        """Return packet rate, losses, and lateness of packets and forces [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
@@ -148,7 +148,7 @@ class DeviceLink:
         }
 
     def status_text(self) -> str:
-        """Return the state at the last `poll` in words."""
+        """Return the link's state at the last `poll` in words."""
         if not self.refused:
             return self._lateness_text()
         reason = f"the last one {self.refusal}"
@@ -183,10 +183,10 @@ def _is_loopback(host: str) -> bool:
 
 
 class DeviceConnection:
-    """Link to a haptic device, and its client process if started here.
+    """Link to a haptic device, with the client process of a haply:// address.
 
     Args:
-        address: udp://127.0.0.1:PORT of a client, or haply://HOST:PORT of an Inverse3.
+        address: udp://127.0.0.1:PORT for a client, or haply://HOST:PORT of an Inverse3.
 
     Raises:
         DrakeTeleopError: for another address, or a port in use.
@@ -208,7 +208,7 @@ class DeviceConnection:
             self._client = subprocess.Popen(client, stdout=subprocess.DEVNULL)
 
     def close(self) -> None:
-        """Close the link and end the client."""
+        """Close the link and end the client process."""
         self.link.close()
         if self._client is None:
             return

@@ -2,7 +2,7 @@
 
 Little-endian, without padding, in the device's base frame B. From the device: "DTD1", flags,
 number, time [s], position (3) [m], orientation (4) [w, x, y, z], behind [s]. To the device:
-"DTF1", 0, number and time of the answered packet, [f; tau] (6) [N, N m].
+"DTF1", 0, number and time of the answered packet, wrench [f; tau] (6) [N, N m].
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ CLUTCH_OPEN = 1
 
 
 class DeviceState(NamedTuple):
-    """Pose of a device at a time.
+    """Pose of a haptic device at a time.
 
     Attributes:
-        number: of the packet, increasing.
-        t: on the device's clock [s].
+        number: packet number, increasing.
+        t: time on the device's clock [s].
         position: p_BE [m].
         orientation: R_BE, unit quaternion.
         flags: 0 or `CLUTCH_OPEN`.
-        behind: age of the position that the force answers [s]; 0 without one.
+        behind: age of the position that the force answers [s]; 0 without a force.
     """
 
     number: int
@@ -43,7 +43,7 @@ class DeviceState(NamedTuple):
 
 
 class DevicePose(NamedTuple):
-    """p_BE [m], R_BE [w, x, y, z] and flags of `DeviceState`."""
+    """Position p_BE [m], orientation R_BE [w, x, y, z] and flags of a `DeviceState`."""
 
     position: Sequence[float]
     orientation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ class DevicePose(NamedTuple):
 
 
 class ForceCommand(NamedTuple):
-    """Wrench [f; tau] in B [N, N m] for a state."""
+    """Wrench [f; tau] in B [N, N m], with number and time of the answered state."""
 
     number: int
     t: float
@@ -59,13 +59,13 @@ class ForceCommand(NamedTuple):
 
 
 def packed_state(state: DeviceState) -> bytes:
-    """Return the packet of a state."""
+    """Return the packet of a device state."""
     numbers = (*state.position, *state.orientation, state.behind)
     return _STATE.pack(_FROM_DEVICE, state.flags, state.number, state.t, *numbers)
 
 
 def unpacked_state(packet: bytes) -> DeviceState | None:
-    """Return the state in a packet, None if implausible. Never raises."""
+    """Return the device state in a packet, None if implausible. Never raises."""
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
@@ -75,7 +75,7 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
 def plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
-    """Return the state of position, orientation and `behind`; None if implausible."""
+    """Return the state with `numbers`: position, orientation and `behind`; None if implausible."""
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
@@ -94,7 +94,7 @@ def plausible_state(
 
 
 def refusal(packet: bytes) -> str:
-    """Return why a packet is refused."""
+    """Return the reason why a packet is refused."""
     if len(packet) != _STATE.size:
         length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
         return f"is {length} bytes long, not {_STATE.size}"
@@ -111,7 +111,7 @@ def packed_force(command: ForceCommand) -> bytes:
 
 
 def unpacked_force(packet: bytes) -> ForceCommand | None:
-    """Return the command in a packet, None if invalid. Never raises."""
+    """Return the force command in a packet, None if invalid. Never raises."""
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None
     _, _, number, t, *wrench = _FORCE.unpack(packet)

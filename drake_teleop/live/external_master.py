@@ -1,6 +1,7 @@
 """Master side of a real haptic device, in place of operator, simulated device and force display.
 
-The pose moves to the newest one on a straight line, so that the slave's command has no steps.
+The pose moves to the newest received pose on a straight line, so that the slave's command has no
+steps.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _WRENCH = float(Fault.WRENCH)
 
 @njit(cache=True)
 def _pose_on_path(path, time, out):
-    """Write pose (7,) and twist (6,) at `time` into `out` (13,)."""
+    """Write the pose (7,) and twist (6,) at `time` into `out` (13,)."""
     share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
     r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
     start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
@@ -63,7 +64,7 @@ def _pose_on_path(path, time, out):
 
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
-    """Write the displayed wrench after a period; `limits` (2,) [N, N m]."""
+    """Write wrench, fault and allowed share (8,) after `period` to `now`; `limits`: [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
@@ -85,7 +86,7 @@ def _display_step(wrench, held, period, limits, last, now):
 
 
 class ExternalMaster(LeafSystem):
-    """Haptic device with pose input and force output.
+    """Real haptic device as a system with pose input and force output.
 
     The force fades within 50 ms while released or after a non-finite command, and returns within
     0.25 s.
@@ -99,14 +100,14 @@ class ExternalMaster(LeafSystem):
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - master_state: (12,) position [m], yaw, pitch, roll [rad]; zero speeds
-        - force_to_master: (6,) for the device [N, N m]
+        - force_to_master: (6,) wrench for the device [N, N m]
         - fault_at_hand: a `Fault`
         - displayed_and_fault: the last two side by side
-        - hand_wrench_E: (6,) minus the displayed force
+        - hand_wrench_E: (6,) minus the displayed wrench
 
     Args:
-        start: (7,) X_BE.
-        period: of the hand [s].
+        start: (7,) initial X_BE.
+        period: period of the hand [s].
         limits: (2,) of force and torque [N, N m].
     """
 
@@ -134,7 +135,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Move the device to `target` (7,) X_BE; None releases it."""
+        """Move the device to the pose `target` (7,) X_BE; None releases it."""
         now, path = self._present(context), np.zeros(_PATH)
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
@@ -189,7 +190,7 @@ class ExternalMaster(LeafSystem):
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return a master side of a real device, like `MakeLiveMasterSide`."""
+    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])

@@ -1,7 +1,7 @@
-"""The Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
+"""Haply Inverse3 at the websocket of Haply's service on this machine (Inverse Service 3).
 
 Messages are JSON: `inverse3[0].state.cursor_position` {x, y, z} [m], and the grip's
-`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. Each is answered by
+`state.orientation` {w, x, y, z} and `state.buttons` {a, b, c}. Each message is answered by
 `inverse3[0].commands.set_cursor_force.values`. Axes: x right, y forward, z up. Button a opens the
 clutch. Tested only with a virtual service, not with the device.
 """
@@ -23,7 +23,7 @@ _GRIPS = ("wireless_verse_grip", "verse_grip", "wired_verse_grip", "custom_verse
 
 
 class Message(NamedTuple):
-    """Name of a device, and its state in B."""
+    """Content of a message: name of the device, and its state in B."""
 
     device: str
     state: DeviceState
@@ -52,7 +52,7 @@ def read_message(text: Any) -> Message | None:
 
 
 def force_message(device: str, wrench: Sequence[float]) -> str:
-    """Return the message that displays the force of a wrench in B."""
+    """Return the message that displays the force of a wrench [f; tau] in B."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(
@@ -67,7 +67,7 @@ def _number(value: Any) -> float:
 
 
 class HaplyDevice:
-    """Inverse3 at haply://HOST:PORT.
+    """Haply Inverse3 at haply://HOST:PORT.
 
     Raises:
         DrakeTeleopError: if the service does not answer.

@@ -1,7 +1,7 @@
-"""Inputs of a driver as integers, so that the record is exactly the simulated input.
+"""Inputs of a live session as integers, so that the record is exactly the simulated input.
 
-`inputs.csv` has a row for each change, with its time [ms] and choices by name. The last row is the
-end. A comment contains versions on which the motion depends.
+The file `inputs.csv` has a row for each change, with its time [ms] and choices by name. The last
+row is the end. A comment contains versions on which the motion depends.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ SENSORS = (OWN, *SENSOR_PRESETS)
 #: Names of each choice; a choice is the index of its name.
 NAMES = {"network": NETWORKS, "method": METHODS, "grip": tuple(GRIPS), "sensor": SENSORS}
 
-#: File of a drive's inputs.
+#: Name of the file with the inputs of a recorded drive.
 INPUTS = "inputs.csv"
 #: Length of a slice [ms]; inputs change between slices.
 SLICE_MS = 5
 LENGTH, ANGLE = 1e-5, 1e-4  #: units of position [m] and rotation [rad]
 _SHARE_UNIT, _SCALE_UNIT = 1e-2, 1e-5
-MAX_DURATION_MS = 36_000_000  # ms; ten hours, as of a scenario
+MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def initial_choices(scenario: Scenario) -> dict[str, int]:
@@ -67,7 +67,7 @@ class Inputs:
         sigma: scale of the gripper's (or whole) non-contact wrench [%].
         sigma_object: scale of a gripped object's non-contact wrench [%].
         gamma: scale of the contact wrench [%].
-        force_scale: slave to master [1e-5].
+        force_scale: scale from slave to master force [1e-5].
         network, method, grip, sensor: index into `NAMES`.
         delay, jitter, loss: of the network "custom" [0.1 ms, %, 0.1 %].
         object: 1 with a gripped object.
@@ -107,7 +107,7 @@ class Inputs:
         return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """Return inputs with new values, clipped, without non-finite ones."""
+        """Return inputs with new values, clipped to `RANGES`; ignore non-finite values."""
         changes = {}
         for name in values.keys() & RANGES.keys():
             value, (low, high) = values[name], RANGES[name]
@@ -122,25 +122,25 @@ class Inputs:
 
     @property
     def station(self) -> tuple[int, ...]:
-        """Inputs on which the station depends."""
+        """Inputs whose change requires another station."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
 
     @property
     def channel(self) -> tuple[int, ...]:
-        """Inputs on which channel and passivity method depend."""
+        """Inputs that determine channel and passivity method."""
         return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
-        """Return the intended X_BE (7,) for a start position (3,) [m]; None if released."""
+        """Return the intended pose X_BE (7,); None if released. `start`: (3,) position [m]."""
         if not self.held:
             return None
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
-        """Return inputs that hold the stylus at `pose` (7,) X_BE."""
+        """Return inputs that hold the stylus at the pose `pose` (7,) X_BE."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -183,7 +183,7 @@ _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the first lines, with versions and digests by name."""
+    """Return the file's first lines, with versions and digests by name."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
@@ -196,10 +196,10 @@ def row(ms: int, inputs: Inputs) -> str:
 
 
 def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple[int, Inputs]]:
-    """Return the changes with their times [ms]; the last one is the end.
+    """Return the recorded changes with their times [ms]; the last one is the end.
 
     Raises:
-        DrakeTeleopError: with file and line; or if the drive cannot be repeated exactly.
+        DrakeTeleopError: for an invalid line; or if the drive cannot be repeated exactly.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]

@@ -1,6 +1,7 @@
-"""A drive with its driver and spectators, independent of page and clock.
+"""Live session with one driving page and spectators, independent of web server and clock.
 
-Without a driver the hand lets go, and after 0.25 s the simulation stops with a complete record.
+Without a driver the hand releases the stylus. After 0.25 s the simulation stops with a complete
+record.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ FRAME = 1 / 60
 _MIN_FRAME_PERIOD_S = 0.25 * FRAME  # s, shortest time between two frames
 #: Smallest contact force at the hand that a gamepad displays [N].
 TOUCH_FORCE_N = 0.12
-# Time without a driver until the simulation stops [s]; most slices between two polls of messages.
+# Time without a driver until the simulation stops [s]; maximum number of slices between two polls
+# of messages.
 _SLEEP_AFTER_S, _SLICES_PER_TICK = 0.25, 4
 _MIN_REMOVED_FORCE_N = 0.05  # N, smallest removed force that the page reports
 _RELEASED = {"held": 0, "clutch": 0}
@@ -50,21 +52,21 @@ MAX_SLOWDOWN = 20.0
 
 
 class Live:
-    """Event handler of a drive: messages of pages and ticks of a clock.
+    """Event handler of a live session: messages of pages and ticks of a clock.
 
     Attributes:
         refused: number of invalid messages.
         stopped: failure that stops the simulation, or "".
-        requested_scene: of a page, or ""; the simulation waits for `change_scene`.
+        requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
         scene: present scene.
         pace: timing of the slices.
         recorded: folders of completed drives.
 
     Args:
-        record: folder, or if it is not empty the next free one; None for none.
-        show: returns the scene's part of a frame.
-        now: the clock [s].
-        link: to a haptic device; None for a page's hand.
+        record: folder, or if it is not empty the next free one; None for no record.
+        show: function that returns the scene's part of a frame.
+        now: time of the clock [s].
+        link: link to a haptic device; None for a page's hand.
         begin: initial inputs.
     """
 
@@ -119,7 +121,7 @@ class Live:
     def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
     ) -> None:
-        """Start a drive of the requested scene."""
+        """Start a new drive with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
         self._restart(now)
@@ -132,12 +134,12 @@ class Live:
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
-        """Continue the present scene, and report why."""
+        """Continue the present scene, and show the reason `why`."""
         self.requested_scene, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the scenario's constants for a page."""
+        """Return the constants of the scenario for a page."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
@@ -153,18 +155,18 @@ class Live:
         }
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first one drives."""
+        """Add a page; the first page drives."""
         if self._driver is None:
             self._set_driver(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; the driver's hand lets go."""
+        """Remove a page; the driver's hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count an invalid one."""
+        """Handle a message of a page; count invalid messages."""
         message = parse(text)
         if message is None:
             self.refused += 1
@@ -210,12 +212,12 @@ class Live:
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice or frame [s]."""
+        """Return the time until the next simulation slice or frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate at most four due slices; return a due frame."""
+        """Simulate at most four due slices; return a due frame, else None."""
         for _ in range(_SLICES_PER_TICK):
             now = clock()
             if self.is_idle or self.pace.wait(now) > 0:
@@ -245,7 +247,7 @@ class Live:
             self.pace.start(now)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Run an action; a failure stops the drive."""
+        """Run an action; if it fails, stop the simulation with the error in `stopped`."""
         try:
             action()
         except _FAILURES as error:
@@ -282,7 +284,7 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return the present frame for pages."""
+        """Return the values that pages show now (a frame)."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
@@ -325,7 +327,7 @@ class Live:
         """Complete the record.
 
         Raises:
-            CannotWrite: if that fails.
+            CannotWrite: if writing fails.
         """
         try:
             self._session.close()
@@ -337,7 +339,7 @@ class Live:
         self._folder = ""
 
     def close(self) -> None:
-        """End the drive and the device link.
+        """End the session and close the device link.
 
         Raises:
             CannotWrite: if any record is incomplete.
@@ -350,7 +352,7 @@ class Live:
 
 
 def _free_folder(folder: Path) -> Path:
-    """Return the folder if absent or empty, else DIR-2, DIR-3, ..."""
+    """Return the folder if absent or empty, else a new DIR-2, DIR-3, ..."""
     folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
@@ -359,7 +361,7 @@ def _free_folder(folder: Path) -> Path:
 
 
 def parse(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a message; None without any.
+    """Return the valid requests of a page's message; None if there are none.
 
     "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
     """

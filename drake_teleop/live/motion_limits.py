@@ -1,7 +1,7 @@
 """Rate inputs of keys and sticks, and motion limits, in simulated time.
 
-In slow motion a hand could otherwise saturate the wrist sensor, and be rendered forces in free
-motion.
+Without limits, a hand in slow motion could saturate the wrist sensor, and forces would be rendered
+in free motion.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of rates per simulated second."""
+    """Integrator of input rates per simulated second."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -29,7 +29,7 @@ class RateInputs:
         self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Return the inputs at new rates by name; rates end 1 s after their repetition."""
+        """Return the inputs at new rates by name; rates end 1 s after their last repetition."""
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
@@ -37,7 +37,7 @@ class RateInputs:
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
-        """Return the inputs of the next slice."""
+        """Return the inputs of the next simulation slice."""
         if not self._rates:
             return inputs
         if now > self._end_time:
@@ -51,11 +51,11 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limits of the target's speed, and for a device of its acceleration.
+    """Limiter of the target's speed, and for a device of its acceleration.
 
     Args:
         slice_s: period [s].
-        scales: slave over master, of translation and rotation.
+        scales: slave over master motion, for translation and rotation.
     """
 
     def __init__(self, slice_s: float, scales: tuple[float, float], *, device: bool) -> None:
@@ -97,7 +97,7 @@ class _Axis:
         return self._at
 
     def _braking(self, distance: float) -> float:
-        """Return v with v + (v - change) + (v - 2 change) + ... = distance."""
+        """Return the speed v with v + (v - change) + (v - 2 change) + ... = distance."""
         if self._change == math.inf:
             return distance
         root = math.sqrt(self._change**2 + 8.0 * self._change * distance)

@@ -13,11 +13,11 @@ _STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
-    """Schedule of the slices [s].
+    """Schedule of the simulation slices.
 
     Attributes:
         slow: clock time per simulated time.
-        given_up: lost time [s].
+        given_up: lost time that is not caught up [s].
     """
 
     def __init__(self, slice_s: float, now: float) -> None:
@@ -28,12 +28,12 @@ class Pace:
         self.start(now)
 
     def start(self, now: float) -> None:
-        """Make the next slice due now."""
+        """Make the next slice due at time `now`."""
         self._due = now
         self._starts.clear()
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice [s]."""
+        """Return the time until the next slice is due [s]."""
         return self._due - now
 
     def begin(self, now: float) -> None:
@@ -48,13 +48,13 @@ class Pace:
 
     @property
     def factor(self) -> float:
-        """Simulated over elapsed time of 400 slices; 0 at first."""
+        """Simulated over elapsed time of the last 400 slices; 0 at first."""
         if len(self._starts) < 2 or self._starts[-1] <= self._starts[0]:
             return 0.0
         return (len(self._starts) - 1) * self._slice / (self._starts[-1] - self._starts[0])
 
     def lateness(self) -> float:
-        """Return the 99 % quantile of lateness [s]."""
+        """Return the 99 % quantile of the slices' lateness [s]."""
         return (
             sorted(self._lateness)[(99 * len(self._lateness) - 1) // 100] if self._lateness else 0.0
         )
@@ -62,7 +62,7 @@ class Pace:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable the garbage collector, which takes ten slices."""
+    """Disable the garbage collector, which takes the time of ten slices."""
     gc.collect()
     gc.freeze()
     gc.disable()

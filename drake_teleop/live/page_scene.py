@@ -1,6 +1,6 @@
-"""3D scene of a drive for its page: the objects once, then their poses.
+"""3D scene of a live session for its page: the objects once, then their poses.
 
-Meshcat is closed before the drive listens: malformed input from any page would end the process.
+Meshcat is closed before the server listens: malformed input from any page would end the process.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _FILE = re.compile(r'^casAssets\["([^"]*)"\] = "([^"]*)";$', re.M)
 
 
 class PageScene:
-    """3D scene of a scenario; its failure does not end the drive.
+    """3D scene of a scenario; its failure does not end the session.
 
     Attributes:
-        name: in the page's addresses.
+        name: name in the page's addresses.
         objects: JSON {"commands": [base64], "files": {address: data URL}}.
-        failure: why there is no scene, or "".
+        failure: reason if there is no scene, or "".
     """
 
     def __init__(self, name: str, scenario: Scenario, *, forces: bool = True) -> None:
@@ -52,7 +52,7 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return the scene's part of a frame at the last row.
+        """Return the scene's part of a frame, at the last row.
 
         "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
         """
@@ -76,7 +76,7 @@ class PageScene:
 
 
 class _Moves:
-    """Recorder with the interface of Meshcat."""
+    """Recorder of poses with the interface of Meshcat."""
 
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}

@@ -42,10 +42,10 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """Folder of a drive without its log.
+    """Folder of a recorded drive without its log.
 
     Raises:
-        CannotWrite: if it contains a drive, or the disk is full.
+        CannotWrite: if the folder contains a drive, or the disk is full.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Record:
     ) -> None:
         make_folder(folder)
         self._folder, path, self._last = folder, folder / INPUTS, ""
-        with wrap_write_errors(path):  # mode x never overwrites another drive
+        with wrap_write_errors(path):  # mode x never overwrites another recorded drive
             self._file: TextIOWrapper = path.open("x", encoding="utf-8", newline="\n")
         try:
             write_scenario(folder / SCENARIO, scenario)
@@ -74,7 +74,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write a change at once, which survives a kill."""
+        """Write changed inputs at once, so that they survive a kill."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -86,7 +86,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end; remove the record of a drive that never started."""
+        """Write the end; remove the record if no time was simulated."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)
@@ -103,7 +103,7 @@ class Record:
 
 
 class LogBeside(LogOnDisk):
-    """Log on a thread, which waits for the disk only in `finish` and the next part."""
+    """Log written by a thread; only `finish` and the next part wait for the disk."""
 
     def __init__(
         self,
@@ -120,7 +120,7 @@ class LogBeside(LogOnDisk):
         """Wait until all rows are on the disk.
 
         Raises:
-            DrakeTeleopError: if that fails.
+            DrakeTeleopError: if writing fails.
         """
         self._writing.result()
 
@@ -130,5 +130,5 @@ class LogBeside(LogOnDisk):
 
 
 def _import_polars() -> None:
-    """Import polars on the thread, which takes 0.1 s."""
+    """Import polars on the thread, because that takes 0.1 s."""
     import polars  # noqa: F401

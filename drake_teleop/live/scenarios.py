@@ -1,4 +1,4 @@
-"""Scenarios of a drive: scenes of the page, and results of the driver's choices."""
+"""Scenarios of a live session: scenes of the page, and results of the driver's choices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CROSS_FADE_S = 0.25
 _MIN_ROTATIONAL_IMPEDANCE = 0.5
 _DELAY_UNIT_S, _JITTER_UNIT, _LOSS_UNIT = 1e-4, 1e-2, 1e-3
 
-#: Shipped scenario of each scene; "own" is the scenario of the drive.
+#: Shipped scenario of each scene; "own" is the scenario of the user.
 _SHIPPED = {
     "leaf": "touch",
     "slot": "peg_in_slot",
@@ -44,7 +44,7 @@ SCENES = ("own", *_SHIPPED)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return a scenario without intent, task and settling, with error-controlled steps."""
+    """Return the scenario with intent, task and settling removed and error-controlled steps."""
     return replace(
         scenario,
         operator__intent=[],
@@ -64,7 +64,7 @@ def with_device(scenario: Scenario) -> Scenario:
 
 
 def scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of one of `SCENES`."""
+    """Return the scenario of a scene in `SCENES`."""
     if name == "own":
         return own
     scenario = LoadScenario(_SHIPPED[name])
@@ -76,7 +76,7 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices; detection needs a known noise floor."""
+    """Return the scenario with all choices; contact detection needs a noise floor."""
     changes: dict[str, object] = {
         "passivity__method": METHODS[inputs.method],
         "operator__grip": list(GRIPS)[inputs.grip],
@@ -119,14 +119,14 @@ def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
 
 
 def _object_phi(scenario: Scenario) -> Array:
-    """Return phi (10,) of the object, about So in S."""
+    """Return the load parameters (10,) of the object, about So in S."""
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
 def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) for the masses and the tared sensor of `now`."""
+    """Return the load estimate (16,) adapted to load and sensor offsets of the scenario `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
@@ -142,7 +142,7 @@ def _sensor_offset(scenario: Scenario) -> Array:
 
 
 def fill_time(scenario: Scenario) -> float:
-    """Return the time until a new channel delivers all packets [s]."""
+    """Return the time until a new channel's packets arrive, also the most delayed [s]."""
     if scenario.is_direct:
         return 0.0
     return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME

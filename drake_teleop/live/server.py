@@ -1,6 +1,6 @@
-"""Server of `drake-teleop drive`: one page on this machine and its socket.
+"""Server of `drake-teleop drive`: one page on this machine and its websocket.
 
-One port of 127.0.0.1 serves clients with the token of the address; the socket only this page.
+One port of 127.0.0.1 serves clients with the token of the address; the websocket only this page.
 """
 
 from __future__ import annotations
@@ -61,12 +61,12 @@ _LOGGER.addFilter(lambda record: record.msg == "connection handler failed")
 
 
 class LiveDrive:
-    """A drive on its own thread.
+    """Live session and its server on a thread.
 
     Attributes:
-        url: of the page, with its token.
+        url: address of the page, with its token.
         recorded: folders of completed drives.
-        ended: after the end, why the simulation had stopped, or "".
+        ended: after the end, the failure that stopped the simulation, or "".
         ms: after the end, simulated time [ms].
     """
 
@@ -116,7 +116,7 @@ class LiveDrive:
         progress(1.0)
 
     def wait(self) -> None:
-        """Wait for the end, by `stop` or Ctrl-C.
+        """Wait for the end of the session, by `stop` or Ctrl-C.
 
         Raises:
             DrakeTeleopError: if the record is incomplete.
@@ -146,13 +146,13 @@ class LiveDrive:
             raise self._failed
 
     def stop(self) -> None:
-        """End the drive and complete its record."""
+        """End the session and complete its record."""
         self._stop.set()
         for thread in self._threads:
             thread.join()
 
     def _end(self) -> None:
-        """Stop within 4 s; Python may crash at its exit while compiled code runs."""
+        """Stop all threads within 4 s; Python may crash at exit while compiled code runs."""
         self._stop.set()
         end = time.monotonic() + _END_TIMEOUT_S
         for thread in self._threads:
@@ -240,7 +240,7 @@ class LiveDrive:
                 await self._sleep()
 
     async def _sleep(self) -> None:
-        """Wait until the next event, then handle messages."""
+        """Wait until the next slice or frame, then handle messages."""
         rest = self._live.wait(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
@@ -290,7 +290,7 @@ class LiveDrive:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Serve a file or open a socket, only for our page."""
+        """Serve a file or open the websocket, only for clients with the token."""
         host = f"{_HOST}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
@@ -344,7 +344,7 @@ class LiveDrive:
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
-    """Return the load with its noise floor, None if it is estimated online."""
+    """Return the identified load with its noise floor, None if it is estimated online."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -352,7 +352,7 @@ def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | Non
 
 
 def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile the functions of the first slices, a minute once."""
+    """Compile the functions of the first slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.frame(session.new_rows(), session.inputs)
@@ -384,15 +384,15 @@ def drive(
     browser: bool = False,
     device: str | None = None,
 ) -> LiveDrive:
-    """Drive a station in the browser: its hand by mouse, keys, gamepad or touch.
+    """Drive a station in the browser: move its hand by mouse, keys, gamepad or touch.
 
-    `wait()` returns at the end of the drive, `stop()` ends it. A notebook shows the page as the
+    `wait()` returns at the end of the session, `stop()` ends it. A notebook shows the page as the
     value of this call; elsewhere open its `url`.
 
     Args:
-        scenario: or a shipped name, or a YAML file; its operator gives only the grip.
-        record: folder for `run --inputs`; None for none.
-        port: of the page on 127.0.0.1; 0 for any free port.
+        scenario: scenario, shipped name, or YAML file; its operator specifies only the grip.
+        record: folder for `run --inputs`; None for no record.
+        port: TCP port of the page on 127.0.0.1; 0 for any free port.
         browser: whether to open the page.
         device: haptic device: udp://127.0.0.1:PORT of a client, or haply://localhost:10001.
 
@@ -414,7 +414,7 @@ def drive_command(
     """Run `drake-teleop drive` until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: as `drive`, or for a stopped drive or incomplete record.
+        DrakeTeleopError: as `drive`, or for a stopped simulation or incomplete record.
     """
     live = drive(scenario, record=record, port=port, browser=browser, device=device)
     print(f"drive it at {live.url}\n{start_condition(device)}; Ctrl-C ends it", flush=True)
@@ -427,10 +427,9 @@ def drive_command(
 
 
 def start_condition(device: str | None) -> str:
-    """Return for which event a drive waits."""
+    """Return the event for which the simulation waits, in words."""
     return "the simulation waits until this page is open" + _OR_DEVICE[device is not None]
 
 
 def _print_note(text: str) -> None:
-    """Print on stderr, not on a page."""
     print(text, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""A station that runs in slices and takes its inputs between them.
+"""Station that is simulated in slices of time and takes its inputs between them.
 
 The motion depends on the inputs alone: `Drive.repeat` gives the same log for any slices.
 """
@@ -50,7 +50,7 @@ _NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Bound the steps of error control by `shortest` [s]; keep them for 4 ms after a rejection.
+    """Bound the steps of error control by `shortest` [s]; keep this step 4 ms after a rejection.
 
     A bouncing tool makes error control reject two of five steps, which takes time.
     """
@@ -93,11 +93,12 @@ def with_all_signals(log: SimulationResult) -> SimulationResult:
 
 
 class _Station:
-    """A running station; `number` in the drive is added to its seed.
+    """Running station.
 
     Args:
         estimate: load estimate (16,).
-        load: with the noise floor.
+        load: identified load with the noise floor.
+        number: number of the station in the session; it is added to the seed.
     """
 
     def __init__(
@@ -172,18 +173,18 @@ class _Station:
 
 
 class Session:
-    """A running station with a hand that follows inputs.
+    """Running station with a hand that follows inputs.
 
     Attributes:
-        scenario: of the drive.
-        inputs: in force now.
+        scenario: initial scenario.
+        inputs: present inputs.
         ms: simulated time [ms].
 
     Args:
-        load: None if it is estimated online.
-        log: folder; None keeps rows in memory until `new_rows` returns them.
+        load: identified load; None if it is estimated online.
+        log: folder of the log; None keeps rows in memory until `new_rows` returns them.
         record: folder of scenario, load and inputs; None for none.
-        device: whether positions are those of a haptic device.
+        device: whether the positions are those of a haptic device.
     """
 
     def __init__(
@@ -214,7 +215,7 @@ class Session:
         """Set and record the inputs from now on.
 
         Raises:
-            DrakeTeleopError: if there is no such station; then nothing has changed.
+            DrakeTeleopError: if no such station is possible; then nothing has changed.
         """
         before = self.inputs
         if inputs == before:
@@ -296,15 +297,15 @@ class Session:
         return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
-        """Return inputs of a hand that takes the stylus."""
+        """Return inputs of a hand that takes the stylus at its present pose."""
         return self.inputs.holding(self._station.value("pose_master"), self._start)
 
     def force(self) -> NDArray[np.float64]:
-        """Return the wrench (6,) for the device [N, N m]."""
+        """Return the wrench (6,) for the haptic device [N, N m]."""
         return self._station.value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force that a new channel's limit removes [N]."""
+        """Return the force that the limit after a channel change removes [N]."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block("cross_fade")
@@ -322,14 +323,14 @@ class Session:
         return with_all_signals(read_log(self._station.simulator, 0.0))
 
     def log(self) -> SimulationResult:
-        """Return the rows in memory."""
+        """Return the log in memory."""
         parts = [*self._earlier_rows, self._rows()]
         values = {name: np.concatenate([p[name] for p in parts]) for name in parts[0].signals}
         t = np.concatenate([part.t for part in parts])
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """End the record; remove that of a drive that never started."""
+        """End the record; remove the record if no time was simulated."""
         record, self._record = self._record, None
         try:
             if record is not None:
@@ -341,10 +342,10 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A recorded drive.
+    """Recorded drive.
 
     Attributes:
-        changes: of the inputs, with their times [ms]; the last is the end.
+        changes: changed inputs with their times [ms]; the last is the end.
         device: whether a haptic device was the hand.
     """
 
@@ -357,10 +358,10 @@ class Drive:
     def repeat(
         self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the drive again and return its log, bit by bit.
+        """Simulate the drive again and return its log, equal bit by bit.
 
         Args:
-            log: its folder; None for memory.
+            log: folder of the log; None for memory.
             slice_ms: longest step between changes [ms].
         """
         session = Session(self.scenario, self.load, log=log, device=self.device)
@@ -378,7 +379,7 @@ def read_drive(folder: str | Path) -> Drive:
     """Return the recorded drive in a folder.
 
     Raises:
-        DrakeTeleopError: with the invalid file.
+        DrakeTeleopError: for an invalid file.
     """
     folder = Path(folder)
     scenario = LoadScenario(folder / SCENARIO)

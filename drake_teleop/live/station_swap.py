@@ -1,6 +1,6 @@
 """Transfer of a station's state to another station, by block names.
 
-Random numbers, and a changed channel, start anew.
+Random numbers, and a changed channel, restart.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from drake_teleop.common.compiled import njit
 
 Array = NDArray[np.float64]
 
-#: Blocks whose parameters change during a drive.
+#: Blocks whose parameters change during a live session.
 _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 
 
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy states and changeable parameters of `before` to `station`.
+    """Copy states and changeable parameters of the station `before` to `station`.
 
     Args:
-        then, context: of the two stations.
-        excluded: block names.
+        then, context: contexts of the two stations.
+        excluded: names of blocks that are not copied.
     """
     context.SetTime(then.get_time())
     sources = dict(_blocks(before))
@@ -84,14 +84,14 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 @njit(cache=True)
 def _weight(change, time):
-    """Return the weight of the new wrench, 0 to 1."""
+    """Return the weight of the new wrench in a cross-fade, 0 to 1."""
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 @njit(cache=True)
 def _cross_fade_into(wrench, before, share, most, out):
-    """Write the cross-fade (6,) with a force of at most `most` [N]."""
+    """Write the cross-faded wrench (6,), with a force of at most `most` [N]."""
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
     force = _force(out)
@@ -113,7 +113,7 @@ def add_cross_fade(builder: DiagramBuilder, port: InputPort, period: float) -> I
 
 
 class CrossFade(LeafSystem):
-    """Cross-fade of the rendered wrench from a previous station.
+    """Cross-fade from the rendered wrench of a previous station.
 
     .. pydrake_system::
 
@@ -139,13 +139,13 @@ class CrossFade(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
-        """Cross-fade from `rendered` (6,) within `length` [s] from `start` [s]."""
+        """Cross-fade from the wrench `rendered` (6,) within `length` [s] from `start` [s]."""
         change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
 
     def Limit(self, context: Context, most: float) -> None:
-        """Limit the force to `most` [N] until the wrench was once below."""
+        """Limit the force to `most` [N] until the new wrench is at most that large."""
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:

@@ -14,16 +14,16 @@ _STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
-    """Light device of given mass [kg] and damping [N s/m] in a moving hand.
+    """Simulated light device of given mass [kg] and damping [N s/m] in a moving hand.
 
     Attributes:
-        position: [m].
-        velocity: [m/s].
-        energy: of device and hand into the port [J].
+        position: device position [m].
+        velocity: device velocity [m/s].
+        energy: work of device and hand against the force [J].
 
     Args:
-        hand: intended position [m] and velocity [m/s] at a time [s].
-        grip: of `GRIPS`.
+        hand: function from time [s] to intended position [m] and velocity [m/s].
+        grip: name in `GRIPS`.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion from `lift` to -`depth` [m] and back, with a share `hold` below."""
+    """Return a hand motion from `lift` to -`depth` [m] and back; `hold`: share of time below."""
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

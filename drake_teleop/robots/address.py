@@ -1,4 +1,4 @@
-"""Addresses of robots: kind://HOST[:PORT][?name=value&...]."""
+"""Addresses of robots and sensors: kind://HOST[:PORT][?name=value&...]."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """Return 1 for the wrench of sensor on load, Eq. (1); -1 (default) for the opposite."""
+        """Return the factor to the wrench of sensor on load, Eq. (1): 1, or -1 (default)."""
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(f"sign={text!r} is neither 1 nor -1", where=self.text)

@@ -1,6 +1,6 @@
 """Readings that combine the wrench of one stream with the motion of another.
 
-Motions are derivatives of poses (docs/robot.md, "Methods").
+The motion contains derivatives of poses (docs/robot.md, "Methods").
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One or two sources as one; raise DrakeTeleopError if there is no motion.
+    """One or two sources of parts as one source; raise DrakeTeleopError if none has motion.
 
     Attributes:
         motion_stream: stream of the motion: poses if available, else an IMU.
@@ -66,7 +66,7 @@ class Parts:
             )
 
     def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
-        """Return parts with their times of arrival."""
+        """Return received parts with their times of arrival [s]."""
         found: list[tuple[Part, float]] = []
         if self._motion is not None:
             motions, now = self._motion.read(0.0) or (), time.monotonic()
@@ -86,18 +86,18 @@ class Parts:
 
 
 class SensorPoseOfJoints(Protocol):
-    """Kinematics of an arm, such as `station.slave.plant.Arm`."""
+    """Interface of an arm's kinematics, such as `station.slave.plant.Arm`."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names from the base outwards."""
+        """Joint names from the base outwards."""
 
     def pose(self, q: Array) -> Array:
-        """Return the pose X_WS (7,) at q (n,), as [w x y z, position]."""
+        """Return the sensor's pose X_WS (7,) at joint positions q (n,): [w x y z, position]."""
 
 
 class PosedByJoints:
-    """Source that converts joint positions to poses of S."""
+    """Source that converts joint positions to poses of the sensor frame S."""
 
     def __init__(self, source: PartSource, arm: SensorPoseOfJoints) -> None:
         self._source, self._arm, self.dt = source, arm, source.dt
@@ -125,12 +125,12 @@ class PosedByJoints:
 
 
 class MotionWindow:
-    """Motions of S from poses of a frame F, or from IMU samples, on a uniform grid.
+    """Motions of the sensor frame S on a uniform time grid, from poses of a frame F or IMU samples.
 
     Args:
-        cutoff_hz: None for the shortest window.
+        cutoff_hz: cut-off of the smoothing; None for the shortest window.
         X_FS: (7,) pose of the sensor in F.
-        gravity_W: (3,) [m/s^2].
+        gravity_W: (3,) gravity [m/s^2].
     """
 
     def __init__(self, cutoff_hz: float | None, X_FS: Array, gravity_W: Array = _GRAVITY) -> None:
@@ -155,7 +155,7 @@ class MotionWindow:
             self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return times and motions (9,) that are complete with a sample received at `now`."""
+        """Return times and motions (9,) that a sample received at time `now` completes."""
         row = self._row(part)
         if row is None:
             return []
@@ -181,7 +181,7 @@ class MotionWindow:
         return found
 
     def _row(self, part: Part) -> Array | None:
-        """Return R_WS and p_WS (12,), or IMU values (6,); None if invalid."""
+        """Return rotation R_WS and position p_WS (12,), or IMU values (6,); None if invalid."""
         values = part.values
         if part.flags or not (abs(part.t) < _MAX_TIME_S and (np.abs(values) < _MAX_VALUE).all()):
             return None
@@ -194,7 +194,7 @@ class MotionWindow:
         return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
     def _motion(self) -> Array:
-        """Return s, omega, alpha (9,) in the middle of the window."""
+        """Return the motion s, omega, alpha (9,) in the middle of the window."""
         rows = np.array(self._rows)
         smooth, first, second = self._weights @ rows
         if rows.shape[1] == 6:
@@ -210,7 +210,7 @@ def _axis(A: Array) -> Array:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return quaternion and position (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
+    """Return the pose (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
     return np.concatenate([quaternions(rotation_rpy(numbers[3:])[None])[0], numbers[:3]])
 
 
@@ -229,9 +229,9 @@ class Assembly:
     """Source of readings with the motion of another stream.
 
     Args:
-        delay_s: delay of the motion's stamps behind the wrench's [s].
-        follow: load for tracking this delay; None for a constant delay.
-        X_FS: (7,) [w x y z, position] of the sensor in the posed frame.
+        delay_s: delay of the motion's time stamps behind the wrench's [s].
+        track: load for tracking this delay; None for a constant delay.
+        X_FS: (7,) pose of the sensor in the frame F of the poses, [w x y z, position].
         weight_removed: the robot has removed the weight from the wrench. Readings contain the
             acceleration instead of the specific force; an IMU raises DrakeTeleopError.
 
@@ -278,7 +278,7 @@ class Assembly:
         return [reading for part, now in arrived for reading in self.take(part, now)]
 
     def take(self, part: Part, now: float) -> list[Reading]:
-        """Return the readings that are complete with a part received at `now`."""
+        """Return the readings that a part received at time `now` completes."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
             self._pending.append(part)
@@ -307,7 +307,7 @@ class Assembly:
                 motions.popleft()
 
     def _complete(self, part: Part) -> Reading | None:
-        """Return the reading, stale if without motion; None while its motion is pending."""
+        """Return a wrench's reading, stale without motion; None while motion is pending."""
         values, flags, motions = np.zeros(VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):

@@ -1,4 +1,4 @@
-"""Identification from a stream until the requested parameters are known (docs/robot.md)."""
+"""Load identification from a stream until the tolerances are met (docs/robot.md)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RECORD_GROWTH = 1.12
 FIRST_RECORD_S = 1.0
 """Length of the record at the first result [s]."""
 MIN_DEGREES_OF_FREEDOM = 20.0
-"""Minimum degrees of freedom of the variance of a known number."""
+"""Minimum degrees of freedom of the variance of a known parameter."""
 _START_AGAIN = "start again: the record has another zero or another load from t = {t:.2f} s on"
 _GRAVITY = 9.81
 # Load and noise [N, N m] for the advice before the first identification.
@@ -57,9 +57,9 @@ class Evaluation:
     Attributes:
         t: length of the record [s].
         found: the identification; None if it failed for the reason `why`.
-        half: (k,) half-widths of the 95 % intervals over the tolerances.
-        sure: (k,) whether the interval of level `CONFIDENCE` is within the tolerance.
-        known: (k,) whether the previous one also was.
+        half: (k,) half-widths of the 95 % intervals, divided by the tolerances.
+        sure: (k,) True where the interval of level `CONFIDENCE` is within the tolerance.
+        known: (k,) True where the previous result was `sure`, too.
         doubts: problems of the record; no parameter is known then.
         advice: the next motion; "" if all parameters are known.
     """
@@ -82,7 +82,7 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the present record; `previous` is the previous result."""
+    """Identify the record at `path`; return the result. `previous`: previous result."""
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -116,7 +116,10 @@ def evaluate_record(
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return half-widths at 95 % and `CONFIDENCE` over the tolerances, and degrees of freedom."""
+    """Return interval half-widths divided by the tolerances, and degrees of freedom, (k,) each.
+
+    The half-widths have the levels 95 % and `CONFIDENCE`.
+    """
     load = found.identification
     errors = errors_of(tolerance, load.phi)
     deviations = deviations_of(errors, load.covariance)
@@ -127,7 +130,7 @@ def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Arra
 
 
 def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
-    """Return problems that invalidate all intervals."""
+    """Return the problems of a record that invalidate all intervals."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("all poses are at rest")
@@ -146,9 +149,9 @@ def best_motion(
     """Return the most informative motion, in words.
 
     Args:
-        motion: s, omega, alpha, (N, 3) each.
-        errors: (k, 16) from `errors_of`.
-        noise: (6,) of a sample's wrench [N, N m].
+        motion: s, omega, alpha of the record, (N, 3) each.
+        errors: (k, 16) matrix from `errors_of`.
+        noise: (6,) standard deviation of a sample's wrench [N, N m].
     """
     rate = 1.0 / dt if cutoff_hz is None else min(1.0 / dt, _INDEPENDENT_PER_S_HZ * cutoff_hz)
     equations = NormalEquations(noise)
@@ -167,7 +170,7 @@ def best_motion(
 
 
 def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield words and information (16, 16) of motions that start at the specific force `up`."""
+    """Yield motions in words, with their information (16, 16); all start at specific force `up`."""
     s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
     t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
     for words, size, hertz in _MOTIONS:
@@ -218,7 +221,7 @@ def calibrate(
         All results.
 
     Raises:
-        DrakeTeleopError: if too few samples came, or the record cannot be written.
+        DrakeTeleopError: if there are too few samples, or the record cannot be written.
     """
     results: list[Evaluation] = []
     next_length_s = FIRST_RECORD_S

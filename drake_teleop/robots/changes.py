@@ -1,6 +1,6 @@
-"""Detection of a tare or a grasp in a stream, by the test of `identify`.
+"""Detection of a changed sensor zero or load in a stream, by the test of `identify`.
 
-For a live stream it runs in another process of low priority, because threads would share the
+For a live stream the test runs in another process of low priority, because threads would share the
 interpreter lock with the loop.
 """
 
@@ -27,9 +27,9 @@ from drake_teleop.robots.compensator import JUMP_S
 from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Flag, Reading
 
 SPAN_S = 20.0
-"""Length of the record that is explained [s]."""
+"""Length of the record that a test examines [s]."""
 SETTLED_S = 2.0
-"""Minimum duration of the flags [s]."""
+"""Minimum duration of contact or load flags before a test [s]."""
 _WATCH_FLAGS, _INVALID_FLAGS = int(Flag.IN_CONTACT | Flag.OTHER_LOAD), ~int(NONZERO_FLAGS)
 # [s]: maximum time between attempts, flag-free time after a change, time between two changes.
 _MAX_RETRY_S, _END_S, _SAME_CHANGE_S = 10.0, 1.0, 1.0
@@ -42,7 +42,7 @@ Report = tuple[float, str]
 
 
 class Changes:
-    """Report of each change of zero or load, once, by the callback `report`."""
+    """Monitor that reports each change of zero or load once, by the callback `report`."""
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
@@ -54,7 +54,7 @@ class Changes:
         self._reported: list[float] = []
 
     def take(self, reading: Reading, flags: int) -> None:
-        """Take a reading and the flags of its compensated wrench."""
+        """Add a reading, with the flags of its compensated wrench."""
         if flags & _INVALID_FLAGS:
             return
         if not 0.0 < reading.t - self._last < JUMP_S:
@@ -80,7 +80,7 @@ class Changes:
             self._pending = None
 
     def close(self) -> None:
-        """Wait for the last record and report its changes."""
+        """Wait for the last test and report its changes."""
         if self._pending is not None:
             self._report_changes(self._pending)
         self._executor.shutdown()
@@ -104,7 +104,6 @@ class Changes:
 
 
 def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
-    """Return `find_changes`, computed by another process."""
     done = subprocess.run(
         [sys.executable, "-m", __name__, repr(dt)],
         input=rows.tobytes(),
@@ -133,7 +132,7 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
 
 
 def _decisive(state: State, time: float) -> bool:
-    """Return whether S has moved since, and the other kind explains the record much worse."""
+    """Return whether the sensor moved after `time` and the other kind of change fits much worse."""
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:
@@ -162,7 +161,7 @@ def _change_text(cause: Cause) -> str:
 
 
 def main() -> None:
-    """Explain the rows on stdin; write the reports to stdout."""
+    """Find changes in the rows on stdin; write them to stdout."""
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
     rows = np.frombuffer(sys.stdin.buffer.read()).reshape(-1, 1 + VALUES)

@@ -1,4 +1,4 @@
-"""Loop of `drake-teleop compensate`, from a source to a sink."""
+"""Loop of the command `drake-teleop compensate`, from a source to a sink."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _IDLE_S = 0.01  # period of zero wrenches while nothing comes
 
 
 class Control:
-    """UDP port of this machine that accepts the word `tare`."""
+    """UDP port of this machine that accepts the request `tare`."""
 
     def __init__(self, port: int) -> None:
         self._socket = listening(THIS_MACHINE, port)
@@ -35,7 +35,7 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request."""
+        """Answer a waiting request: call `tare` and send the result."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -60,7 +60,7 @@ def run(
     changes: Changes | None = None,
     report: Callable[[str], None] = lambda _: None,
 ) -> Counter[str]:
-    """Compensate until the source ends, or Ctrl-C.
+    """Compensate readings until the source ends, or Ctrl-C.
 
     Args:
         tare: tare once, after `TARE_S` of good readings.
@@ -127,8 +127,8 @@ def compensate_command(
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
         largest: range of the sensor [N], [N m].
         free: log of free motion, see `Detector`.
-        control: port of `Control`.
-        stream: see `open_source`.
+        control: UDP port of `Control`.
+        stream: options of `open_source`.
 
     Raises:
         DrakeTeleopError: if an argument cannot be used.

@@ -12,10 +12,10 @@ NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
 
 @njit(cache=True)
 def value_problem(values, largest, limits):
-    """Return 0, `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
+    """Return 0 for valid values, else `NOT_FINITE`, `TOO_LARGE` or `AT_RANGE`.
 
     Args:
-        values: (15,) of the reading.
+        values: (15,) reading.
         largest: (15,) maximum valid magnitudes.
         limits: (6,) range of the sensor.
     """
@@ -36,9 +36,9 @@ def low_pass_into(x, low_pass, memory):
     """Filter a sample in place, by a second-order low-pass as in `scipy.signal.lfilter`.
 
     Args:
-        x: (n,).
-        low_pass: (7,) b, a_1, a_2 and the steady-state memory at input 1.
-        memory: (2, n); NaN starts in the steady state.
+        x: (n,) sample.
+        low_pass: (7,) coefficients b, a_1, a_2 and the steady-state memory at input 1.
+        memory: (2, n) filter memory; NaN starts in the steady state.
     """
     start = math.isnan(memory[0, 0])
     for i in range(len(x)):
@@ -53,10 +53,11 @@ def low_pass_into(x, low_pass, memory):
 
 @njit(cache=True)
 def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
-    """Write contact and scaled wrench of a good reading to out (12,).
+    """Write the contact wrench and scaled wrench of a good reading to out (12,).
 
     Args:
-        values: (15,) of the reading.
+        values: (15,) reading.
+        offsets: (6,) sensor offsets.
         phi, nothing: (10,) the load, and zeros.
         scales: (3,) see `scaled_wrench_into`.
         low_pass, memory: see `low_pass_into`; low_pass may be empty.
@@ -75,7 +76,7 @@ def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest
 
 @njit(cache=True)
 def clip(wrenches, limits):
-    """Limit wrenches (12,) to the sensor's range (6,); return whether one exceeded it."""
+    """Limit two wrenches (12,) to the sensor's range (6,); return whether a value exceeded it."""
     beyond = False
     for i in range(12):
         limit = limits[i % 6]

@@ -1,10 +1,11 @@
-"""Contact wrench of each reading; a flagged zero for each invalid reading.
+"""Contact wrench of each reading; a flagged zero wrench for each invalid reading.
 
-Good readings pass the kernels of `eliminate --causal`, with bit-equal results. After a fault of
-`STALE_S` the low-pass restarts in its steady state.
+Good readings pass the kernels of `eliminate --causal`, with bit-equal results. After `STALE_S`
+without a good reading the low-pass restarts in its steady state.
 
-The source's time t is related to our clock by the least (now - t), which rises by `CLOCK_DRIFT`.
-The excess of (now - t) is the age of a reading; if it lasts for `JUMP_S`, the clock was set.
+The source's time t is related to our clock by the minimum of (now - t), which rises by
+`CLOCK_DRIFT`. The excess of (now - t) over this minimum is the age of a reading. If it lasts for
+`JUMP_S`, the source's clock was set.
 """
 
 from __future__ import annotations
@@ -30,18 +31,18 @@ from drake_teleop.robots.streams import NONZERO_FLAGS, VALUES, Compensated, Flag
 from drake_teleop.robots.watch import Detector, Watch
 
 STALE_S = 0.05
-"""Age above which the wrench is zero [s]."""
+"""Age of a reading above which the output wrench is zero [s]."""
 JUMP_S = 1.0
 """Larger steps between two clocks indicate a clock that was set [s]."""
 CLOCK_DRIFT = 1e-3
 """Maximum relative drift of two clocks [s/s]."""
 RATE_TOLERANCE = 0.05
-"""Tolerated relative error of the rate, over `_RATE_READINGS` readings and `_RATE_S`."""
+"""Tolerated relative error of the rate, measured over `_RATE_READINGS` and `_RATE_S`."""
 TARE_S = 0.5
 """Time at rest before a tare [s]."""
 MAX_OFFSET_DRIFT = np.repeat([5.0, 0.25], 3)
 """Maximum drift of the offsets [N, N m]."""
-_RATE_READINGS, _RATE_S = 200, 0.4  # readings, [s]: longer than a burst
+_RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_S = 1e12  # [s]
 _MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `Flag` takes a microsecond.
@@ -60,7 +61,7 @@ _MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
 class _RateCheck:
-    """Comparison of the measured rate of the readings with the stated one."""
+    """Comparison of the measured rate of the readings with the configured one."""
 
     def __init__(self, dt: float) -> None:
         self._dt, self._readings = dt, max(_RATE_READINGS, round(_RATE_S / dt))
@@ -71,7 +72,7 @@ class _RateCheck:
         self._count, self._flag = 0, 0
 
     def flag(self, reading: Reading) -> int:
-        """Return the result of the last complete interval, 0 or `WRONG_RATE`."""
+        """Return 0 or `WRONG_RATE`, the result of the last complete interval."""
         if self._count == 0:
             self._start_t, self._start_number = reading.t, reading.number
         self._count += 1
@@ -83,17 +84,17 @@ class _RateCheck:
 
 
 class Compensator:
-    """Conversion of readings to wrenches.
+    """Converter of readings to contact wrenches and scaled wrenches.
 
     Args:
         sigma, gamma: scales of load wrench and contact wrench in the scaled wrench.
-        wait: readings by which the motion comes late, already aligned by the source.
-        predicted: extrapolate over wait and low-pass.
+        wait: delay of the motion, in readings, for which the source has corrected.
+        predicted: extrapolate over `wait` and the delay of the low-pass.
         largest: (6,) range of the sensor [N, N m].
-        detector: flags contact instead of `watch`.
+        detector: contact detector; its flag replaces that of `watch`.
 
     Attributes:
-        offsets: (6,) of the sensor [N, N m].
+        offsets: (6,) sensor offsets [N, N m].
         lag_s: delay of a slow contact without prediction [s].
         good_count: number of successive good readings.
     """
@@ -140,7 +141,7 @@ class Compensator:
         self.good_count = 0
 
     def step(self, reading: Reading, now: float) -> Compensated:
-        """Return the output for a reading received at `now` of a monotonic clock."""
+        """Return the output for a reading received at `now` [s] of a monotonic clock."""
         flags = self._reading_flags(reading, now)
         invalid = flags & ~_NONZERO_FLAGS
         if invalid & ~_GAP:
@@ -162,7 +163,7 @@ class Compensator:
         return Compensated(reading.number, reading.t, wrench[:6], wrench[6:], flags)
 
     def stale_output(self, now: float) -> Compensated | None:
-        """Return a stale zero wrench if nothing came for `STALE_S`, else None."""
+        """Return a zero wrench, flagged as stale, after `STALE_S` of silence; else None."""
         if now - self._now <= STALE_S:
             return None
         return self._zero(_STALE)
@@ -172,7 +173,7 @@ class Compensator:
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
-        """Set the offsets to their mean in `TARE_S`; return the result or why it is refused."""
+        """Add the mean contact wrench to the offsets, or refuse; return the result in words."""
         if self.good_count < len(self._tare_rows):
             return f"refused: fewer than {TARE_S:g} s of good readings so far"
         spread = self._tare_rows.std(axis=0)
@@ -197,7 +198,7 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
-        """Return the flags of a reading and update the clocks."""
+        """Return the flags of a reading and update the clock comparison."""
         flags = reading.flags
         if flags & _DAMAGED:
             return _DAMAGED
@@ -234,7 +235,7 @@ class Compensator:
         return flags | self._rate.flag(reading)
 
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
-        """Accept the clock of this reading and restart."""
+        """Accept the clock of this reading and restart the filters."""
         self._min_offset, self._number, self._t = ahead, reading.number, reading.t
         self._rate.reset()
         self.good_count = 0
@@ -249,7 +250,7 @@ class Compensator:
         self._delay_line.clear()
 
     def _eliminate(self, values: Array) -> Array:
-        """Return low-passed contact and scaled wrench (12,)."""
+        """Return low-passed contact wrench and scaled wrench (12,)."""
         out = np.empty(12)
         at = self.good_count % len(self._tare_rows)
         phi, zero, scales = self._phi, self._zero_phi, self._scales

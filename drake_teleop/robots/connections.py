@@ -1,4 +1,4 @@
-"""Sources and sinks by their addresses."""
+"""Functions that open sources and sinks by their addresses."""
 
 from __future__ import annotations
 
@@ -105,7 +105,11 @@ def open_recording(
     sensor_pose: tuple[float, ...] | None = None,
     arm: SensorPoseOfJoints | None = None,
 ) -> tuple[Source[Any], Records[Any]]:
-    """Return the stream that `calibrate` reads, and its recorder."""
+    """Return the stream that `calibrate` reads, and its recorder.
+
+    Args:
+        largest: (6,) range of the sensor [N, N m]; the others: see `open_source`.
+    """
     kind = _kind(address)
     # Records keep their time stamps; only a NetBox, without stamps, needs its own rate.
     rate_hz = None if kind == "netft" else _UNUSED_RATE_HZ
@@ -117,7 +121,7 @@ def open_recording(
 
 
 def is_file(address: str) -> bool:
-    """Return whether a sink is a file or a folder of files."""
+    """Return whether the address of a sink is a file or a folder of files."""
     return not _kind(address) and Path(address).suffix in (".csv", ".parquet", ".mcap")
 
 
@@ -142,7 +146,7 @@ def open_sink(address: str) -> Sink:
 
 
 def _kind(address: str) -> str:
-    """Return the scheme of the address; "" for a file."""
+    """Return the scheme of an address; "" for a file."""
     if address.startswith(_REPLAY):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""

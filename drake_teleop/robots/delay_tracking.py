@@ -1,7 +1,8 @@
 """Tracking of the motion's delay behind the wrench, from the wrench of the load.
 
-If the motion is early by e, the residual wrench is r = o + g e, with offsets o and g the slope of
-V phi. Least squares over the channels c, with weights that fade in `FADE_TIME_S`, gives
+If the motion is early by e, the residual wrench is r = o + g e, with the offsets o and the time
+derivative g of the load's wrench V phi. Least squares over the channels c, with weights that fade
+in `FADE_TIME_S`, gives
 
     e = sum_c w_c cov(g_c, r_c) / sum_c w_c var(g_c),    w_c = 1 / noise_c^2.
 """
@@ -28,9 +29,9 @@ MAX_SLEW = 0.005
 MAX_DELAY_S = 0.1
 """Maximum magnitude of the delay [s]."""
 INITIAL_ERROR_S = 0.03
-"""Error of the delay that the residual of a sample may contain at first [s]."""
+"""Delay error that the residual of a sample may contain before the delay is known [s]."""
 TRACKING_ERROR_S = 0.004
-"""The same when the delay is known, in addition to the remaining correction [s]."""
+"""Delay error in a residual once the delay is known, besides the remaining correction [s]."""
 SAMPLE_PERIOD_S = 0.004
 """Period of the evaluated samples [s]."""
 _SIGMAS, _MIN_SAMPLES = 5.0, 50  # samples before offsets are estimated
@@ -40,7 +41,7 @@ Motion = tuple[float, Array]
 
 
 class DelayTracker:
-    """Tracked delay `delay_s` [s] of the motion."""
+    """Estimator of the motion's delay `delay_s` [s]."""
 
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
@@ -51,7 +52,7 @@ class DelayTracker:
         self._wrenches = np.zeros((3, 6))
         self._reset(-math.inf)
         self.take((0.0, np.zeros(9)), self._offsets, (0.0, np.zeros(9)), (1.0, np.zeros(9)))
-        self._reset(-math.inf)  # loads compiled code before the first sample
+        self._reset(-math.inf)  # the call above loads compiled code before the first sample
 
     def _reset(self, t: float) -> None:
         self._t = self._fitted = t
@@ -59,7 +60,7 @@ class DelayTracker:
         self._delay_error = INITIAL_ERROR_S
 
     def take(self, at: Motion, wrench: Array, before: Motion, after: Motion) -> None:
-        """Take a wrench (6,), its motion at the present delay, and both neighbours."""
+        """Update the delay with a wrench (6,), its motion `at`, and the neighbouring motions."""
         t, step = at[0], after[0] - before[0]
         elapsed = t - self._t
         if 0.0 <= elapsed < SAMPLE_PERIOD_S or step <= 0.0:
@@ -94,7 +95,6 @@ class DelayTracker:
         return bool((np.abs(residual - offsets) < limit).all())
 
     def _slew_delay(self, elapsed: float) -> None:
-        """Slew the delay towards a sufficiently accurate estimate."""
         if self._samples < _MIN_SAMPLES:
             return
         g, r, gg, gr, rr = self._sums / self._count

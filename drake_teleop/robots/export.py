@@ -1,4 +1,4 @@
-"""An identified load in the format of a robot, of a compensation, or of a model."""
+"""Export of an identified load to the format of a robot, a compensation or a model."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ STANDARD_GRAVITY = 9.80665  #: m/s^2
 
 @dataclass(frozen=True)
 class Load:
-    """Values for a format, in SI.
+    """Load parameters to export, in SI units.
 
     Args:
-        com: (3,) centre of mass in the frame F of the values [m].
+        com: (3,) centre of mass in the frame F of the export [m].
         inertia: (3, 3) about the centre of mass, in F [kg m^2].
-        offsets: (6,) in the sensor's frame and sign [N, N m].
+        offsets: (6,) sensor offsets, in the sensor's frame and sign [N, N m].
     """
 
     mass: float
@@ -36,7 +36,7 @@ class Load:
 
     @property
     def six(self) -> tuple[float, ...]:
-        """xx, yy, zz, xy, xz, yz [kg m^2]."""
+        """Inertia xx, yy, zz, xy, xz, yz [kg m^2]."""
         i = self.inertia
         return i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]
 
@@ -48,8 +48,9 @@ class Format:
     Args:
         of_sensor: the values are in the sensor's frame.
         inertia, offsets: whether the format contains them.
-        body: the target requires a physically consistent body.
+        body: the format requires a physically consistent body.
         comment: prefix of a comment line; "" for none.
+        note: further warning for the user.
     """
 
     write: Callable[[Load], str]
@@ -68,16 +69,18 @@ def export(
     sensor_pose: Sequence[float] | None = None,
     sign: int = -1,
 ) -> tuple[str, list[str]]:
-    """Return the text for a target of `FORMATS`, and warnings of dropped and unidentified values.
+    """Return the text in the format `to`, a key of `FORMATS`, and warnings.
+
+    The warnings name values that are dropped or not identified.
 
     Args:
-        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the values,
+        sensor_pose: x, y, z [m], roll, pitch, yaw [deg] of the sensor in the frame F of the export,
             as in a URDF; None: F is S.
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
 
     Raises:
-        DrakeTeleopError: for an unknown target, a pose for a target in the sensor's frame, or an
-            inconsistent load for a target that requires a body.
+        DrakeTeleopError: for an unknown format, a `sensor_pose` with a format in the sensor's
+            frame, or an inconsistent load with a format that requires a body.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(

@@ -1,4 +1,4 @@
-"""Wrenches for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
+"""Sinks for Foxglove, live or in an MCAP file: JSON in the topic `/wrench`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _Channel:
 
 
 class FoxgloveSink:
-    """Live server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
+    """Sink with a server at foxglove://[HOST][:PORT]; messages have the time of our clock."""
 
     def __init__(self, address: str) -> None:
         host, port = endpoint(address, PORT)
@@ -74,7 +74,7 @@ class FoxgloveSink:
 
 
 class McapSink:
-    """MCAP file, written continuously; messages have the times of the readings."""
+    """Sink that writes an MCAP file continuously; messages have the times of the readings."""
 
     def __init__(self, path: Path) -> None:
         self._channel = _Channel(str(path))

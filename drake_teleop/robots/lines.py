@@ -20,7 +20,7 @@ _BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default."""
+    """Return the reading in a line, `DAMAGED` if invalid; `number` is the default number."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:
@@ -36,7 +36,7 @@ def read_line(line: bytes, number: int) -> Reading:
 
 
 def wrench_line(out: Compensated) -> str:
-    """Return the line of a wrench."""
+    """Return a compensated wrench as a line of JSON."""
     data: dict[str, Any] = {
         "number": out.number,
         "t": out.t,
@@ -53,7 +53,7 @@ def flag_names(flags: int) -> list[str]:
 
 
 class LineSource(Source[Reading]):
-    """Readings from a growing file, such as standard input."""
+    """Source of readings from a growing file, such as standard input."""
 
     live = True
 
@@ -80,7 +80,7 @@ class LineSource(Source[Reading]):
 
 
 class LineSink(Sink):
-    """Unbuffered lines in a text file, such as standard output."""
+    """Sink of unbuffered lines in a text file, such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

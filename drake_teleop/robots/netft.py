@@ -1,7 +1,7 @@
 """Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP.
 
 A request of 8 bytes starts the stream of records of 36 bytes, both big-endian. It is repeated after
-a silence, so that the stream resumes after a restart of the box.
+a silence, so that the stream resumes after a restart of the NetBox.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _UNITS = {
 
 
 class Record(NamedTuple):
-    """RDT record."""
+    """Record of RDT, with the wrench in counts."""
 
     rdt_sequence: int
     ft_sequence: int
@@ -55,10 +55,10 @@ def unpack_record(packet: bytes) -> Record | None:
 
 
 class NetFtSource:
-    """Wrenches of netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
+    """Source at netft://HOST[:PORT][?counts=FORCE,TORQUE&rate=HZ&sign=-1]; counts per N and N m.
 
     Raises:
-        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the box cannot be read.
+        DrakeTeleopError: if the address is invalid, or netftapi2.xml of the NetBox cannot be read.
     """
 
     streams: tuple[str, ...] = (WRENCH,)
@@ -100,7 +100,7 @@ class NetFtSource:
         return found
 
     def part(self, packet: bytes, now: float) -> Part:
-        """Return the wrench in a packet received at `now`, flagged if it is invalid."""
+        """Return the wrench in a packet received at time `now`, flagged if it is invalid."""
         record = unpack_record(packet)
         if record is None:
             return DAMAGED_WRENCH
@@ -153,7 +153,7 @@ def _read_page(address: Address) -> list[float]:
 
 
 def parse_page(content: bytes) -> list[float]:
-    """Return counts of 1 N and 1 N m, and rate [Hz], from netftapi2.xml.
+    """Return counts per N and N m, and rate [Hz], from netftapi2.xml.
 
     Raises:
         SyntaxError, KeyError, ValueError: if they are missing or invalid.
@@ -173,10 +173,10 @@ _JUMP_S = 1.0  # a larger step of the number is a restart
 
 
 class SampleClock:
-    """Clock from sample numbers.
+    """Clock that derives times from sample numbers.
 
-    The period is first the stated one, after a second the measured one, so that a wrong stated rate
-    causes no growing delay.
+    The period is first the configured one, after a second the measured one, so that a wrong
+    configured rate causes no growing delay.
     """
 
     def __init__(self, dt: float) -> None:
@@ -185,10 +185,10 @@ class SampleClock:
         self._first: tuple[int, float] | None = None
 
     def time_of(self, number: int, now: float) -> float:
-        """Return the time of a sample, on its own clock [s].
+        """Return the time of a sample, on this clock [s].
 
         Args:
-            number: smaller than before if out of order or after a restart.
+            number: sample number, smaller than before if out of order or after a restart.
             now: our monotonic clock [s].
         """
         step = number - self._number

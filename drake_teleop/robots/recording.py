@@ -1,7 +1,7 @@
-"""Samples of a stream, collected and written as a log.
+"""Recorders that collect the samples of a stream and write them as a log.
 
-Readings make a canonical log; parts a table for each stream and a description, log.yaml. A set
-clock starts a new part of the record; the longest part is written.
+Readings make a canonical log; parts a table for each stream and a description, log.yaml. When a
+clock is set, a new segment of the record starts; the longest segment is written.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _T = TypeVar("_T")
 
 
 class Records(Generic[_T]):
-    """Collector of samples.
+    """Recorder of samples.
 
     Attributes:
         file, files: name of the log, and of all written files.
@@ -82,7 +82,7 @@ class Records(Generic[_T]):
         return _seconds(self._longest_part())
 
     def take(self, sample: _T) -> None:
-        """Add a sample if it is good."""
+        """Add a sample if it is valid."""
         raise NotImplementedError
 
     def write(self, path: Path) -> None:
@@ -91,7 +91,7 @@ class Records(Generic[_T]):
 
 
 class Recorder(Records[Reading]):
-    """`Records` of readings; `largest` (6,) is the range of the sensor [N, N m]."""
+    """Recorder of readings; `largest` (6,) is the range of the sensor [N, N m]."""
 
     file = "log.parquet"
     files: tuple[str, ...] = (file,)
@@ -111,7 +111,7 @@ class Recorder(Records[Reading]):
 
 
 class PartRecorder(Records[tuple[Part, float]]):
-    """`Records` of parts; `X_FS` as in `Assembly`."""
+    """Recorder of parts; `largest` as in `Recorder`, `X_FS` as in `Assembly`."""
 
     file = "log.yaml"
     files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
@@ -172,7 +172,7 @@ _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 class _Samples:
-    """Samples of one stream; `min_offset` is the minimum of (our - its clock) [s]."""
+    """Samples of one stream; `min_offset` is the minimum of (our clock - its clock) [s]."""
 
     def __init__(self) -> None:
         self.t: list[float] = []

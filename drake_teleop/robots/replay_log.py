@@ -1,4 +1,4 @@
-"""A log as a source, aligned as by `eliminate`."""
+"""Source that replays a log, aligned as by `eliminate`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from drake_teleop.robots.streams import Flag, Reading, Source
 
 
 class LogSource(Source[Reading]):
-    """Readings of a log. The motion comes late by its delay, `wait` readings.
+    """Source of a log's readings. The motion comes late by its delay, `wait` readings.
 
     Args:
         load: load for the estimate of the delay; None keeps wrench and motion as recorded. If the

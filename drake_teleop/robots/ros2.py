@@ -1,4 +1,4 @@
-"""Protocol of the ROS 2 middleware rmw_zenoh, by the library eclipse-zenoh, without ROS.
+"""Source and sink for ROS 2 with rmw_zenoh, by the library eclipse-zenoh, without ROS.
 
 A topic has the key `DOMAIN/TOPIC/TYPE/HASH`. Messages are CDR, with number, send time and sender
 attached. A liveliness token lists a node in the ROS graph.
@@ -53,7 +53,7 @@ def message_types() -> Any:
 
 
 def open_session(address: Address) -> Any:
-    """Return a session with a router, which may start later."""
+    """Return a session with the router at `address`, which may start later."""
     import zenoh
 
     config = zenoh.Config()
@@ -71,12 +71,12 @@ def open_session(address: Address) -> Any:
 
 
 def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
-    """Return the key of a topic, by default with any hash (Humble has none)."""
+    """Return the zenoh key of a topic, by default with any hash (ROS Humble has none)."""
     return f"{domain}/{topic}/{_dds(kind)}/{hashed}"
 
 
 def domain_of(address: Address) -> int:
-    """Return the parameter `domain`, by default 0; raise DrakeTeleopError if invalid."""
+    """Return the ROS domain of an address, by default 0; raise DrakeTeleopError if invalid."""
     text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=address.text)
@@ -113,7 +113,7 @@ def attachment(number: int, ns: int, sender: bytes) -> bytes:
 
 
 def message_number(attached: bytes) -> int | None:
-    """Return the number in an attachment, None without."""
+    """Return the message number in an attachment, None if absent."""
     if len(attached) == _ATTACHMENT.size:
         return int(_NUMBER.unpack_from(attached)[0])
     if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
@@ -127,10 +127,11 @@ def _dds(kind: str) -> str:
 
 
 class Messages:
-    """Conversion of ROS 2 messages to parts.
+    """Converter of ROS 2 messages to parts.
 
     Args:
-        frames: parent and child of the pose from transforms; empty for none.
+        sign: see `Address.sign`.
+        frames: parent and child frame of the pose from `/tf`; empty for none.
         joints: names of the joints, in the order of the values.
     """
 
@@ -149,7 +150,7 @@ class Messages:
         self._counts = dict.fromkeys(KINDS, 0)
 
     def parts(self, name: str, message: bytes, attachment: bytes) -> list[Part]:
-        """Return the parts of a CDR message with a name in `KINDS`, flagged if it is invalid."""
+        """Return the parts of a CDR message, flagged if it is invalid; `name`: see `KINDS`."""
         self._counts[name] += 1
         number = message_number(attachment)
         if number is None:
@@ -184,7 +185,7 @@ class Messages:
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
     def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
-        """Return the pose of the child in the parent, if this message updates it."""
+        """Return stamp and pose of the child frame, if this message updates it."""
         newest = {each.child_frame_id: each for each in data.transforms}
         for child, each in newest.items():
             X = each.transform
@@ -206,9 +207,9 @@ class Messages:
 
 
 class Ros2Source:
-    """Parts of zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
+    """Source at zenoh://HOST[:PORT]/TOPIC[?pose=TOPIC&imu=TOPIC&joints=TOPIC&tf=PARENT,CHILD&...].
 
-    TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
+    The first TOPIC is a WrenchStamped. `/tf` must contain all frames between PARENT and CHILD.
     """
 
     def __init__(self, address: str, dt: float, joints: tuple[str, ...] = ()) -> None:
@@ -279,9 +280,9 @@ def _compose(a: Array, b: Array) -> Array:
 
 
 class Ros2Sink:
-    """WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
+    """Sink for WrenchStamped at zenoh://HOST[:PORT]/TOPIC[?frame=NAME&wrench=scaled&domain=N].
 
-    It contains the send time, because stale zeros have no other. Flags are not sent.
+    Messages contain the send time, because stale zeros have no other. Flags are not sent.
     """
 
     def __init__(self, address: str) -> None:
@@ -311,7 +312,7 @@ class Ros2Sink:
         self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
 
     def message(self, wrench: Array, ns: int) -> bytes:
-        """Return WrenchStamped in CDR."""
+        """Return a WrenchStamped in CDR; `ns`: its time."""
         kinds = self._types.types
         vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
         header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)

@@ -1,4 +1,4 @@
-"""Universal Robots: wrench, pose and tool acceleration by RTDE, with the library ur_rtde."""
+"""Source for Universal Robots: wrench, pose and tool acceleration by RTDE, with ur_rtde."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _BLOCK_BYTES = 65536
 
 
 class RtdeSource:
-    """Parts of rtde://HOST[?sign=-1], of the same instants, 500 or 125 a second.
+    """Source of parts at rtde://HOST[?sign=-1], synchronous, 500 or 125 per second.
 
     Raises:
         DrakeTeleopError: if the address is invalid, ur_rtde is missing, or no robot answers.
@@ -96,7 +96,7 @@ class RtdeSource:
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """Return the parts of a sample."""
+    """Return wrench, pose and acceleration of a sample."""
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {

@@ -34,7 +34,7 @@ def read(host: str, pipe: int) -> None:
 
 
 def main() -> None:
-    """Run with the arguments host and file descriptor."""
+    """Run `read` with the arguments host and file descriptor."""
     try:
         read(sys.argv[1], int(sys.argv[2]))
     finally:

@@ -1,6 +1,6 @@
 """Types of the live streams: readings, parts, compensated wrenches, flags, sources and sinks.
 
-Readings are in the sensor's frame S, in SI, with the sign of Eq. (1): wrench of sensor on load.
+Readings are in the sensor frame S, in SI units, with the sign of Eq. (1): wrench of sensor on load.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ NONZERO_FLAGS = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LO
 
 
 class Reading(NamedTuple):
-    """Sample of a source: number, time [s] on its clock, values (15,), flags."""
+    """Sample of wrench and motion: number, time [s] on the source's clock, values (15,), flags."""
 
     number: int
     t: float
@@ -49,9 +49,9 @@ class Reading(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Sample of one stream of several, on its own clock.
+    """Sample of one of several streams, each with its own clock.
 
-    The values are one of: the wrench of S (6); the pose X_WF of a frame on the wrist (7); specific
+    The values are one of: the wrench in S (6); the pose X_WF of a frame on the wrist (7); specific
     force and angular velocity of S (6); joint positions (n); a tool acceleration (3).
     """
 
@@ -67,7 +67,7 @@ ACCELERATION = "acceleration"
 
 
 class Compensated(NamedTuple):
-    """Sample for a sink: contact and scaled are (6,)."""
+    """Sample for a sink: contact wrench (6,) and scaled wrench (6,)."""
 
     number: int
     t: float
@@ -83,7 +83,7 @@ DAMAGED_WRENCH = Part(WRENCH, -1, np.nan, np.full(6, np.nan), int(Flag.DAMAGED))
 
 
 class Source(Protocol[_T]):
-    """Source of readings, or of other samples.
+    """Interface of a source of readings, or of other samples.
 
     Attributes:
         dt: period of the samples [s].
@@ -102,7 +102,7 @@ class Source(Protocol[_T]):
 
 
 class PartSource(Protocol):
-    """Source of parts; `dt` [s] is the period of the wrenches."""
+    """Interface of a source of parts; `dt` [s] is the period of the wrenches."""
 
     dt: float
     streams: tuple[str, ...]
@@ -115,7 +115,7 @@ class PartSource(Protocol):
 
 
 class Sink(Protocol):
-    """Sink of wrenches."""
+    """Interface of a sink of compensated wrenches."""
 
     def write(self, out: Compensated) -> None:
         """Write a wrench."""

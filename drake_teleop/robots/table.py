@@ -1,4 +1,4 @@
-"""Wrenches in a CSV file or a folder of Parquet files, written continuously."""
+"""Sink that writes wrenches continuously to a CSV file or a folder of Parquet files."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from drake_teleop.common.files import (
 from drake_teleop.logs.read.canonical import WRENCH
 from drake_teleop.robots.streams import Compensated
 
-#: Time between two writes [s], lost if the process is killed. A Parquet file takes milliseconds.
+#: Time between two writes [s]; a killed process loses its rows. A Parquet file takes milliseconds.
 PERIOD_S = {".csv": 0.1, ".parquet": 1.0}
 
 
 class TableSink:
-    """Table with the columns t, number, contact_f_x ..., scaled_f_x ..., flags.
+    """Sink whose table has the columns t, number, contact_f_x ..., scaled_f_x ..., flags.
 
     An existing file or .parquet folder is replaced at the first wrench.
     """

@@ -1,8 +1,8 @@
-"""Readings and wrenches in UDP packets, with the layout of `drake_teleop_udp.h`.
+"""Sources and sink of UDP packets, with the layout of `drake_teleop_udp.h`.
 
 Little-endian, without padding. Input: "DTW1", flags (`Flag.SATURATED` only), number, time [s],
 15 numbers; or "DTP1", the same head, wrench (6), pose (w x y z, position). Output: "DTC1", the
-same head, contact (6), scaled (6).
+same head, contact wrench (6), scaled wrench (6).
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ def unpack_parts(packet: bytes) -> list[Part]:
 
 
 def pack_wrench(out: Compensated) -> bytes:
-    """Return the packet of a wrench."""
+    """Return the packet of a compensated wrench."""
     wrenches = (np.asarray(each, "<f8").tobytes() for each in (out.contact, out.scaled))
     return _HEAD.pack(_WRENCH_TAG, out.flags, out.number, out.t) + b"".join(wrenches)
 
 
 def unpack_wrench(packet: bytes) -> Compensated:
-    """Return the wrench in a packet; raise DrakeTeleopError if it is invalid."""
+    """Return the compensated wrench in a packet; raise DrakeTeleopError if invalid."""
     if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError("is not a wrench packet", where="packet")
     _, flags, number, t, *values = WRENCH.unpack(packet)
@@ -76,7 +76,7 @@ def unpack_wrench(packet: bytes) -> Compensated:
 
 
 def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
-    """Return host (default: this machine) and port; raise DrakeTeleopError without a port."""
+    """Return host (default: this machine) and port; raise DrakeTeleopError if there is no port."""
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or THIS_MACHINE, port if parts.port is None else parts.port
@@ -92,7 +92,7 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that receives packets; raise DrakeTeleopError if the address is in use."""
+    """Return a socket that receives UDP packets; raise DrakeTeleopError if it is in use."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -125,7 +125,7 @@ class _Receiver:
 
 
 class UdpSource(_Receiver):
-    """Readings of udp://[HOST]:PORT."""
+    """Source of readings at udp://[HOST]:PORT."""
 
     live = True
 
@@ -135,7 +135,7 @@ class UdpSource(_Receiver):
 
 
 class PosedSource(_Receiver):
-    """Wrenches and poses of posed://[HOST]:PORT[?sign=-1]."""
+    """Source of wrenches and poses at posed://[HOST]:PORT[?sign=-1]."""
 
     streams: tuple[str, ...] = (streams.WRENCH, streams.POSE)
 
@@ -151,7 +151,7 @@ class PosedSource(_Receiver):
 
 
 class UdpSink:
-    """Wrenches, sent to HOST:PORT whether there is a receiver or not."""
+    """Sink that sends wrenches to HOST:PORT, with or without a receiver."""
 
     def __init__(self, address: str) -> None:
         self._to = endpoint(address)

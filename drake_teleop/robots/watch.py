@@ -1,6 +1,6 @@
-"""Detection of contact or of another load, sample by sample: `--watch`.
+"""Detection of contact or of another load, sample by sample, for `compensate --watch`.
 
-A lasting push looks like another load only if it turns with the tool. With `--free LOG`, contact
+A lasting push appears as another load only if it turns with the tool. With `--free LOG`, contact
 is detected as by `detect`, with a noise floor fitted to a log of free motion.
 """
 
@@ -34,7 +34,7 @@ from drake_teleop.robots.replay_log import LogSource
 from drake_teleop.robots.streams import Flag
 
 MODEL_ERROR = 0.02
-"""Relative error of the load's wrench by gains and clocks."""
+"""Relative error of the load's wrench due to errors of gains and clocks."""
 MIN_NOISE = np.repeat([0.05, 0.0025], 3)
 """Minimum noise of a reading at 1 kHz [N, N m]."""
 _NEVER_REPLACED = 1e-12  # accuracy at which another load would replace the present one
@@ -43,13 +43,13 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return the noise (6,) of a reading [N, N m] from the low-passed residual, assumed white."""
+    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual."""
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
 
 class Watch:
-    """Detection for `Compensator`; the residual of `load` was low-passed at `cutoff_hz`."""
+    """Detector of contact and of another load; `cutoff_hz`: low-pass of the residual of `load`."""
 
     def __init__(self, load: Identification, dt: float, cutoff_hz: float | None) -> None:
         noise = raw_noise(load, dt, cutoff_hz)
@@ -65,7 +65,7 @@ class Watch:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load."""
+        """Reset all but the identified load; `offsets` (6,): sensor offsets."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched_memory(self._out, self._covariance)
 
@@ -79,14 +79,14 @@ class Watch:
 
 
 MEAN_TIME_S = 3.0
-"""Time constant of the mean [s]."""
+"""Time constant of the mean contact wrench outside of contact [s]."""
 _GRAVITY_HZ = 0.5
 _STATISTIC = "level"
 _RATE_TOLERANCE = 0.05
 
 
 class Detector:
-    """Contact detection by the noise floor of a log after the causal low-pass.
+    """Contact detector with the noise floor of a log after the causal low-pass.
 
     Gravity is the specific force below `_GRAVITY_HZ`.
 
@@ -143,7 +143,7 @@ class Detector:
         self._filters = np.full((2, 12), np.nan)
 
     def _low_passed(self, rows: Array) -> Array:
-        """Return low-passed contact, motion and acceleration (N, 18)."""
+        """Return low-passed contact wrench, motion and acceleration (N, 18)."""
         filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
         out = np.empty((len(rows), 18))
         for row, to in zip(rows, out, strict=True):

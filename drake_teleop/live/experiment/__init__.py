@@ -1,1 +1,1 @@
-"""Blind experiments with people or simulated participants."""
+"""Blind perception experiments with people or simulated participants."""

@@ -1,7 +1,7 @@
 """Station and stimulus of an experiment's task under a condition.
 
-A contact of F newton of the contact force P is rendered with gamma scaled by F / P, the other
-interval with gamma = 0. A mass at the hand increases sigma, or the eta of a held object.
+To render F newton of the contact force P, one interval has gamma scaled by F / P, the other
+interval gamma = 0. A mass at the hand increases sigma, or the eta of a held object.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
 def load_for(scenario: Scenario) -> IdentifiedLoad | None:
-    """Return the load, None if it is estimated online."""
+    """Return the identified load, None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
@@ -48,7 +48,7 @@ class Apparatus:
     """Station of a task under a condition.
 
     Attributes:
-        mass: of the load or object at the hand [kg].
+        mass: mass of the load or object at the hand [kg].
     """
 
     task: Task
@@ -58,7 +58,7 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return the inputs for a stimulus and an expected contact force [N]."""
+        """Return the inputs for a stimulus level and an expected contact force [N]."""
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
@@ -72,7 +72,7 @@ class Apparatus:
         return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
     def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
-        """Return the result of an interval with an intended level."""
+        """Return the result of an interval with the intended level `shown`."""
         force = rows.force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -92,7 +92,7 @@ def make_apparatus(
     """Return the station of a task under a condition.
 
     Raises:
-        DrakeTeleopError: if there is none.
+        DrakeTeleopError: if no such station is possible.
     """
     setup = live_scenario(scenario)
     changes: dict[str, object] = {}
@@ -123,8 +123,8 @@ class IntervalLog:
     """Measures of an interval.
 
     Attributes:
-        time: of the last row [s].
-        done_at: time at the floor of the slot [s]; 0 before.
+        time: time of the last row [s].
+        done_at: time at which the tool was at the slot's floor [s]; 0 before.
     """
 
     def __init__(self, task: Task, scenario: Scenario, insert: Insert | None) -> None:
@@ -136,7 +136,7 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows."""
+        """Add the newest rows of the log."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -164,7 +164,7 @@ class IntervalLog:
     def change(self, after: float) -> float:
         """Return the largest 20 ms mean change of the rendered force [N] from time `after` [s].
 
-        It is relative to the 0.1 s before.
+        The change is relative to the 0.1 s before `after`.
         """
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)

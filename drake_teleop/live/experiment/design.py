@@ -1,4 +1,4 @@
-"""Design of an experiment: its YAML file."""
+"""Design of an experiment, from its YAML file."""
 
 # No postponed annotations: yaml_load_typed reads the types of the fields.
 import os
@@ -58,7 +58,7 @@ class _Task:
 @settings
 @dataclass
 class ContactDetection(_Task):
-    """In which of two intervals was the contact rendered? The tool touches in both."""
+    """Task to find the interval of two with rendered contact. The tool touches in both."""
 
     low: float = quantity(0.2, "N", 1e-3, 1e3, "smallest rendered contact force at the tool")
     high: float = quantity(
@@ -71,7 +71,7 @@ class ContactDetection(_Task):
 @settings
 @dataclass
 class ApparentMass(_Task):
-    """In which of two intervals was the tool heavier? It is moved back and forth in both."""
+    """Task to find the interval of two with a heavier tool. It moves back and forth in both."""
 
     low: float = quantity(0.004, "kg", 1e-4, 10.0, "smallest additional mass at the hand")
     high: float = quantity(0.15, "kg", 1e-3, 10.0, "largest additional mass, also for practice")
@@ -128,7 +128,7 @@ class Experiment:
         """Check the experiment without its scenarios.
 
         Raises:
-            DrakeTeleopError: with the field.
+            DrakeTeleopError: for an invalid field.
         """
         check_ranges(self, where)
         for name in ("tasks", "conditions"):
@@ -164,7 +164,7 @@ class Experiment:
 
 
 def ExperimentNames() -> list[str]:
-    """Return the shipped names."""
+    """Return the names of the shipped experiments."""
     return sorted(path.stem for path in _FOLDER.glob("*.yaml"))
 
 
@@ -172,7 +172,7 @@ def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
     """Return a checked experiment by file or name, and its scenarios.
 
     Raises:
-        DrakeTeleopError: with the invalid field.
+        DrakeTeleopError: for an invalid field.
     """
     expect((str, Path), path, "study")
     names = ExperimentNames()

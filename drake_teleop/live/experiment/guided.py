@@ -1,4 +1,4 @@
-"""Experiment of one participant, in place of `Live`.
+"""Event handler for an experiment of one participant, in place of `Live`.
 
 Each interval is a recorded `Live`. The page receives only the rendered force.
 """
@@ -33,12 +33,12 @@ _SHOWN_KEYS = (
 )
 _HIDDEN_VALUES = {"contact": False, "energy": [0.0, 0.0], "words": [], "record": "", "scene": "own"}
 
-#: Inputs of a drive that move the hand.
+#: Names of the inputs that move the hand.
 HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rows without the forces of the 3D scene."""
+    """Return rows without the forces that the 3D scene shows."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
@@ -98,7 +98,7 @@ class Guided:
         return self._show(without_forces(rows))
 
     def hello(self) -> dict[str, Any]:
-        """Return the constants for a page."""
+        """Return the experiment's constants for a page."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -106,7 +106,7 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first one drives."""
+        """Add a page; the first page drives."""
         if self._driver is None:
             self._set_driver(client, now)
 
@@ -116,7 +116,7 @@ class Guided:
         self._live.join(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; after the driver's, the trial restarts."""
+        """Remove a page; if it drives, the trial restarts."""
         if client == self._driver:
             self._remove_driver(now)
 
@@ -136,14 +136,14 @@ class Guided:
 
     @contextmanager
     def _keep_write_error(self) -> Iterator[None]:
-        """Keep a `CannotWrite` for `tick`."""
+        """Keep a `CannotWrite` for `tick`, which raises it."""
         try:
             yield
         except CannotWrite as error:
             self._write_error = str(error)
 
     def handle_message(self, client: int, text: Any, now: float) -> None:
-        """Handle a message of a page; count an invalid one."""
+        """Handle a message of a page; count invalid messages."""
         message = parse_study(text)
         if message is None:
             self.refused += 1
@@ -245,14 +245,14 @@ class Guided:
         }
 
     def close(self) -> None:
-        """End the drive."""
+        """End the session and close the device link."""
         self._live.close()
         if self._link is not None:
             self._link.close()
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a message: set, rates, drive, go, answer."""
+    """Return the valid requests of a page's message: set, rates, drive, go, answer."""
     message = parse(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

@@ -23,7 +23,7 @@ CONSENT, TASK, READY, INTERVAL, GAP, ANSWER, FEEDBACK, BREAK, END = (
 
 @dataclass(frozen=True)
 class Trial:
-    """A planned trial.
+    """Planned trial.
 
     Attributes:
         task, condition: index in the experiment.
@@ -41,11 +41,11 @@ class IntervalResult:
     """Result of an interval.
 
     Attributes:
-        level: of the stimulus; 0 without one.
+        level: level of the stimulus; 0 without one.
         force_N: largest contact force at the tool.
         valid: False without contact.
         done: whether the tool reached the floor of the slot.
-        time_s: until then.
+        time_s: time until the floor.
         lost_s: simulation time behind the clock.
     """
 
@@ -76,13 +76,13 @@ def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
 
 
 class Procedure:
-    """State of a participant, after the stored rows.
+    """Progress of a participant, continued from the stored rows.
 
     Attributes:
         phase: `CONSENT` to `END`.
         interval: 1 or 2.
-        level: intended, of the trial.
-        prepared_intervals: number so far.
+        level: intended level of the trial.
+        prepared_intervals: number of intervals so far.
         said: whether the last answer was right.
         again: whether the trial is repeated for lack of contact.
     """
@@ -116,12 +116,12 @@ class Procedure:
 
     @property
     def task(self) -> Task:
-        """Task of that trial."""
+        """Task of the present trial."""
         return self.experiment.tasks[self.trial.task]
 
     @property
     def present_level(self) -> float:
-        """Level of the present interval."""
+        """Stimulus level of the present interval."""
         return self.level if self.trial.signal == self.interval else 0.0
 
     @property
@@ -141,7 +141,7 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """Continue after a page of text."""
+        """Continue after a text page."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
@@ -152,7 +152,7 @@ class Procedure:
             self._next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
-        """End the present interval."""
+        """End the present interval with a result."""
         self._results[self.interval - 1] = result
         if not result.valid:
             self._new_trial()
@@ -166,7 +166,7 @@ class Procedure:
             self.phase = ANSWER
 
     def start_second_interval(self) -> None:
-        """Start the second interval."""
+        """Start the trial's second interval."""
         self.phase = INTERVAL
 
     def restart_trial(self) -> None:
@@ -176,7 +176,7 @@ class Procedure:
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """Store the chosen interval in the phase `ANSWER`."""
+        """Store the chosen interval, if the phase is `ANSWER`."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 
@@ -227,7 +227,7 @@ class Procedure:
             self.phase = READY
 
     def view(self) -> dict[str, Any]:
-        """Return the state for the participant."""
+        """Return the state that the participant may see."""
         number = self.number - (self.phase == FEEDBACK)  # FEEDBACK belongs to the finished trial
         trial = self.trials[min(number, len(self.trials) - 1)]
         return {

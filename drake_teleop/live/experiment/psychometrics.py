@@ -28,13 +28,13 @@ _LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """Return P(correct) for levels >= 0."""
+    """Return P(correct) for stimulus levels >= 0."""
     d = (level / threshold) ** slope
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
 
 class Estimate(NamedTuple):
-    """Median, and 2.5 % and 97.5 % quantiles."""
+    """Median of an estimate, with 2.5 % and 97.5 % quantiles."""
 
     value: float
     low: float
@@ -78,7 +78,7 @@ class Psi:
         self._posterior /= self._posterior.sum()
 
     def threshold(self) -> Estimate:
-        """Return the threshold."""
+        """Return the estimated threshold."""
         share = self._posterior.sum(axis=(1, 2))
         # The probability of a node is uniform over its cell, in the logarithm.
         step = math.log(self._thresholds[1] / self._thresholds[0])
@@ -88,7 +88,7 @@ class Psi:
         return Estimate(float(value), float(low), float(high))
 
     def d_prime(self, level: float) -> Estimate:
-        """Return d' at a level."""
+        """Return the estimated sensitivity d' at a level."""
         d = (level / self._grid[0]) ** self._grid[1]
         values, share = d.ravel(), self._posterior.sum(axis=2).ravel()
         order = np.argsort(values)

@@ -2,7 +2,7 @@
 
 Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
 forces geometric means with t intervals of the logarithm. Participant 0 is the (geometric) mean of
-all, with its t interval.
+all participants, with its t interval.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the table; participant 0 stands for all."""
+    """Row of the result table; participant 0 stands for all."""
 
     task: str
     condition: str
@@ -48,7 +48,7 @@ class Result(NamedTuple):
 
 
 def results(experiment: Experiment, store: Store) -> list[Result]:
-    """Return all rows of the table."""
+    """Return all rows of the result table."""
     found = []
     known = {n: [row for row in store.rows(n) if not row.practice] for n in store.participants()}
     for task in experiment.tasks:
@@ -90,7 +90,7 @@ def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimat
 
 
 def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:
-    """Return the (geometric) mean with its t interval, nan for one value."""
+    """Return the (geometric) mean with its t interval; limits are nan for one value."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
@@ -110,7 +110,7 @@ def _wilson(successes: int, n: int) -> Estimate:
 
 
 def write_results(experiment: Experiment, store: Store) -> pl.DataFrame:
-    """Write trials.csv, results.csv and results.png; return the table."""
+    """Write trials.csv, results.csv and results.png; return the result table."""
     import polars as pl
 
     found = results(experiment, store)

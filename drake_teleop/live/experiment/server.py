@@ -1,4 +1,4 @@
-"""Page of an experiment."""
+"""Server of the page of an experiment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drake_teleop.station.scenario import Scenario
 
 
 class ExperimentDrive(LiveDrive):
-    """Experiment whose page is open to one participant."""
+    """Live session of an experiment with one participant."""
 
     def __init__(
         self,
@@ -53,7 +53,7 @@ class ExperimentDrive(LiveDrive):
         return Guided(*setup, time.perf_counter(), link)
 
     def done(self) -> tuple[int, int]:
-        """Return the numbers of finished and of all trials."""
+        """Return the numbers of finished trials and of all trials."""
         return self._procedure.number, len(self._procedure.trials)
 
     def _page(self) -> str:
@@ -73,10 +73,10 @@ def serve_experiment(
     browser: bool,
     device: str | None,
 ) -> None:
-    """Serve the page until Ctrl-C or SIGTERM.
+    """Serve the page of an experiment until Ctrl-C or SIGTERM.
 
     Raises:
-        DrakeTeleopError: why the drive had stopped.
+        DrakeTeleopError: if the simulation stopped.
         KeyboardInterrupt: if trials are left.
     """
     live = ExperimentDrive(experiment, scenarios, store, participant, port, device)

@@ -1,8 +1,8 @@
 """Simulated participants: an observer with noise compares rendered forces.
 
-A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
-larger response, the largest change of the rendered force plus normal noise. The simulated operator
-inserts the peg.
+A scripted hand presses down and up, or moves back and forth. The response to an interval is the
+largest change of the rendered force plus normal noise; the interval with the larger response is
+the answer. The simulated operator inserts the peg.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _ROWS_PERIOD_MS = 200
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """Return the station of each task and condition."""
+    """Return the station of each task and condition, by their indices."""
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
@@ -54,7 +54,7 @@ def all_apparatus(
 
 
 def seeded(scenario: Scenario, procedure: Procedure) -> Scenario:
-    """Return the scenario with a seed for this interval."""
+    """Return the scenario with a seed for the present interval."""
     number = 2 * procedure.number + procedure.interval
     rng = np.random.default_rng([procedure.experiment.seed, procedure.participant, number])
     return replace(scenario, simulation__seed=int(rng.integers(2**32)))
@@ -68,7 +68,7 @@ def take_part(
     participant: int,
     progress: Callable[[int, int], None],
 ) -> None:
-    """Run the remaining trials; `progress` receives finished and all trials."""
+    """Run a participant's remaining trials; `progress` receives the finished and all trials."""
     procedure = Procedure(experiment, participant, store)
     observer, responses = experiment.simulated, [0.0, 0.0]
     while procedure.phase != END:
@@ -93,9 +93,9 @@ def take_part(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger noisy response.
+    """Return the interval, 1 or 2, with the larger response after adding noise.
 
-    A difference of `noise` at rest is d' = 1.
+    A difference of `noise` at rest corresponds to d' = 1.
     """
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
@@ -107,7 +107,7 @@ def compare_responses(
 
 
 def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
-    """Return the result, and the response without noise [N]."""
+    """Return an interval's result, and the response without noise [N]."""
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)

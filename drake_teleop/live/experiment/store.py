@@ -16,21 +16,21 @@ from drake_teleop.common.version import __version__
 from drake_teleop.lab.studies.store import claimed
 from drake_teleop.live.experiment.design import Experiment
 
-#: Largest number of a participant.
+#: Largest valid participant number.
 MAX_PARTICIPANT = 9999
 
 
 @dataclass(frozen=True)
 class Row:
-    """A finished trial.
+    """Finished trial.
 
     Attributes:
-        practice: 1 if it is not evaluated.
+        practice: 1 if the trial is not evaluated.
         level: measured stimulus: contact force at the tool [N], mass at the hand [kg].
         signal: interval with the stimulus, 1 or 2; 0 for peg in slot.
-        answer: interval of the answer.
-        correct: 1 if right, or if the tool reached the floor.
-        time_s: of the answer, or until the floor.
+        answer: chosen interval.
+        correct: 1 if the answer is right, or if the tool reached the floor.
+        time_s: time until the answer or the floor.
         force_N: largest contact force at the tool.
         lost_s: simulation time behind the clock.
     """
@@ -56,7 +56,7 @@ _SCHEMA: dict[str, type[pl.DataType]] = {
 
 @dataclass(frozen=True)
 class Store:
-    """Trials in a folder."""
+    """Stored trials in a folder."""
 
     folder: Path
 
@@ -65,15 +65,15 @@ class Store:
         return self.folder / "participants" / f"{participant:02}.csv"
 
     def participants(self) -> list[int]:
-        """Return the participants with a trial."""
+        """Return the numbers of participants with a trial."""
         stems = (path.stem for path in self.folder.glob("participants/*.csv"))
         return sorted(int(stem) for stem in stems if stem.isdecimal())
 
     def rows(self, participant: int) -> list[Row]:
-        """Return a participant's trials.
+        """Return a participant's finished trials.
 
         Raises:
-            DrakeTeleopError: with a damaged file.
+            DrakeTeleopError: if the file is damaged.
         """
         path = self.path(participant)
         if not path.exists():
@@ -90,7 +90,7 @@ class Store:
         return rows
 
     def write(self, participant: int, rows: list[Row]) -> None:
-        """Replace all trials of a participant."""
+        """Replace all stored trials of a participant."""
         make_folder(self.path(participant).parent)
         table = pl.DataFrame([dataclasses.asdict(row) for row in rows], schema=_SCHEMA)
         write_table(self.path(participant), table)
