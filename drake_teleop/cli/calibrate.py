@@ -7,7 +7,8 @@ log.parquet   recorded log, for `identify log.parquet`; log.yaml with a table fo
               if the source delivers poses or an IMU
 settling.png  half-widths of the intervals over time, with the advice
 summary.json  that of `identify`, with "tolerance", "known" (by name), "all_known",
-              "half_widths_95" divided by the tolerances, "doubts", "looks"
+              "half_widths_95" over the tolerances, "doubts" (list of texts), "looks" (number
+              of evaluations)
 ============= ==================================================================================
 """
 
@@ -37,7 +38,7 @@ from drake_teleop.load.tolerance import (
 from drake_teleop.robots.calibration import DEFAULT_TOLERANCE, Evaluation, calibrate
 from drake_teleop.robots.connections import open_recording
 
-_BAR, _DECADES = 24, 3.0  # cells of a bar, and decades of the half-width over the tolerance
+_BAR, _DECADES = 24, 3.0  # cells of a bar; decades of half-width over tolerance in a bar
 
 
 def calibrate_command(
@@ -52,10 +53,11 @@ def calibrate_command(
     quiet: bool = False,
     **stream_options: Any,
 ) -> dict[str, Any]:
-    """Run `calibrate` and return its summary; see `open_source` for the stream's options.
+    """Identify a load from a live source; write the results into `out` and return the summary.
 
     Args:
-        until: see `read_tolerance`.
+        source, stream_options: see `open_source`.
+        until: tolerance, see `read_tolerance`.
         largest: range of the sensor [N], [N m].
 
     Raises:
@@ -102,7 +104,7 @@ def calibrate_command(
 
 
 def shown(at: Evaluation, tolerance: Tolerance) -> Group:
-    """Return the table of an intermediate result, and the advice."""
+    """Return the terminal output of an intermediate result: table, doubts and advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):
@@ -144,7 +146,7 @@ def _verdict(at: Evaluation, k: int) -> str:
 
 
 def draw_settling(looks: list[Evaluation], tolerance: Tolerance) -> Figure:
-    """Draw half-widths of the 95 % intervals over the tolerances, with the advice."""
+    """Draw the half-widths of the 95 % intervals over the tolerances, with the advice."""
     with plot_style():
         figure = Picture(figsize=(9, 5.5))
         axes = figure.subplots()

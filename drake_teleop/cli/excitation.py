@@ -76,13 +76,14 @@ def excite_command(
     """Design, check and write an excitation trajectory.
 
     Args:
-        scenario: with slave and wrist sensor.
-        model: another arm, with the scenario's sensor.
-        sensor_frame: required with `model`.
+        scenario: name or file of the scenario with slave and wrist sensor.
+        model: model file of another arm, with the scenario's sensor.
+        sensor_frame: name of the sensor's frame, required with `model`.
         until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
         package_paths, acceleration, payload: see `RobotFromModel`.
         criterion, period, harmonics, seconds, seed: see `excite`.
-        progress: False: no progress bars; `quiet`: no tables either.
+        quiet: True hides progress bars and tables.
+        progress: False hides the progress bars.
 
     Returns:
         The summary and the content of session.json.
@@ -162,7 +163,7 @@ def _refuse(*options: object) -> None:
 
 
 def summarise(found: Excitation) -> dict[str, Any]:
-    """Return the values of summary.json."""
+    """Return the content of summary.json."""
     robot, trajectory = found.robot, found.trajectory
     names = (*_OFFSETS, *_PHI)
     return {
@@ -190,7 +191,7 @@ def _words(name: str, robot: Robot) -> str:
 
 
 def table(found: Excitation) -> pl.DataFrame:
-    """Return one period at 1 kHz, both ends included."""
+    """Return trajectory.csv: one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}

@@ -27,9 +27,9 @@ def experiment_command(
     """Continue an experiment and return the table of `write_results`.
 
     Args:
-        participant: default: the first with trials left, or a new one.
+        participant: its number; default: the first with trials left, or a new one.
         simulated: total number of simulated participants; 0 for people.
-        page: options of `drive`.
+        page: options of the page, see `drive`.
 
     Raises:
         DrakeTeleopError: for an invalid file, or a folder with other contents.
@@ -52,7 +52,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return the requested participant, the first with trials left, or a new one."""
+    """Return the participant's number: `wanted`, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

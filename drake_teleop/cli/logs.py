@@ -50,8 +50,8 @@ def identify_command(
 ) -> dict[str, Any]:
     """Identify the load of a log, write the results into `out`, return the summary.
 
-    Files: identification.json; summary.json (docs/log-summaries.md); report.html; fit.png and
-    knowledge.png, and report.png with both; with a gripper's file also object.json.
+    The files are identification.json; summary.json (docs/log-summaries.md); report.html; fit.png
+    and knowledge.png, and report.png with both. With a `gripper` file, object.json is written too.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)
@@ -114,8 +114,8 @@ def eliminate_command(
 
     The table has `t` and, for each channel such as f_x, `contact_f_x`, `scaled_f_x`,
     `non_contact_f_x` and `measured_f_x` (without offsets); with `causal` (see `eliminate_log`) also
-    `causal_contact_f_x` and `causal_scaled_f_x`. `in_contact` flags contact, `edge` samples without
-    a decision.
+    `causal_contact_f_x` and `causal_scaled_f_x`. The column `in_contact` is true in contact, `edge`
+    at samples without a decision.
     """
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
@@ -192,8 +192,8 @@ def detect_command(
 ) -> dict[str, Any]:
     """Write detection.parquet, detection.png and summary.json; return the summary.
 
-    The table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and `edge` for
-    samples without a decision. The names of the summary: docs/detection.md.
+    The table has `t`, the three statistics, `contact_f_x` and so on, `in_contact`, and `edge`,
+    which is true at samples without a decision. docs/detection.md describes the summary.
     """
     found = detect_log(log, load, free=free, statistic=statistic, cutoff_hz=cutoff_hz, delay=delay)
     eliminated = found.eliminated

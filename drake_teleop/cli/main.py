@@ -63,10 +63,10 @@ def reproduce(out: Path, **options: Any) -> int:
 @click.option("--fresh", is_flag=True, help="Identify the load again, without the cache.")
 @option.quiet
 def run(scenario: str | None, inputs: Path | None, out: Path, **options: Any) -> None:
-    """Simulate one scenario, or repeat a drive.
+    """Simulate one scenario, or repeat a recorded drive.
 
-    SCENARIO is a shipped name or a YAML file. Writes the log, pictures and a 3D replay. The load
-    is identified first and kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
+    SCENARIO is a shipped name or a YAML file. Writes the log, pictures and a 3D replay. The load is
+    identified first and kept in the user's cache folder, or in $DRAKE_TELEOP_CACHE_DIR.
     """
     from drake_teleop.lab.run import run_command
 
@@ -326,8 +326,8 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
     SOURCE is udp://[HOST]:PORT, rtde://HOST, netft://HOST, zenoh://HOST/TOPIC, - for lines of JSON
     on stdin, or replay:LOG; SINK is udp://HOST:PORT, zenoh://HOST/TOPIC, foxglove://, - for stdout,
     or a .csv, .parquet or .mcap file. Invalid wrenches are zero, with a flag. --cutoff is causal
-    here; --delay is of the motion behind the wrench, auto: that of the load file. Ends with the
-    source or with Ctrl-C.
+    here. --delay is the delay of the motion behind the wrench; auto: the value in the load file.
+    The command ends with the source or with Ctrl-C.
     """
     from drake_teleop.robots.compensate import compensate_command
 
@@ -354,11 +354,11 @@ def compensate(source: str, load: Path, sink: str, **options: Any) -> None:
 @option.out("calibrate")
 @option.quiet
 def calibrate(source: str, out: Path, **options: Any) -> int:
-    """Identify a load from a live stream, guided.
+    """Identify a load from a live stream, with guidance.
 
     SOURCE is as for `compensate`. Move the tool manually or by the motion of `excite`, without
-    contact. Ends when all tolerances are reached; writes the log and the results of `identify`. The
-    exit status is 1 if it ended before.
+    contact. The command ends when all tolerances are reached; it writes the log and the results of
+    `identify`. The exit status is 1 if it ends before.
     """
     from drake_teleop.cli.calibrate import calibrate_command
 
@@ -407,8 +407,9 @@ def export(identification: Path, to: str, sensor_pose: tuple[float, ...] | None,
 def sample_log(out: Path, **options: Any) -> None:
     """Write a simulated log to try these commands on.
 
-    Wrench and pose of an arm with a gripper, in free motion and with three contacts, from two
-    recorders with different clocks, rates and units; the true values are in truth.json.
+    The log contains wrench and pose of an arm with a gripper, in free motion and with three
+    contacts, from two recorders with different clocks, rates and units. The true values are in
+    truth.json.
     """
     from drake_teleop.logs.sample import sample_log_command
 
@@ -499,8 +500,8 @@ def study(study: Path, out: Path, **options: Any) -> None:
 def scaling_study(out: Path, **options: Any) -> None:
     """Find the best force scales for a simulated operator.
 
-    Runs its tasks over sigma, gamma and eta, about 1000 times. After an interruption the same
-    command continues.
+    Runs the operator's tasks over sigma, gamma and eta, about 1000 times. After an interruption the
+    same command continues.
     """
     from drake_teleop.lab.studies.scaling_study import scaling_study_command
 
@@ -562,9 +563,9 @@ def scaling_study(out: Path, **options: Any) -> None:
 def excite(scenario: str, out: Path, **options: Any) -> None:
     """Design a motion that excites all parameters of a load.
 
-    For the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor. A Fourier
-    series from rest to rest, optimised and checked against every limit and for collisions. Check
-    the 3D replay, excitation.html, before a robot runs it.
+    The motion is for the slave of SCENARIO, or with --model for another arm with SCENARIO's sensor.
+    It is a Fourier series from rest to rest, optimised and checked against every limit and for
+    collisions. Check the 3D replay, excitation.html, before a robot runs the motion.
     """
     from drake_teleop.cli.excitation import excite_command
 
@@ -606,8 +607,8 @@ def new(folder: Path, arm: Path, sensor_frame: str, **options: Any) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: 0, 2 for invalid input, 130 for Ctrl-C or SIGTERM.
 
-    A drive that the user ends has status 0. Status 1: `reproduce` finds an unaccepted number, or
-    `calibrate` ends before all tolerances are reached.
+    A live session that the user ends has status 0. Status 1: `reproduce` finds an unaccepted
+    number, or `calibrate` ends before all tolerances are reached.
     """
     signal.signal(signal.SIGTERM, _terminate)
     atexit.register(gc.freeze)  # the last collection takes 1 s with Drake's objects

@@ -1,4 +1,4 @@
-"""Parameter types and options that commands have in common."""
+"""Parameter types and options of several commands."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from drake_teleop.common.files import scenarios_dir, studies_dir
 
 
 class Utf8Path(click.Path):
-    """Path whose name is UTF-8, which all libraries accept."""
+    """Parameter type of paths with UTF-8 names, which all libraries accept."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path, or fail with one line."""
+        """Return the path, or fail with a one-line message."""
         path = super().convert(value, param, ctx)
         try:
             str(path).encode()
@@ -32,7 +32,7 @@ class Utf8Path(click.Path):
 
 
 class ShippedOrPath(Utf8Path):
-    """Name of a shipped file, or a path; the shell completes both."""
+    """Parameter type: name of a shipped file, or path; the shell completes both."""
 
     def __init__(self, folder: Path, path_type: type) -> None:
         super().__init__(path_type=path_type)
@@ -41,7 +41,7 @@ class ShippedOrPath(Utf8Path):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return the completions of an incomplete word."""
+        """Return the completions of an incomplete name or path."""
         names = sorted(path.stem for path in self._folder.glob("*.yaml"))
         fitting = [CompletionItem(name) for name in names if name.startswith(incomplete)]
         return fitting + super().shell_complete(ctx, param, incomplete)
@@ -58,7 +58,7 @@ def _check_range(
     param: click.Parameter | None,
     ctx: click.Context | None,
 ) -> None:
-    """Fail with words for a number out of range; click writes `x>=0`."""
+    """Fail with a message in words if a number is out of range; click writes `x>=0`."""
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
         text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
@@ -69,14 +69,14 @@ def _check_range(
 
 
 class Number(click.FloatRange):
-    """Finite number in a range; click's type accepts nan and inf."""
+    """Parameter type of finite numbers in a range; click's type accepts nan and inf."""
 
     name = "number"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Return the number, or fail with one line."""
+        """Return the number, or fail with a one-line message."""
         number: float = click.FLOAT.convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
@@ -85,26 +85,26 @@ class Number(click.FloatRange):
 
 
 class Integer(click.IntRange):
-    """Integer in a range."""
+    """Parameter type of integers in a range."""
 
     name = "integer"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the number, or fail with one line."""
+        """Return the number, or fail with a one-line message."""
         number: int = click.INT.convert(value, param, ctx)
         _check_range(self, number, param, ctx)
         return number
 
 
 class Delay(click.ParamType):
-    """Seconds, or "auto"."""
+    """Parameter type of a number of seconds, or "auto"."""
 
     name = "auto|SECONDS"
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """Return the number or "auto", or fail with one line."""
+        """Return the number or "auto", or fail with a one-line message."""
         return "auto" if value == "auto" else Number(-10, 10).convert(value, param, ctx)
 
 
@@ -113,35 +113,35 @@ POSITIVE = Number(0, 1e5, min_open=True)
 
 
 class Names(click.ParamType):
-    """Names separated by commas."""
+    """Parameter type of names separated by commas."""
 
     name = "NAME,..."
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """Return the names."""
+        """Return the names in the text."""
         if isinstance(value, tuple):
             return value
         return tuple(name.strip() for name in value.split(","))
 
 
 class PositiveNumbers(click.ParamType):
-    """Positive numbers separated by commas."""
+    """Parameter type of positive numbers separated by commas."""
 
     name = "number,..."
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """Return the numbers, or fail with one line."""
+        """Return the numbers in the text, or fail with a one-line message."""
         if isinstance(value, tuple):
             return value
         return tuple(POSITIVE.convert(part, param, ctx) for part in value.split(","))
 
 
 def out(command: str) -> Callable[[Any], Any]:
-    """Return the option `--out DIR`; a command that fails leaves no empty folder there."""
+    """Return the option `--out DIR`; a command that fails leaves no new empty folder there."""
     return click.option(
         "--out",
         type=PATH,
@@ -161,7 +161,7 @@ def _remove_empty_at_failure(ctx: click.Context, _: click.Parameter, folder: Pat
 
 
 def _remove_empty(new: list[Path]) -> None:
-    """Remove the folders if they contain only empty folders, innermost first."""
+    """Remove the new folders, innermost first, if they contain only empty folders."""
     inner = sorted(new[0].rglob("*"), reverse=True)
     for folder in (*inner, *new):
         if folder.is_symlink() or not folder.is_dir():
@@ -242,13 +242,13 @@ yes = click.option(
 
 
 def load(*, required: bool = False, default: str = "") -> Callable[[Any], Any]:
-    """Return the option `--load`, with a description of its default."""
+    """Return the option `--load`; its help contains the text `default`."""
     text = "identification.json of the load." + (f"  [default: {default}]" if default else "")
     return click.option("--load", type=PATH, required=required, help=text)
 
 
 def sigma(text: str) -> Callable[[Any], Any]:
-    """Return the option `--sigma` with this help."""
+    """Return the option `--sigma` with the help `text`."""
     return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
 
 
@@ -259,7 +259,7 @@ def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
 
 
 def sensor_pose(text: str) -> Callable[[Any], Any]:
-    """Return the option `--sensor-pose` with this help."""
+    """Return the option `--sensor-pose` with the help `text`."""
     return click.option(
         "--sensor-pose",
         nargs=6,
@@ -270,7 +270,7 @@ def sensor_pose(text: str) -> Callable[[Any], Any]:
 
 
 def stream(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a live SOURCE; those of the model become the argument `arm`."""
+    """Add the options of a live SOURCE; the options of the model become the argument `arm`."""
 
     @wraps(command)
     def with_arm(

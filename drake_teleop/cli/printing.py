@@ -38,7 +38,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
 
 
 _Row: TypeAlias = tuple[str, float, float, float, str, str]
-"""Label, value, standard deviation, factor from SI to the unit, unit, parameter."""
+"""Table row: label, value, standard deviation, factor from SI to the unit, unit, parameter."""
 
 
 def _load_rows(load: dict[str, Any]) -> list[_Row]:
@@ -99,7 +99,7 @@ def print_elimination(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_detection(summary: dict[str, Any], out: Path) -> None:
-    """Print the contacts, and shares of time above the thresholds."""
+    """Print the contacts, and the shares of time above the thresholds."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -130,7 +130,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
 
 
 def print_results(table: Any, figures: str, summary: dict[str, Any], out: Path) -> None:
-    """Print a table, figures in words, notes and the folder."""
+    """Print a table, the text `figures`, delay and notes, and the output folder."""
     from rich.console import Console
 
     lines = [figures]
