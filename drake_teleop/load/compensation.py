@@ -3,7 +3,8 @@
     F_c = F - F_o - V phi                                          (13)
     F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
 
-sigma scales weight and inertia of the load (0 eliminates it), gamma the contact wrench.
+F is the measured wrench, F_o the offsets. sigma scales weight and inertia of the load, 0
+eliminates them; gamma scales the contact wrench F_c.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ def scaled_wrench_into(
     gamma,
     out,
 ):
-    """Write F' of Eq. (T7) into out (6,), with one evaluation of V phi.
+    """Write the scaled wrench F' of Eq. (T7) into out (6,), with one evaluation of V phi.
 
-    For sigma = gamma the result does not depend on errors of the load.
+    For sigma = gamma the result does not depend on errors of the load's parameters.
     """
     a, b = sigma_gripper - gamma, sigma_object - gamma
     phi = (
@@ -84,10 +85,10 @@ def contact_wrench(
     """Return the contact wrench F_c (..., 6) of Eq. (13) [N, N m].
 
     Args:
-        wrench: (..., 6) measured, sign of Eq. (1).
-        offsets: (6,) or (..., 6) of the sensor.
-        s, omega, alpha: (..., 3) as for `regressor`.
-        phi: (10,) about So in S.
+        wrench: (..., 6) measured wrench, sign of Eq. (1).
+        offsets: (6,) or (..., 6) offsets of the sensor.
+        s, omega, alpha: (..., 3) motion, as for `regressor`.
+        phi: (10,) load about So in S.
     """
     return scaled_wrench(
         wrench,
@@ -121,7 +122,7 @@ def scaled_wrench(
     Args:
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
         phi_gripper, phi_object: (10,) parts of the load; zeros for a missing part.
-        sigma_gripper, sigma_object, gamma: factors >= 0.
+        sigma_gripper, sigma_object, gamma: scales >= 0 of gripper, object and contact wrench.
 
     Raises:
         DrakeTeleopError: for a negative factor.
@@ -141,7 +142,7 @@ def scaled_wrench(
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return (sigma_gripper, sigma_object, gamma) = (0, eta, 1), equivalent to Eq. (14).
+    """Return the scales sigma_gripper, sigma_object, gamma = 0, eta, 1, equivalent to Eq. (14).
 
     Raises:
         DrakeTeleopError: if eta is outside [0, 1].

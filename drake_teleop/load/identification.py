@@ -1,4 +1,4 @@
-"""Identified load: values, covariance, verdicts, identification.json, and the gripped object.
+"""Identified load: values, covariance, verdicts, identification.json, and gripped objects.
 
 Parameters in directions without excitation are undetermined: variance inf. A parameter is
 identified if its standard deviation is at most 5 % of `natural_scale`, and "weakly" up to 50 %.
@@ -43,20 +43,20 @@ class Identification:
     """Identified load, as stored in identification.json.
 
     Attributes:
-        phi: (10,) about So in S [kg, kg m, kg m^2].
-        offsets: (6,) of the sensor [N, N m].
+        phi: (10,) load about So in S [kg, kg m, kg m^2].
+        offsets: (6,) offsets of the sensor [N, N m].
         covariance: (16, 16) of [offsets; phi], Eq. (7) [SI]. An undetermined parameter has
             variance inf (null in the file) and covariances 0.
-        identifiable: (16,) bools.
+        identifiable: (16,) True for identified parameters.
         condition_number: of [E V] of Eq. (8), rows weighted by the noise and columns scaled to
             unit norm, over the determined directions.
         delay_s: delay of the motion relative to the wrench [s].
-        residual_rms: (6,) of the wrench channels [N, N m].
+        residual_rms: (6,) RMS residual of the wrench channels [N, N m].
         method: name of the estimator.
         samples: number of samples.
         weight_removed: whether the robot had removed the load's weight from the wrench.
         degrees_of_freedom: (16,) of the variances; inf (null) for specified noise.
-        prior_dominated: (16,) bools, see `uncertainty.prior_dominated`.
+        prior_dominated: (16,) booleans, see `uncertainty.prior_dominated`.
 
     The last three are optional in the file.
     """
@@ -105,7 +105,7 @@ class Identification:
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """Verdicts (16,) from `VERDICTS`.
+        """Verdicts (16,) on [offsets; phi], each one of `VERDICTS`.
 
         "prior" marks a value that is mostly the prior's, "weakly" 5 % to 50 % of `natural_scale`.
         """
@@ -259,15 +259,15 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    """Return (16,) bools: standard deviation at most 5 % of `natural_scale`."""
+    """Return (16,) booleans: standard deviation at most 5 % of `natural_scale`."""
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
     """Return the natural scale (16,) of [offsets; phi] for mass m and size L = max(|c|, 3 cm).
 
-    m g and m g L for offsets, m, m L, and m L^2 / 3 for the inertia: a rod from So to 2 c about its
-    centre. The mass must not be zero.
+    m g and m g L for offsets, m, m L, and m L^2 / 3 for the inertia, as of a rod from So to 2 c
+    about its centre. The mass must not be zero.
     """
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
@@ -289,7 +289,7 @@ def _read_json(path: str | Path) -> dict[str, Any]:
 
 
 def _only_numbers(value: Any) -> bool:
-    """Return whether JSON data contains numbers only; NumPy would also convert "1" and true."""
+    """Return whether JSON data contains numbers only, not "1" or true."""
     if isinstance(value, list):
         return all(map(_only_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool)

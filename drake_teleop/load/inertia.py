@@ -1,7 +1,7 @@
-"""Inertial parameters phi of a rigid load: frames and physical consistency.
+"""Inertial parameters phi of a rigid load: conversions, frames and physical consistency.
 
 phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], about the frame's
-origin. Parameters of parts add. Pseudo-inertia: Wensing, Kim, Slotine 2018.
+origin, with centre of mass c. Parameters of parts add. Pseudo-inertia: Wensing, Kim, Slotine 2018.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _point_inertia(about: Array, mass: float) -> Array:
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    """Return phi (10,) about So in S.
+    """Return the load phi (10,) about So in S.
 
     Args:
         mass: [kg].
@@ -43,7 +43,9 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 
 
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
-    """Return mass [kg], p_SoBcm_S (3,) [m] and I_BBcm_S (3, 3) [kg m^2]; the mass may be negative.
+    """Return mass [kg], centre of mass p_SoBcm_S (3,) [m] and inertia I_BBcm_S (3, 3) [kg m^2].
+
+    The mass may be negative.
 
     Raises:
         DrakeTeleopError: if the mass is zero.
@@ -74,7 +76,7 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """Return phi (10,), the inverse of `pseudo_inertia`.
+    """Return the load phi (10,), the inverse of `pseudo_inertia`.
 
     Raises:
         DrakeTeleopError: if J is not symmetric.
@@ -110,10 +112,10 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """Return phi (10,) of the same load about Ao in A, Eq. (T2).
+    """Return the parameters (10,) of a load about Ao in A, from those about Bo in B, Eq. (T2).
 
     Args:
-        phi_B: (10,) about Bo in B.
+        phi_B: (10,) load about Bo in B.
         R_AB: (3, 3) rotation, v_A = R_AB v_B.
         p_AoBo_A: (3,) position of Bo from Ao, in A [m].
 

@@ -1,9 +1,9 @@
 """Load and sensor offsets of a record by batch least squares, Eqs. (7)-(8), (T3) and (T16).
 
 Scaled Gram eigenvalues below 1e-12 of the largest count as zero: the solution has minimum norm
-there, and affected parameters are undetermined. The covariance uses long-run variances from sums
-over blocks, or for poses at rest one variance for forces and one for torques. Derivation:
-docs/theory.md, "Details of the estimators".
+in these directions, and affected parameters are undetermined. The covariance uses long-run
+variances from sums over blocks; for poses at rest, one variance for forces and one for torques.
+Derivation: docs/theory.md, "Details of the estimators".
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class NormalEquations:
         return int(self._moments[0, 0, 0])
 
     def add(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Add samples (N, 6) and (N, 3), or one (6,) and (3,), as for `identify`."""
+        """Add samples as for `identify`, (N, 6) and (N, 3), or one sample, (6,) and (3,)."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         _accumulate(*rows, self._moments, self._blocks, self._state)
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Return the least squares solution; `delay_s` [s] is stored in it.
+        """Return the least squares solution, in which the given `delay_s` [s] is stored.
 
         Raises:
             DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
@@ -110,7 +110,7 @@ class NormalEquations:
         return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
 
     def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
-        """Return the finite covariance (16, 16) and its diagonal's degrees of freedom (16,)."""
+        """Return the finite covariance (16, 16) and the variances' degrees of freedom (16,)."""
         variances, degrees, _ = self._long_run_variances(theta, inverse)
         # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
@@ -128,7 +128,7 @@ class NormalEquations:
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Return the Gram matrix (16, 16) and right-hand side (16,), for channel weights (6,)."""
+        """Return Gram matrix (16, 16) and right-hand side (16,) for channel weights (6,)."""
         weights = self._weights if weights is None else checked("weights", weights, 6)
         gram, right = np.tensordot(weights, self._channel_grams(), 1), np.zeros(16)
         for c, weight in enumerate(weights):
@@ -143,7 +143,7 @@ class NormalEquations:
 
     @property
     def unexcited(self) -> NDArray[np.bool_]:
-        """Bools (16,): parameters without any influence on the wrench."""
+        """Booleans (16,): True for parameters that do not influence the wrench."""
         squares = np.diag(self.normal_equations(np.ones(6))[0]) / self.samples
         return np.sqrt(squares) < _MIN_EXCITATION
 
@@ -153,7 +153,7 @@ class NormalEquations:
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        """Return the sums (6,) of squared residuals."""
+        """Return the sums (6,) of each channel's squared residuals."""
         theta = checked("theta", theta, 16)
         squares = np.empty(6)
         for c in range(6):
@@ -164,13 +164,16 @@ class NormalEquations:
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Return long-run variances (6,) of the residuals, and their degrees of freedom (6,).
 
-        They are corrected for the power that least squares removes.
+        The variances are corrected for the power that least squares removes.
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 
     def slow_noise(self) -> NDArray[np.bool_]:
-        """Return (6,) bools: noise is slower than the record resolves, deviations are too small."""
+        """Return (6,) booleans: True where the noise is slower than the record resolves.
+
+        The standard deviations are then too small.
+        """
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
 
@@ -288,7 +291,7 @@ def identify(
 
     Args:
         wrench: (N, 6) measured [f; tau], sign of Eq. (1) [N, N m].
-        s, omega, alpha: (N, 3) as for `regressor`, or (3,) zeros for static poses.
+        s, omega, alpha: (N, 3) motion, as for `regressor`, or (3,) zeros for static poses.
         noise: (6,) standard deviations of the wrench channels; None: unweighted.
         delay_s: delay that was removed from the motion, stored in the result [s].
 
@@ -309,8 +312,9 @@ def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
     """Add sums of x x^T, x = [1, wrench, row of V], per channel and per block of samples.
 
     Args:
-        moments: (6, 12, 12), updated.
-        blocks: (n, 6, 12), updated; a full table is halved by joining pairs.
+        moments: (6, 12, 12) sums of each channel, updated.
+        blocks: (n, 6, 12) first rows of each block's sums, updated; a full table is halved by
+            joining pairs.
         state: (2,) index of the open block, samples of a full block; updated.
     """
     V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
@@ -357,7 +361,7 @@ def _add_block(part, moments, block):
 def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_], float]:
-    """Return pseudo-inverse, undetermined parameters (16,) and condition number of a Gram."""
+    """Return a Gram matrix's pseudo-inverse, undetermined parameters (16,), condition number."""
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]

@@ -35,7 +35,7 @@ TIME = -1  #: [s], only in the output of the wrist sensor
 
 @njit(cache=True)
 def regressor_into(s, omega, alpha, V):
-    """Write V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
+    """Write the regressor V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
     sx, sy, sz = s[0], s[1], s[2]
     wx, wy, wz = omega[0], omega[1], omega[2]
     ax, ay, az = alpha[0], alpha[1], alpha[2]
@@ -58,7 +58,7 @@ def regressor_into(s, omega, alpha, V):
 
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Write V phi, Eqs. (1)-(2), into out (6,) without V. phi may be a tuple."""
+    """Write the load's wrench V phi, Eqs. (1)-(2), into out (6,) without V. phi may be a tuple."""
     s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
     m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
     force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
@@ -81,7 +81,7 @@ def _non_contact_wrenches(s, omega, alpha, phi, out):
 
 
 def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
-    """Return V (..., 6, 10) of Eq. (5), with [f; tau] = V phi.
+    """Return the regressor V (..., 6, 10) of Eq. (5), with [f; tau] = V phi.
 
     Args:
         s: (..., 3) specific force a - g of So in S [m/s^2].
@@ -95,9 +95,9 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
 
 
 def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: ArrayLike) -> Array:
-    """Return the wrench V phi (..., 6) of Eqs. (1)-(2) and (12) [N, N m].
+    """Return the load's wrench V phi (..., 6) of Eqs. (1)-(2) and (12) [N, N m].
 
-    Arguments as for `regressor`, and phi (10,) about So in S.
+    Arguments are as for `regressor`, and phi (10,), the load about So in S.
     """
     phi = checked("phi", phi, 10)
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
@@ -107,7 +107,7 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
 
 
 def sample_parts(num_joints: int) -> dict[str, int]:
-    """Return the parts of a wrist sensor's sample: signal name -> size."""
+    """Return a dictionary from signal name to size, for a wrist sensor's sample."""
     return {
         "measured_wrench_S": 6,
         "specific_force_S": 3,

@@ -12,15 +12,15 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.load.inertia import mass_com_inertia
 
 QUANTITIES = ("mass", "com", "inertia")
-"""Quantities of a tolerance."""
+"""Names of the quantities whose accuracy a tolerance can require."""
 ENTRIES = {
     "mass": ("mass",),
     "com": ("com x", "com y", "com z"),
     "inertia": tuple(f"inertia {axes}" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")),
 }
-"""Numbers of each quantity."""
+"""Names of the numbers that each quantity consists of."""
 UNITS = {"mass": "kg", "com": "mm", "inertia": "kg m^2"}
-"""Units for display."""
+"""Unit of each quantity in printed values."""
 
 _FACTORS = {"%": 0.01, "mm": 1e-3, "m": 1.0}
 _ENTRY_PATTERN = re.compile(r"\s*([a-z]+)\s+([0-9.eE+-]+)\s*(%|mm|m)\s*")
@@ -28,11 +28,11 @@ _MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
-    """Required standard deviations; None where no accuracy is required.
+    """Largest permitted standard deviations of a load; None where no accuracy is required.
 
     Attributes:
         mass: relative to the mass.
-        com: along each axis [m].
+        com: of the centre of mass, along each axis [m].
         inertia: of each entry about the centre of mass, relative to the mean principal moment.
     """
 
@@ -42,7 +42,7 @@ class Tolerance(NamedTuple):
 
     @property
     def required(self) -> tuple[str, ...]:
-        """Required `QUANTITIES`."""
+        """Names of the quantities (`QUANTITIES`) whose accuracy is required."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
@@ -60,7 +60,7 @@ class Tolerance(NamedTuple):
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """Return the tolerance of a text of this form.
+    """Return the tolerance that a text such as "mass 0.5 %, com 0.5 mm" specifies.
 
     Raises:
         DrakeTeleopError: for another form or a value outside 1e-9 to 10.
@@ -86,7 +86,7 @@ def read_tolerance(text: str) -> Tolerance:
 
 
 def errors_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the derivative (k, 16) of required numbers over tolerances by [offsets; phi]."""
+    """Return derivatives (k, 16) of the required numbers by [offsets; phi], over the tolerances."""
     m, c, inertia = mass_com_inertia(phi)
     rows = np.zeros((10, 10))
     rows[0, 0] = 1.0 / m
@@ -109,7 +109,10 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """Return standard deviations (k,) over tolerances from `errors_of`; inf if undetermined."""
+    """Return (k,) standard deviations, divided by the tolerances; inf if undetermined.
+
+    `errors` is the result of `errors_of`.
+    """
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
     variances = np.einsum("ki,ij,kj->k", errors, finite, errors)
@@ -118,14 +121,14 @@ def deviations_of(errors: Array, covariance: Array) -> Array:
 
 
 def values_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the required numbers (k,) in the units of `UNITS`."""
+    """Return the values (k,) of the required numbers, in the units of `UNITS`."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required])
 
 
 def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the tolerances (k,) in the units of `UNITS`."""
+    """Return the tolerances (k,) in the units of `UNITS`, for the load phi."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required]

@@ -65,7 +65,7 @@ class FourierTrajectory:
         return q, qd, qdd
 
     def scaled(self, factor: float) -> FourierTrajectory:
-        """Return the motion with `factor` times the amplitude about q0."""
+        """Return the trajectory with `factor` times the amplitude about q0."""
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
@@ -81,7 +81,7 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Read a file of `save`.
+        """Read a YAML file that `save` wrote.
 
         Raises:
             DrakeTeleopError: with file and field, if the content is not a trajectory.

@@ -1,1 +1,1 @@
-"""Recorded logs: identification, elimination and contact detection, without Drake."""
+"""Recorded logs: identification and elimination of the load, contact detection; no Drake needed."""

@@ -1,4 +1,4 @@
-"""Log with the motion that best explains the wrench of an identified load, without its delay."""
+"""Log without its delay, with the motion that best explains the wrench of an identified load."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class AlignedLog:
 
     Attributes:
         log: with removed weight, its specific force is the acceleration.
-        delay_s: of the recorded motion behind the wrench [s].
+        delay_s: removed delay of the recorded motion behind the wrench [s].
         source: of the delay: "estimated", "given", "load" or "static".
-        differentiated: the same with differentiated motion, if required.
-        edge: (N,) samples with measurements on one side only.
+        differentiated: the log with differentiated motion, if required.
+        edge: (N,) True for samples with measurements on one side only.
     """
 
     log: Log
@@ -51,10 +51,10 @@ def aligned_log(
 
     Args:
         path, cutoff_hz, delay: as in `eliminate_log`.
-        phi: (10,) of the load.
+        phi: (10,) identified load.
         usual_s: delay for a record that does not determine it [s].
-        differentiate: whether `AlignedLog.differentiated` is required.
-        weight_removed: whether the wrench is without the weight of the load.
+        differentiate: True if `AlignedLog.differentiated` is required.
+        weight_removed: True if the wrench does not contain the weight of the load.
 
     Raises:
         DrakeTeleopError: if the weight is removed and the log has no orientation.
@@ -91,7 +91,7 @@ def aligned_log(
 
 
 def without_orientation(where: str) -> DrakeTeleopError:
-    """Return the error for a removed weight and a motion without orientation."""
+    """Return the error for a wrench with removed weight whose log has no orientation."""
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",
@@ -101,7 +101,7 @@ def without_orientation(where: str) -> DrakeTeleopError:
 
 
 def accelerated(log: Log) -> Log:
-    """Return the log with the acceleration instead of the specific force.
+    """Return the log with the acceleration in place of the specific force.
 
     Raises:
         DrakeTeleopError: if the log has no orientation.

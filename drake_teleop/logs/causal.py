@@ -1,7 +1,7 @@
 """Contact wrench from past samples alone, as in a control loop.
 
 The low-pass is a Butterworth filter of second order, Eq. (T11) in docs/theory.md. Wrench and
-motion are aligned before it, so that elimination does not suffer from its lag.
+motion are aligned before it, so that its lag does not disturb the elimination.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ MODES = ("delayed", "predicted")
 
 @dataclass(frozen=True)
 class CausalWrench:
-    """Wrenches from past samples alone, N samples.
+    """Wrenches of N samples, each computed from past samples alone.
 
     Args:
         mode: one of `MODES`.
         lag_s: delay of a slow contact without prediction [s].
-        contact: (N, 6) Eq. (13).
-        scaled: (N, 6) gamma F_c + sigma V phi.
-        offsets: (6,) of the load file or the start of the record.
+        contact: (N, 6) contact wrench F_c, Eq. (13).
+        scaled: (N, 6) scaled wrench gamma F_c + sigma V phi.
+        offsets: (6,) offsets of the load file or of the start of the record.
     """
 
     mode: str
@@ -37,13 +37,13 @@ class CausalWrench:
 
 
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Filter along the first axis, settled at the first sample.
+    """Filter samples along the first axis, from the steady state of the first sample.
 
     Args:
         x: (N, ...) samples.
         dt: sample time [s].
         cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
-        ahead_s: prediction by the output's slope [s].
+        ahead_s: time by which the output's slope extrapolates the output [s].
 
     Raises:
         DrakeTeleopError: for a prediction without a filter.
@@ -66,7 +66,7 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 def low_pass_coefficients(
     dt: float, cutoff_hz: float, ahead_s: float = 0.0
 ) -> tuple[Array, Array, Array]:
-    """Return b (3,), a (3,) and the state (2,) settled at 1 of `causal_low_pass`."""
+    """Return b (3,), a (3,) of `causal_low_pass`, and its steady state (2,) for a constant 1."""
     # Imported here, because the import takes longer than the rest of the command.
     from scipy.signal import bilinear, lfilter_zi
 
@@ -85,13 +85,13 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
 def causal_wrenches(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalWrench:
-    """Return the output of a loop at each instant.
+    """Return the output that a control loop has at each instant.
 
     Args:
-        contact, scaled: (N, 6), unfiltered, wrench and motion of the same instants.
+        contact, scaled: (N, 6) unfiltered wrenches, with the motion of the same instants.
         dt: sample time [s].
-        cutoff_hz: of the low-pass.
-        delay_s: of the motion behind the wrench [s], rounded up to a full sample.
+        cutoff_hz: cut-off of the low-pass.
+        delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
         mode: "delayed" keeps the lag, "predicted" extrapolates over it.
 
     Raises:

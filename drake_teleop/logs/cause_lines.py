@@ -1,4 +1,4 @@
-"""Lines of a log description that correct the causes of a record.
+"""Lines of a log description that correct the causes of a misfit.
 
 Each line contains the value after the correction of all causes.
 """
@@ -37,8 +37,9 @@ _OTHER_REMEDIES = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Add the correcting lines to the messages; `by_pose`: the acceleration is from poses, not from
-    an IMU.
+    """Return the causes with the correcting lines added to their messages.
+
+    `by_pose`: the acceleration is from poses, not from an IMU.
     """
     texts = _correct_fields(causes, log, by_pose)[1]
     return tuple(
@@ -48,7 +49,7 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return the fields to set if a mass is too large for a wrist sensor."""
+    """Return the fields to set, as a message, if a mass is too large for a wrist sensor."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]
@@ -145,7 +146,6 @@ def _axes(fields: Fields, values: dict[str, Any]) -> None:
 
 
 def _rotation(fields: Fields, values: dict[str, Any]) -> None:
-    """Rotate all motion to the axes of the wrench, which are those of S."""
     R = Rotation.from_rotvec(values["rotation_vector"]).as_matrix()
     for name in {*_ROTATIONS, *_POSITIONS} & set(fields):
         fields[name] = R @ fields[name]
@@ -161,7 +161,6 @@ def _weight(fields: Fields, values: dict[str, Any]) -> None:
 
 
 def _factor(fields: Fields, values: dict[str, Any]) -> None:
-    """Exchange the unit of torque or force if that explains the factor, otherwise scale."""
     force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
     ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
     ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]

@@ -1,9 +1,9 @@
-"""Contact detection shared by `detect` and `eliminate`.
+"""Contact detection shared by the commands `detect` and `eliminate`.
 
-A statistic of the contact wrench over a noise floor is compared with a threshold: 1.25 times its
-maximum in free motion, and never below the value of normal noise once in a million samples.
-Without a log of free motion, free motion is searched in the record itself (docs/theory.md, "On a
-record").
+A statistic of the contact wrench, relative to its noise floor, is compared with a threshold. This
+is 1.25 times the statistic's maximum in free motion, and at least the value that normal noise
+reaches once in a million samples. Without a log of free motion, free motion is searched in the
+record itself (docs/theory.md, "On a record").
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _CONTACT_SHARE_OF_SHIFT = 0.2
 
 
 class Samples(NamedTuple):
-    """Input of the detector, N samples: F_c (N, 6); s, omega, alpha and a, (N, 3)."""
+    """Input of the detector: contact wrench F_c (N, 6); motion s, omega, alpha, a (N, 3)."""
 
     contact: Array
     s: Array
@@ -51,20 +51,20 @@ class Samples(NamedTuple):
     acceleration: Array
 
     def at(self, rows: slice | NDArray[np.bool_]) -> Samples:
-        """Return some of the samples."""
+        """Return the samples in `rows`."""
         return Samples(*(x[rows] for x in self))
 
 
 @dataclass(frozen=True)
 class Detection:
-    """Contact in a log, N samples.
+    """Contact in a log of N samples.
 
     Args:
         floor: noise floor of the free motion.
         statistic: one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
-        threshold: of the statistic.
-        statistics: (N, 3); 0 at the unjudged ends.
-        touched: (N,) contact, with hysteresis.
+        threshold: threshold of this statistic.
+        statistics: (N, 3) all statistics; 0 at the unjudged ends.
+        touched: (N,) True for contact, with hysteresis.
         free_s: duration of the free motion [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
         notes: reasons for doubt.
@@ -81,12 +81,12 @@ class Detection:
 
     @property
     def above(self) -> NDArray[np.bool_]:
-        """(N,) whether the statistic reaches the threshold."""
+        """Booleans (N,): True where the statistic reaches the threshold."""
         return self.statistics[:, statistic_index(self.statistic)] >= self.threshold
 
 
 def samples_of(log: Log, contact: Array, cutoff_hz: float | None) -> Samples:
-    """Return the detector's input from a log and its (N, 6) low-passed contact wrench."""
+    """Return the detector's input from a log and its low-passed contact wrench (N, 6)."""
     s, omega, alpha = (low_pass(x, log.dt, cutoff_hz) for x in log.motion)
     if log.gravity is not None:
         gravity = low_pass(log.gravity, log.dt, cutoff_hz)
@@ -106,18 +106,18 @@ def detect_contact(
     free: tuple[Samples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
-    """Find contact; return None for fewer than `MIN_SAMPLES` judged samples.
+    """Find contact in a log; return None for fewer than `MIN_SAMPLES` judged samples.
 
     Without `free`, short contacts slightly above the threshold are removed.
 
     Args:
-        rows: whole log, low-passed.
+        rows: samples of the whole log, low-passed.
         dt: sample time [s].
-        cutoff_hz: of the low-pass; a period at both ends is not judged.
+        cutoff_hz: cut-off of the low-pass; one of its periods at both ends is not judged.
         covariance: (16, 16) of [offsets; phi], from `finite_covariance`.
-        usual: (6,) residual rms of the identification [N, N m].
-        edge: (N,) further samples that are not judged.
-        free: samples of a log of free motion, and its dt.
+        usual: (6,) RMS residual of the identification [N, N m].
+        edge: (N,) True for further samples that are not judged.
+        free: samples of a log of free motion, and its sample time [s].
         statistic: one of `STATISTICS`.
 
     Raises:
@@ -170,7 +170,7 @@ def _judged_samples(
 def _floor_from_record(
     rows: Samples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, Samples]:
-    """Return floor, threshold and free motion of a record that contains contacts."""
+    """Return noise floor, threshold and free motion of a record that contains contacts."""
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
@@ -208,7 +208,7 @@ def _quieter_half(level: Array, block: int) -> NDArray[np.bool_]:
 
 
 def _extrapolated(values: Array, block: int, samples: int) -> float:
-    """Extrapolate the maximum of quiet blocks to a number of samples, Eq. (T13)."""
+    """Return the maximum of `values` in free motion, extrapolated to `samples`, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
     largest = values[: count * block].reshape(count, block).max(axis=1)
@@ -257,8 +257,9 @@ def _detection_notes(
 
 
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if most of a record seems to be contact: its offsets are `shift` (6,) from the
-    free motion's.
+    """Return a note if most of a record seems to be contact.
+
+    `shift` (6,) is the difference of its offsets from those of the free motion.
     """
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
@@ -270,8 +271,8 @@ def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
-    """Return the offsets (6,) that most samples of a residual (N, 6) agree on, and their share, Eq.
-    (T12).
+    """Return the offsets (6,) on which most samples of a residual (N, 6) agree, and the share of
+    these samples, Eq. (T12).
     """
     ordered = np.sort(residual, axis=0)
     half = len(ordered) // 2
@@ -291,7 +292,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the (6,) noise of a contact wrench (N, 6) that is calm for half of the record, Eq.
+    """Return the noise (6,) of a contact wrench (N, 6) that is calm for half of the record, Eq.
     (T12).
     """
     ordered = np.sort(contact, axis=0)
@@ -312,7 +313,7 @@ def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
 
 
 def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """Return start, stop, peaks, direction and point of each contact, from (N, 6) F_c."""
+    """Return times, peaks, direction and point of each contact, from contact wrenches (N, 6)."""
     rows = []
     for start, stop in _spans(touched):
         wrench = contact[start:stop]

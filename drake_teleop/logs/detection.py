@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """Contacts of a log, with `eliminated`, the log without its non-contact wrench."""
+    """Contacts of a log; `eliminated` is the log without its non-contact wrench."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 
@@ -37,15 +37,15 @@ def detect_log(
     cutoff_hz: float = 30.0,
     delay: str | float = "auto",
 ) -> DetectedLog:
-    """Find contact after the zero-phase low-pass of `eliminate_log`.
+    """Find contact in a log after the zero-phase low-pass of `eliminate_log`.
 
     Args:
         path: canonical table or log description.
-        load: identification.json or its content; None: identified from the log itself.
+        load: identification.json or its content; None: load identified from the log itself.
         free: log of equally fast free motion with the same load; None: calm parts of the log
             itself.
         statistic: one of `STATISTICS`.
-        cutoff_hz: of the low-pass.
+        cutoff_hz: cut-off of the low-pass.
         delay: as in `eliminate_log`.
 
     Raises:
@@ -72,7 +72,7 @@ def detect_log(
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the share of samples above a force, for each kind of wrench."""
+    """Return the share of samples whose force exceeds a limit, by kind of wrench."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,

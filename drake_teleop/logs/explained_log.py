@@ -27,7 +27,10 @@ _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Explain the wrench of a log; None if it is too short. `found`: motion by splines."""
+    """Explain the wrench of a log; return None if the log is too short.
+
+    `found` is the motion by splines, if there is one.
+    """
 
     def with_delay(more: float) -> Instants:
         late = delay_s + more
@@ -66,7 +69,7 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
-    """Return the noise of the acceleration caused by the positions [m/s^2]."""
+    """Return the noise of the acceleration that noisy positions cause [m/s^2]."""
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed(f, splines.spacing)
     if splines.imu_rows is not None:
@@ -76,10 +79,10 @@ def _acceleration_noise(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
-    """Return the load within the model that explains the wrench, or its intervals widened.
+    """Return the load of the model that explains the wrench, or `load` with wider intervals.
 
-    Noise of an IMU's angular acceleration reduces the inertia; its share is added to the
-    deviations.
+    Noise of an IMU's angular acceleration reduces the inertia; the standard deviations are
+    increased by this share.
     """
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
@@ -125,7 +128,9 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """Return the causes, with the finding for a displaced and rotated pose frame."""
+    """Return the causes; `finding` replaces pose frame and sensor rotation if the model has no
+    other part.
+    """
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
         return (Cause(finding.name, finding.message), *kept)
@@ -133,7 +138,7 @@ def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
 
 
 def removed_note(why: Explanation) -> str:
-    """Return a note about the weight behind `wrench.weight: removed`."""
+    """Return a note about the weight that `wrench.weight: removed` refers to, or ""."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

@@ -1,4 +1,4 @@
-"""Figures of `drake-teleop identify` and `drake-teleop eliminate`.
+"""Figures in the summaries of `drake-teleop identify` and `drake-teleop eliminate`.
 
 docs/log-summaries.md explains their names.
 """
@@ -29,7 +29,7 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """Return the first fields of both summaries."""
+    """Return the fields with which both summaries begin."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
@@ -46,7 +46,7 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """Return the load of a part of a record."""
+    """Return the figures of the load in one part of a record."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -62,7 +62,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """Return values and uncertainties of a load."""
+    """Return the figures of a load: values and uncertainties."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -91,7 +91,7 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """Return warnings for an object without significantly negative mass."""
+    """Return warnings for an object whose mass or parameters are doubtful."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
@@ -114,7 +114,7 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 
 
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
-    """Return rms and peak values of the wrenches."""
+    """Return RMS and peak values of the wrenches, without the edges."""
 
     def rms(x: Array) -> Array:
         return np.sqrt(np.mean(x**2, axis=0))
@@ -132,7 +132,7 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Return noise floor, contacts and causal figures."""
+    """Return the figures of noise floor, contacts and causal wrenches."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,
@@ -175,7 +175,7 @@ def _reduced(
 
 
 def plain(value: Any) -> Any:
-    """Convert NumPy values to plain Python, and infinity to None."""
+    """Convert NumPy values to plain Python values, and infinity to None."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""`drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
+"""Command `drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
 
 docs/log-summaries.md explains the names in its summary.
 """
@@ -46,7 +46,7 @@ _QUANTITIES = (
 
 
 def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
-    """Inspect a canonical log, a description, any table or a bag.
+    """Inspect a canonical log, a log description, any table or a bag.
 
     Write summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
 
@@ -231,7 +231,7 @@ def _stream(
 def _repeated(
     at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
-    """Return a finding if the recorder repeated rows, with the rate of new rows.
+    """Return a finding, with the rate of new rows, if the recorder repeated rows.
 
     A coarse sensor at rest also repeats rows, but then few channels change in the next row.
     """
@@ -316,7 +316,7 @@ def _longest(flags: NDArray[np.bool_]) -> int:
 
 
 def _saturated(x: Array, same: NDArray[np.bool_]) -> int:
-    """Count samples at the ends of the range, if only these repeat."""
+    """Count samples at the ends of a channel's range, if only these values repeat."""
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))

@@ -51,7 +51,7 @@ _MEASURED = "#A3AAB5"
 
 
 def draw_fit(found: IdentifiedLog) -> Figure:
-    """Draw measured wrench, V phi and residual, without offsets; rejected samples are shaded."""
+    """Draw measured wrench, V phi and residual without offsets; shade rejected samples."""
     with plot_style():
         figure = Picture(figsize=(10, 7))
         _fit_into(figure, found)
@@ -59,7 +59,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
 
 def draw_knowledge(found: IdentifiedLog) -> Figure:
-    """Draw residual spectrum, intervals and identifiability."""
+    """Draw the residual's spectrum and the intervals and identifiability of parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
         _knowledge_into(figure, found)
@@ -184,7 +184,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
 
 
 def draw_elimination(found: EliminatedLog) -> Figure:
-    """Draw |F| and six channels of each wrench; contacts are shaded."""
+    """Draw |F| and the six channels of each wrench; shade contacts."""
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
         curves.append(("static weight removed", found.gravity_only, ORANGE))

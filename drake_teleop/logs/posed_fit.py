@@ -1,4 +1,4 @@
-"""Load of a log with poses: `pose_motion` for `identify_log`."""
+"""Fit of the load to a log with poses: `pose_motion` for `identify_log`."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class PosedFit:
 
     Attributes:
         log: used samples with the motion of the splines, low-passed.
-        fit: the load.
+        fit: identified load.
         delay_s: removed delay [s].
-        source: "given", "estimated", or "undetermined" (0 was used).
-        motion: of the poses.
+        source: of the delay: "given", "estimated", or "undetermined" (0 was used).
+        motion: estimate from the poses.
     """
 
     log: Log
@@ -58,10 +58,10 @@ def fit_posed(
     The load is None for other methods or logs, or if an IMU contradicts the poses.
 
     Args:
-        log: as read.
+        log: the log as read.
         method: one of `METHODS`.
-        cutoff_hz: of the low-pass on samples and residual.
-        delay: of the motion behind the wrench [s], or "auto".
+        cutoff_hz: cut-off of the low-pass on samples and residual.
+        delay: delay of the motion behind the wrench [s], or "auto".
     """
     if log.posed is None or method not in ROBUST or not usable(log):
         return None, ()
@@ -136,7 +136,7 @@ def _fit(
 
 
 def _consistent(found: PoseEstimate) -> Array:
-    """(16,) nearest physically consistent load; a negative mass remains."""
+    """Return [offsets; phi] (16,) of the nearest consistent load; a negative mass remains."""
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta

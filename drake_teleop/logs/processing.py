@@ -47,7 +47,7 @@ from drake_teleop.logs.read.delay import delay_of
 from drake_teleop.logs.read.reading import read_log
 
 _GAIN_CAUSES = {"gain", "sensor rotation", "torque factor"}
-"""Causes that are explained by stated errors of gains."""
+"""Causes that stated gain errors can explain."""
 _CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _SIGNIFICANT_DELAY = 5.0  # standard deviations
@@ -60,13 +60,13 @@ class IdentifiedLog:
 
     Args:
         log: used samples: without delay and gaps, low-passed.
-        identification: the result.
-        predicted: (N, 6) offsets + V phi at the same instants.
-        delay_source: as in the summary.
-        rejected: (N,) samples rejected by robust fits.
+        identification: identified load.
+        predicted: (N, 6) wrench offsets + V phi at the same instants.
+        delay_source: source of the delay, as in the summary.
+        rejected: (N,) True for samples that robust fits reject.
         base: combinations of offsets and load that the samples determine.
         findings: suspected errors of the description.
-        causes: effects beside a rigid load with constant offsets, included in the model.
+        causes: effects other than a rigid load with constant offsets, included in the model.
         loads: load of each part of the record, if it changes.
         delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
@@ -92,20 +92,20 @@ class EliminatedLog:
 
     Args:
         log: without delay and gaps; not low-passed.
-        phi: (10,) of gripper and object, see `usable_phi`.
+        phi: (10,) load, gripper and object, see `usable_phi`.
         point_mass: names of the inertias replaced by those of a point mass.
         offsets: (6,) of this record.
         tare_fraction: share of the samples that determined `offsets`; 1 if not tared.
-        delay_s: of the motion behind the wrench [s].
-        delay_source: as in the summary.
+        delay_s: removed delay of the motion behind the wrench [s].
+        delay_source: source of the delay, as in the summary.
         measured: (N, 6) wrench without offsets.
-        non_contact: (N, 6) V phi.
-        contact: (N, 6) Eq. (13).
-        scaled: (N, 6) gamma F_c + sigma V phi.
+        non_contact: (N, 6) load's wrench V phi.
+        contact: (N, 6) contact wrench F_c, Eq. (13).
+        scaled: (N, 6) scaled wrench gamma F_c + sigma V phi.
         gravity_only: (N, 6) wrench without offsets and weight; None without orientation.
-        noise_floor: (6,) of `contact`, independent of the motion.
+        noise_floor: (6,) noise of `contact`, independent of the motion.
         causal: wrenches as in a control loop, if requested.
-        edge: (N,) unjudged samples at ends and gaps, excluded from all figures.
+        edge: (N,) True for unjudged samples at ends and gaps, excluded from all figures.
         detection: contacts; None for static poses and very short records.
         findings: suspected errors of the description, after a poor fit.
     """
@@ -130,7 +130,7 @@ class EliminatedLog:
 
     @property
     def touched(self) -> NDArray[np.bool_]:
-        """(N,) contact; False everywhere without a `detection`."""
+        """Booleans (N,): True for contact; all False without a `detection`."""
         none = np.zeros(len(self.contact), bool)
         return none if self.detection is None else self.detection.touched
 
@@ -151,9 +151,9 @@ def identify_log(
     Args:
         path: canonical table or log description.
         method: one of `drake_teleop.load.batch.methods.METHODS`.
-        cutoff_hz: of the low-pass; None for none.
-        delay: of the motion behind the wrench [s], or "auto".
-        checks: of this log, if already known.
+        cutoff_hz: cut-off of the low-pass; None for no filter.
+        delay: delay of the motion behind the wrench [s], or "auto".
+        checks: checks of this log, if already known.
 
     Raises:
         DrakeTeleopError: for an unusable log, an unknown method or a worthless result
@@ -256,11 +256,11 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     """Check a log and its description, with the causes that identification finds.
 
-    Causes replace findings that may be their effects.
+    Causes replace findings that may be effects of these causes.
 
     Args:
         path: canonical table or log description.
-        checks: of the description without causes, if already known.
+        checks: checks of the description without causes, if already known.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -311,19 +311,20 @@ def eliminate_log(
     Args:
         path, delay: as in `identify_log`.
         load: identification.json, or its content.
-        gripper: the same of the gripper alone, in the same frame S; `load` is then gripper with
-            object.
-        sigma: kept share of the non-contact wrench, of the gripper if there is one.
-        sigma_object: kept share of the object's, with a gripper only; None: sigma.
+        gripper: identification of the gripper alone, in the same frame S; `load` is then gripper
+            with object.
+        sigma: kept share of the non-contact wrench; with `gripper`, of the gripper's.
+        sigma_object: kept share of the object's wrench, with `gripper` only; None: sigma.
         gamma: scale of the contact wrench.
-        eta: kept share of the object, Eq. (14), instead of the other scales; the gripper is
-            removed.
-        cutoff_hz: zero-phase low-pass on all outputs; None for none.
+        eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
+            is removed.
+        cutoff_hz: zero-phase low-pass on all outputs; None for no filter.
         tare: estimate the offsets from this record (`robust_offsets`), not from `load`.
         causal: "delayed" or "predicted": also return `EliminatedLog.causal`.
-        causal_tare_s: contact-free start that determines its offsets [s]; None: those of `load`.
+        causal_tare_s: contact-free start that determines the offsets of `causal` [s]; None: those
+            of `load`.
         free: log of free motion with the same load; None: calm parts of the record itself.
-        statistic: of contact, one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
+        statistic: contact statistic, one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
 
     Raises:
         DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
@@ -481,9 +482,9 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Replace unidentified inertias by those of a point mass; return phi (10,) and their names.
+    """Return the load phi (10,) with point-mass inertias where unidentified, and their names.
 
-    m (c'c E - c c') is the smallest inertia about So for this mass and centre of mass.
+    m (c'c E - c c') is the smallest inertia about So for this mass m and centre of mass c.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(~identification.identifiable[10:])
@@ -495,7 +496,7 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
 def _suspected_errors(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
-    """Return errors of the description if the load leaves 30 % of the median force."""
+    """Return errors of the description if 30 % of the median force remain after elimination."""
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()

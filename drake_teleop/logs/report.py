@@ -1,4 +1,4 @@
-"""HTML report of `identify`."""
+"""HTML report of the command `identify`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PILLS = {"identified": "agrees", "not": "differs"}
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Printed row of one parameter, in `unit`."""
+    """Printed row of one parameter, with numbers in `unit`."""
 
     symbol: str
     index: str
@@ -42,7 +42,7 @@ class ParameterRow:
 
 
 def parameter_rows(load: Identification) -> list[ParameterRow]:
-    """Return the 16 rows of [offsets; phi], Eq. (7), without unidentified values."""
+    """Return the 16 rows of [offsets; phi], Eq. (7), without values of unidentified parameters."""
     theta = np.concatenate([load.offsets, load.phi])
     columns = np.stack([theta, load.standard_deviations, *intervals(load)], axis=1)
     rows = []
@@ -75,8 +75,8 @@ def write_report(
     Args:
         path: HTML file; fit.png and knowledge.png are beside it.
         found: identified log.
-        summary: of `identify_command`.
-        alone: the object, if the gripper is known.
+        summary: summary of `identify_command`.
+        alone: identification of the object alone, if the gripper is known.
     """
     log, result = found.log, found.identification
     tables = [

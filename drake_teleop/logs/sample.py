@@ -1,7 +1,7 @@
 """Simulated log of `drake-teleop sample-log`: a gripper on an arm with the lengths of a UR5e.
 
-It moves freely (free.yaml) and is touched (touched.yaml). Wrench and pose have different rates,
-clocks and units, noise, offsets and a delay. truth.json contains the true values.
+The gripper moves freely (free.yaml) and is touched (touched.yaml). Wrench and pose have different
+rates, clocks and units, noise, offsets and a delay. truth.json contains the true values.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
 
 MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
 INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])
-"""The gripper: kg, m, kg m^2, in S; about a Robotiq 2F-85."""
+"""Mass [kg], centre of mass [m] and inertia [kg m^2] of the gripper in S, similar to a Robotiq
+2F-85."""
 TIP_S = np.array([0.0, 0.0, 0.17])
 OFFSETS = np.array([[4.2, -6.1, 11.3, 0.21, -0.14, 0.05], [4.5, -6.0, 10.9, 0.21, -0.15, 0.05]])
 """(2, 6) offsets of the sensor in the two records [N, N m], with drift between them."""
@@ -57,7 +58,7 @@ class Touch:
     """Half-sine push at the fingertips.
 
     Args:
-        start_s, stop_s: on the sensor's clock.
+        start_s, stop_s: times on the sensor's clock.
         push_W: (3,) largest force on the gripper, in the world [N].
     """
 
@@ -66,7 +67,7 @@ class Touch:
     push_W: tuple[float, float, float]
 
     def force(self, t: Array) -> Array:
-        """(N, 3) force in the world, at times t (N,)."""
+        """Return the force (N, 3) in the world [N] at times t (N,)."""
         share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
         return np.outer(np.sin(np.pi * share), self.push_W)
 
@@ -107,7 +108,7 @@ def _description(name: str) -> dict[str, Any]:
 def sample_log_command(out: Path, *, seed: int = 0, quiet: bool = False) -> dict[str, Any]:
     """Write records, descriptions, truth.json and summary.json into `out`; return the summary.
 
-    The same seed of the noise gives the same bytes.
+    The same seed of the noise gives identical files.
     """
     random = np.random.default_rng(seed)
     records = {"free": ((), "in free motion"), "touched": (TOUCHES, "touched three times")}
@@ -176,7 +177,6 @@ class _Motion:
     trajectory: FourierTrajectory
 
     def at(self, t: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) at times t (N,)."""
         moving = np.clip(t - REST_S, 0, PERIOD_S)
         return sensor_motion(*self.trajectory.evaluate(moving))
 
@@ -188,7 +188,9 @@ def _motion(number: int) -> _Motion:
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link.
+    """Return the motion of the last link's frame S, from joint angles.
+
+    It is s, omega, alpha (N, 3) in S, orientation R_WS (N, 3, 3) and position p_WS (N, 3).
 
     Args:
         q, qd, qdd: (N, 6) joint angles and their derivatives [rad, s].

@@ -31,8 +31,8 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
     """Return motion and load of a log with poses, and the source of the delay.
 
     Args:
-        log: as read.
-        delay: of the motion behind the wrench [s], or "auto".
+        log: the log as read.
+        delay: delay of the motion behind the wrench [s], or "auto".
 
     Raises:
         DrakeTeleopError: for too few usable samples, or an invalid delay.
@@ -43,7 +43,7 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
 def motion_of_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """Return the motion that suits an identified load best, and the source of the delay.
+    """Return the motion with which an identified load fits best, and the source of the delay.
 
     None without positions, for a short record, and if an IMU disagrees with the poses.
 
@@ -95,7 +95,7 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with spline motion and without delay, and its edge samples (N,).
+    """Return the log with spline motion and without delay, and (N,) True for edge samples.
 
     Within two knots of an end or a gap of the poses the acceleration is noisy.
     """
@@ -120,7 +120,7 @@ def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool
 
 
 def clock_note(found: PoseMotion) -> list[str]:
-    """Return a note on a clock rate of the poses that differs from the wrench's."""
+    """Return a note if the clock rate of the poses differs from that of the wrench."""
     if not found.clock_rate:
         return []
     side = "faster" if found.clock_rate > 0.0 else "slower"

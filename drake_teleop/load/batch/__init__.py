@@ -1,1 +1,1 @@
-"""Estimators of the load from a whole record."""
+"""Estimators that determine the load from a whole record."""

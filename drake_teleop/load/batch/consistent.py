@@ -1,12 +1,13 @@
-"""Physically consistent load with the best fit, as a semidefinite program, Eqs. (T1) and (T5).
+"""Physically consistent load that fits best, by a semidefinite program, Eqs. (T1) and (T5).
 
 A consistent least squares solution is returned unchanged (Wensing, Kim, Slotine, RA-L 2018).
-Priors phi_0, weighted per sample:
+Costs of a prior load phi_0 with pseudo-inertia J_0, weighted per sample:
 
 - entropic: tr(J_0^-1 J) - log det J (Lee, Wensing, Park, T-RO 2020);
 - geodesic: 1/2 tr((J_0^-1 (J - J_0))^2), a quadratic cost (Lee, Park, RA-L 2018).
 
-An ellipsoid that contains the mass adds tr(J E) >= 0, E = [[-A, A c], [c^T A, 1 - c^T A c]].
+An ellipsoid that contains the mass adds tr(J E) >= 0, E = [[-A, A c], [c^T A, 1 - c^T A c]], with
+matrix A and centre c.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ _PRIORS = ("entropic", "geodesic")
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior of the load; `kind` is "entropic" or "geodesic".
+    """Prior of the load; `kind` names the cost, "entropic" or "geodesic".
 
     Attributes:
-        phi: (10,) about So in S, of a body with extent in all directions.
-        weight: residual variance per sample.
+        phi: (10,) prior load about So in S, of a body with extent in all directions.
+        weight: factor of the cost, a residual variance per sample.
     """
 
     phi: ArrayLike
@@ -64,15 +65,15 @@ class Ellipsoid:
     """Ellipsoid that contains the mass: (r - center)^T matrix (r - center) <= 1.
 
     Attributes:
-        center: (3,) from So in S [m].
-        matrix: (3, 3) positive definite [1/m^2].
+        center: (3,) position of the centre from So, in S [m].
+        matrix: (3, 3) shape, positive definite [1/m^2].
     """
 
     center: ArrayLike
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return the coefficients (10,) of phi in tr(J E) >= 0.
+        """Return the coefficients (10,) of the load phi in the constraint tr(J E) >= 0.
 
         Raises:
             DrakeTeleopError: if the matrix is not positive definite.
@@ -95,7 +96,7 @@ def consistent_least_squares(
 
     Args:
         gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
-        theta: (16,) their solution.
+        theta: (16,) solution of these equations.
 
     Raises:
         DrakeTeleopError: if the solver finds no solution.
@@ -117,7 +118,7 @@ def consistent_least_squares(
 
 
 def _parameter_units(phi: Array) -> Array:
-    """Return units (10,) (m0, m0 L, m0 L^2) that scale the program, L the radius about So."""
+    """Return the units (10,) (m0, m0 L, m0 L^2) of phi; L is a length about So."""
     m = abs(phi[0])
     if m == 0.0:
         raise DrakeTeleopError("the mass cannot be identified from this wrench", where="wrench")
@@ -181,14 +182,15 @@ def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 
 @cache
 def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
-    """Return the reusable program of a thread; building it takes as long as solving it."""
+    """Return one program per thread; building it takes as long as solving it."""
     return _make_program(distance=True)
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return the cone t >= |R x - d| with R^T R = H, R^T d = b: (11, 11) and (11,) for [x; t].
+    """Return matrix (11, 11) and vector (11,) of the cone t >= |R x - d| for unknowns [x; t].
 
-    With the squared distance, the solver's tolerance of 1e-8 would become an error of 1e-4.
+    R and d satisfy R^T R = H and R^T d = b. With the squared distance as cost, the solver's
+    tolerance of 1e-8 would become an error of 1e-4.
     """
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]

@@ -1,8 +1,8 @@
 """Covariance of the batch estimators (docs/theory.md, "Details of the estimators").
 
-It starts from that of `NormalEquations` and adds noise of the motion, random walks of the offsets,
-errors in variables, the prior and errors of the sensor's 36 gains. `consistent` uses the covariance
-without its constraint.
+The covariance of `NormalEquations`, with noise of the motion, random walks of the offsets, errors
+in variables, the prior and errors of the sensor's 36 gains. `consistent` uses the covariance
+without the consistency constraint.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ ARM = 0.06
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior, and (16,) bools: prior-dominated.
+    """Return the covariance (16, 16) of data and prior, and (16,) booleans: True if
+    prior-dominated.
 
     With information D of the data and P of the prior (10, 10), the data's share is the diagonal of
     (D + P)^-1 D.
@@ -52,7 +53,9 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """Return the covariance (16, 16) for weights W between channels, correlated as W^-1."""
+    """Return the covariance (16, 16) for weights W between channels, whose noise correlates as
+    W^-1.
+    """
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
     if np.array_equal(W, np.diag(np.diag(W))):
@@ -74,7 +77,10 @@ def _inverse_gram(fit: Fit) -> Array:
 
 
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
-    """Return the covariance (16, 16) of random walks of the offsets, steps (6, 6) per sample."""
+    """Return the covariance (16, 16) due to random walks of offsets and motion.
+
+    `steps` (6, 6) is the covariance of their steps per sample, as wrenches.
+    """
     covariance = np.zeros((16, 16))
     if not steps.any():
         return covariance
@@ -95,7 +101,7 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """Return the effect (n, 36) of a unit error of each sensor gain, scaled by `ARM`.
+    """Return the parameter errors (n, 36) that a unit error of each gain causes, scaled by `ARM`.
 
     Args:
         products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
@@ -109,7 +115,7 @@ def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """Return the covariance (16, 16) due to gain errors with standard deviation 1."""
+    """Return the covariance (16, 16) that gain errors of standard deviation 1 cause."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)
@@ -119,7 +125,7 @@ def gain_covariance(fit: Fit, offsets: bool) -> Array:
 
 
 def covariance_of(plain: Array, form: NormalForm, offsets: bool) -> Array:
-    """Return the covariance (16, 16) of the form's solution from that of least squares."""
+    """Return the covariance (16, 16) of the solution `form`; `plain` is that of least squares."""
     unknown = np.isinf(np.diag(plain))
     covariance = np.where(unknown[:, None] | unknown, 0.0, plain)
     if not offsets:  # covariance for known offsets

@@ -72,8 +72,8 @@ class BatchResult:
 
     Attributes:
         identification: load and offsets.
-        noise: (6,) standard deviations behind the weights [N, N m].
-        rejected: (N,) bools.
+        noise: (6,) standard deviations that determine the weights [N, N m].
+        rejected: (N,) booleans: True for rejected samples.
         note: warning for the user, mostly empty.
         equations: of the used samples, for `uncertainty.base_parameters`.
     """
@@ -145,7 +145,7 @@ def _huber(record: Record, options: Options) -> NormalForm:
 
 
 def _std_growth(whole: Fit, kept: Moments) -> float:
-    """Return the largest ratio of standard deviations, fewer samples over all samples."""
+    """Return the largest factor by which omitted samples increase a standard deviation."""
     if kept.samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
     used = excited_columns(whole.moments.mean)
@@ -157,7 +157,7 @@ def _std_growth(whole: Fit, kept: Moments) -> float:
 
 
 class Method(NamedTuple):
-    """Name of an estimator in `Identification.method`, and its function."""
+    """Estimator: the text for `Identification.method`, and the function that fits."""
 
     name: str
     fit: Callable[[Record, Options], Fit]
@@ -201,10 +201,10 @@ def identify_batch(
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
-        noise: of wrench and motion; default: estimated wrench noise, exact motion, fixed offsets.
-        offsets: False if they were subtracted before.
-        shared_noise: one estimated noise for the forces and one for the torques, as for averages
-            over poses at rest.
+        noise: of wrench and motion; None: estimated wrench noise, exact motion, fixed offsets.
+        offsets: False if the wrench contains no offsets.
+        shared_noise: one estimated noise for forces and one for torques, as for averages over
+            poses at rest.
         resolution: quantisation step of forces and torques [N, N m], for averages over poses.
         prior, ellipsoid: only for "consistent".
         gain_std: standard deviation of the sensor's 36 gains, scaled by `covariance.ARM` between
@@ -257,7 +257,7 @@ def identify_batch(
 
 
 def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
-    """Return total least squares with the specified noise, or that of the residual."""
+    """Return a total least squares fit with specified, else estimated, wrench noise."""
     noise, Z = options.noise, moments.mean
     if noise.wrench is not None:
         std = np.asarray(noise.wrench, np.float64)
@@ -280,7 +280,7 @@ def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
 
 
 def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
-    """Return (N,) largest residual of a sample over the channel's robust deviation."""
+    """Return (N,) each sample's largest residual over its robust deviation."""
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)

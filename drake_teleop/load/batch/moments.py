@@ -1,11 +1,12 @@
-"""Second moments of a record, a (19, 19) matrix for any length, Eq. (T4).
+"""Second moments of a record, a (19, 19) matrix for any number of samples, Eq. (T4).
 
 Row c of [E V] is T_c z with constant T_c and
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 
 The mean of z z^T determines least squares with any weights between channels, errors in variables
-and the residual's covariance. Noise of omega counts to first order.
+and the residual's covariance. F is the wrench, w = omega. Noise of omega counts to first
+order.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ class Noise:
     """Standard deviations of white measurement noise, independent between channels.
 
     Attributes:
-        wrench: (6,) of [f; tau] [N, N m]; None to estimate them from the residual.
+        wrench: (6,) noise of [f; tau] [N, N m]; None to estimate it from the residual.
         s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
-        walk: (12,), or 0, steps per sample of the random walks of [wrench, s, alpha].
+        walk: (12,), or 0, step per sample of random walks of [wrench, s, alpha].
     """
 
     wrench: ArrayLike | None = None
@@ -63,7 +64,7 @@ class Noise:
 
 
 class Moments:
-    """Sums of z z^T over a record; memory does not depend on its length."""
+    """Sum of z z^T over a record; memory does not depend on its length."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((19, 19))
@@ -106,7 +107,7 @@ class Moments:
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
-        """Return the mean covariance Q (19, 19) of the noise of z; wrench: (6,) std."""
+        """Return the mean noise covariance Q (19, 19) of z for the wrench noise `wrench` (6,)."""
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
@@ -121,7 +122,7 @@ class Moments:
 
     @staticmethod
     def walk_covariance(noise: Noise) -> Array:
-        """Return the covariance (19, 19) of the steps of the random walks of z."""
+        """Return the covariance (19, 19) of the random walks of z per sample."""
         Q = np.zeros((19, 19))
         Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
         return Q
@@ -129,7 +130,7 @@ class Moments:
 
 @cache
 def coefficients() -> Array:
-    """Return T (6, 16, 19) with [E V] = T z, computed from the regressor."""
+    """Return the constant T (6, 16, 19) of [E V] = T z, computed from the regressor."""
     T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
     T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)
@@ -145,7 +146,7 @@ def coefficients() -> Array:
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
 
-    Z is a mean of z z^T or a noise covariance, W the weights between the channels.
+    Z (19, 19) is a mean of z z^T or a noise covariance, W (6, 6) the weights between the channels.
     """
     T = coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
@@ -156,7 +157,10 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T, r = F - [E V] theta, from moments or noise covariance Z."""
+    """Return the mean (6, 6) of r r^T with the residual r = F - [E V] theta.
+
+    Z (19, 19) is a mean of z z^T, or a noise covariance.
+    """
     L = -np.einsum("cjk,j->ck", coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
     S = L @ Z @ L.T
@@ -164,12 +168,12 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
-    """Return (16,) bools: columns of [E V] above rounding."""
+    """Return (16,) booleans: True for columns of [E V] that exceed rounding errors."""
     return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """Return R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution.
+    """Return the matrix R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution.
 
     Columns are scaled. R is 0 in unused columns and along singular directions.
     """
@@ -181,7 +185,6 @@ def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, weights, sums):
-    """Add the weighted sum of z z^T to sums (19, 19), upper half."""
     z = np.empty(19)
     for i in range(wrench.shape[0]):
         z[0] = 1.0

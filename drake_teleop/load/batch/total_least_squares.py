@@ -1,11 +1,12 @@
 """Mixed least squares and total least squares: noise in the measured motion too, Eq. (T4).
 
-The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)), the factor of the specified
-variances (Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3 and 8).
-W = R(theta)^-1 is updated until convergence (Kukush, Van Huffel, Metrika 59, 2004).
+The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)), the ratio of the residual
+covariance S to the covariance R that the specified noise causes (Van Huffel, Vandewalle, The Total
+Least Squares Problem, 1991, chapters 3 and 8). W = R(theta)^-1 is updated until convergence
+(Kukush, Van Huffel, Metrika 59, 2004).
 
-A direction v is left out if v^T G v exceeds lambda v^T C v by less than 5 sqrt(2 / N) of it: the
-motion is not distinguishable from its noise.
+A direction v is omitted if its signal v^T G v exceeds its noise n = lambda v^T C v by less than
+5 sqrt(2 / N) n: the motion along v is not distinguishable from noise.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ class NormalForm(NamedTuple):
     """Equations gram theta = right, divided by the number of samples, and their solution.
 
     Attributes:
-        gram: (16, 16), compensated for noise.
-        right: (16,).
-        theta: (16,) [offsets; phi] [SI].
-        weights: (6, 6) W between channels.
+        gram: (16, 16) Gram matrix, compensated for noise.
+        right: (16,) right-hand side.
+        theta: (16,) solution [offsets; phi] [SI].
+        weights: (6, 6) weights W between channels.
         scale: lambda.
-        transfer: (16, 16) from plain least squares to theta.
-        undetermined: (16,) bools, parameters with most of their variance in left-out directions.
+        transfer: (16, 16) matrix from the ordinary least squares solution to theta.
+        undetermined: (16,) True for parameters whose variance is mostly in omitted directions.
     """
 
     gram: Array
@@ -62,9 +63,9 @@ class NormalForm(NamedTuple):
 def total_least_squares(
     moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
-    """Return offsets and load for noise of the wrench (6,) [N, N m] and of the motion.
+    """Return offsets and load, allowing for noise of the wrench (6,) [N, N m] and of the motion.
 
-    `offsets` False fixes them at 0.
+    `offsets=False` fixes the offsets at 0.
 
     Raises:
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
@@ -90,7 +91,7 @@ def total_least_squares(
 
 
 def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> NormalForm:
-    """Return mixed TLS for W, without directions with a signal share below `min_gain`."""
+    """Return mixed TLS for weights W, without directions whose gain is below `min_gain`."""
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
@@ -121,8 +122,10 @@ def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> Norm
 
 
 def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest lambda that makes [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise]
-    singular: the only root below 1 / max(nu) of the secular equation.
+    """Return the smallest lambda for which the matrix
+    [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise] is singular.
+
+    This is the only root below 1 / max(nu) of the secular equation; b is `right`.
     """
 
     def excess(ratio: float) -> float:
@@ -138,7 +141,7 @@ def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Options of an estimator, as for `identify_batch`."""
+    """Options of a batch estimator, as for `identify_batch`."""
 
     noise: Noise
     offsets: bool = True
@@ -149,7 +152,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Checked record: wrench (N, 6), s, omega and alpha (N, 3)."""
+    """Checked samples: wrench (N, 6), motion s, omega and alpha (N, 3)."""
 
     wrench: Array
     s: Array
@@ -158,7 +161,7 @@ class Record:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Wrench (N, 6), s, omega and alpha (N, 3)."""
+        """Tables wrench (N, 6), s, omega and alpha (N, 3)."""
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
@@ -169,18 +172,18 @@ class Record:
         return moments
 
     def every(self, step: int) -> Record:
-        """Return every `step`-th sample."""
+        """Return a record with every `step`-th sample."""
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        """Return F - [E V] theta (n, 6) of a part of the samples."""
+        """Return the residuals F - [E V] theta (n, 6) of the samples in `part`."""
         F, s, omega, alpha = (table[part] for table in self.arrays)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Normal form, wrench noise (6,), moments, rejected samples (N,) and a note for the user."""
+    """Result: normal form, wrench noise (6,), moments, rejected samples (N,), note for the user."""
 
     form: NormalForm
     wrench_noise: Array

@@ -1,4 +1,4 @@
-"""Intervals, determined combinations, prior shares and predicted wrenches of an identification."""
+"""Uncertainty of an identification: intervals, prior shares, determined parameter combinations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
 
-    Student's t with the degrees of freedom of each variance; (-inf, inf) if undetermined.
+    Student's t with the degrees of freedom of each variance; (-inf, inf) for undetermined
+    parameters.
 
     Raises:
         DrakeTeleopError: if the level is outside (0, 1).
@@ -50,7 +51,9 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Return (n,) bools: standard deviation at least `share` of the prior's, inf for no prior.
+    """Return (n,) booleans: True where a standard deviation is at least `share` of the prior's.
+
+    A prior standard deviation of inf means no prior.
 
     Raises:
         DrakeTeleopError: if shapes differ or a prior standard deviation is not positive.
@@ -68,8 +71,8 @@ class Combination:
     """Linear combination of [offsets; phi] that a record determines.
 
     Attributes:
-        coefficients: (16,); 1 for the leading parameter, which gives the unit.
-        leading: its index in `PARAMETERS`.
+        coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
+        leading: index of the leading parameter in `PARAMETERS`.
         share: standard deviation over the natural scale.
         words: the sum as text; "..." stands for terms below a tenth of the largest.
     """
@@ -110,7 +113,7 @@ class BaseParameters:
         return len(self.combinations)
 
     def lines(self) -> list[str]:
-        """Return the summary as lines of text."""
+        """Return a text summary of the base parameters."""
         lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)

@@ -1,1 +1,1 @@
-"""Contact detection in the eliminated wrench."""
+"""Contact detection in the wrench that remains after elimination of the load."""

@@ -1,6 +1,6 @@
 """Contact detection in the eliminated wrench, sample by sample.
 
-Statistics, of z and e as in `noise_floor`:
+Statistics of the normalised wrench z and of its innovations e (defined in `noise_floor`):
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
@@ -8,7 +8,8 @@ Statistics, of z and e as in `noise_floor`:
     glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
              generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
 
-Contact begins at a threshold and ends after `hold` samples below `leave`; then the sums restart.
+Contact begins at a threshold of the chosen statistic. It ends after `hold` samples with a level
+below `leave`; then the sums restart.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ Z, MEAN, SUM, TOTAL, RING = 8, 14, 20, 26, 32
 SIZE = RING + 6 * WINDOW
 """Length of the memory of `detection_update`."""
 SLACK = 1.0
-"""Slack of the cumulative sum [standard deviations]. In white noise, half of the smallest shift to
-detect is best; this value tolerates lasting errors of the load."""
+"""Default slack of the cumulative sum [standard deviations]. In white noise, half of the smallest
+shift to be detected is best; this value tolerates lasting errors of the load."""
 RARE = 6.2
 """Level that normal noise reaches once in a million samples."""
 LEAVE = 0.7 * RARE
@@ -57,10 +58,10 @@ def detection_update(
 
     Args:
         memory: (SIZE,), zeros before the first sample.
-        contact: (6,) F_c of Eq. (13).
-        s, omega, alpha, acceleration: (3,) as for `NoiseFloor.sigma`.
+        contact: (6,) contact wrench F_c of Eq. (13).
+        s, omega, alpha, acceleration: (3,) motion, as for `NoiseFloor.sigma`.
         parameters: `NoiseFloor.parameters`.
-        slack, following, quiet: as for `ContactDetector`, quiet for leave.
+        slack, following, quiet: as `slack`, `following`, `leave` of `ContactDetector`.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -132,11 +133,11 @@ def statistics(
     slack: float = SLACK,
     following: float = 0.0,
 ) -> Array:
-    """Return the `STATISTICS` (N, 3) of each sample of a log, without hysteresis.
+    """Return the `STATISTICS` (N, 3) of each sample of a log, without contact decisions.
 
     Args:
-        contact: (N, 6) F_c of Eq. (13) [N, N m].
-        s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
+        contact: (N, 6) contact wrench F_c of Eq. (13) [N, N m].
+        s, omega, alpha, acceleration: (N, 3) motion, as for `NoiseFloor.sigma`.
     """
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     out = np.empty((len(rows[0]), 3))
@@ -147,7 +148,7 @@ def statistics(
 
 @njit(cache=True)
 def _last_sum(memory, hold, widths):
-    """Return the likelihood ratio of the longest window within `hold` samples."""
+    """Return the `glr` term of the longest window (1, 2, 4 ... samples) within `hold` samples."""
     m = 0
     while 2 << m <= min(hold, WINDOW // 2):
         m += 1
@@ -167,9 +168,9 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
     Args:
         memory: of `detection_update`, updated.
         statistic: index into `STATISTICS`.
-        enter: its threshold.
-        leave, hold: level, and samples below it, before contact ends.
-        widths: of `NoiseFloor`.
+        enter: threshold of this statistic at which contact begins.
+        leave, hold: contact ends after `hold` samples with a level below `leave`.
+        widths: `NoiseFloor.widths`.
     """
     if memory[FLAG] == 0.0:
         if memory[FIRST_STATISTIC + statistic] >= enter:
@@ -186,7 +187,10 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Update by one sample with `ContactDetector.settings`; return whether there is contact."""
+    """Update the memory by one sample; return whether there is contact.
+
+    Last arguments: `ContactDetector.settings`.
+    """
     slack, following, statistic, enter, leave, hold = decision
     detection_update(
         memory, contact, s, omega, alpha, acceleration, parameters, slack, following, leave
@@ -210,10 +214,10 @@ class ContactDetector:
     Args:
         threshold: of the statistic, such as `NoiseFloor.threshold`.
         statistic: one of `STATISTICS`.
-        leave, hold: level, and samples below it, before contact ends.
-        slack: of the cumulative sum [standard deviations].
-        following: period over time constant of the subtracted mean of F_c, updated while the level
-            is below `leave`; 0 for no mean.
+        leave, hold: contact ends after `hold` samples with a level below `leave`.
+        slack: slack of the cumulative sum [standard deviations].
+        following: sample period over time constant of the subtracted mean of F_c, which is updated
+            while the level is below `leave`; 0 for no mean.
 
     Raises:
         DrakeTeleopError: for an unknown statistic or values outside their range.
@@ -242,7 +246,7 @@ class ContactDetector:
 
     @staticmethod
     def initial_memory() -> Array:
-        """Return the memory (n,) before the first sample."""
+        """Return the memory (SIZE,) before the first sample."""
         return np.zeros(SIZE)
 
     def update(
@@ -253,7 +257,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> bool:
-        """Update by one sample as for `statistics`; return whether there is contact."""
+        """Update by one sample, arguments as for `statistics`; return whether there is contact."""
         parts = {"s": s, "omega": omega, "alpha": alpha, "acceleration": acceleration}
         motion = [checked(name, value, 3) for name, value in parts.items()]
         wrench = checked("contact", contact, 6)
@@ -267,7 +271,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> NDArray[np.bool_]:
-        """Return the flags (N,) of N samples of a log, updating as `update` does."""
+        """Update by N samples of a log; return (N,) booleans: True for contact."""
         rows = checked_motion(
             contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration
         )
@@ -279,7 +283,8 @@ class ContactDetector:
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
     """Return direction (..., 3), nearest point (..., 3) [m] and pitch (...) [m] of a wrench's axis.
 
-    Poinsot's central axis of (..., 6) in S; the point is nearest to So. NaN where f = 0.
+    The axis is Poinsot's central axis of a wrench (..., 6) in S; the point is nearest to So.
+    Results are NaN where the force is 0.
     """
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]

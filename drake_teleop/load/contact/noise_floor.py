@@ -2,10 +2,10 @@
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-n is the noise at rest, P the covariance of [offsets; phi], a and alpha the accelerations of S
-without gravity, whose squares are held at their peaks and fade. k and l cover gains, alignment,
-bandwidth and elasticity. z is r / sigma, decorrelated, with innovations
-e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
+n is the noise at rest, P the covariance of [offsets; phi]. a and alpha are the accelerations of S
+without gravity; their squares are held at their peaks and fade. k and l cover gain errors,
+alignment, bandwidth and elasticity. z is r / sigma, decorrelated between channels, with the
+innovations e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from drake_teleop.load.identification import natural_scale
 from drake_teleop.load.regressor import regressor_into
 
 WINDOW = 128
-"""Longest sum of the likelihood ratio [samples], a power of two."""
+"""Longest window of the likelihood ratio [samples], a power of two."""
 LENGTHS = WINDOW.bit_length()
-"""Number of sums: over 1, 2, 4 ... WINDOW samples."""
+"""Number of windows: 1, 2, 4 ... WINDOW samples."""
 
 HELD_A, HELD_ALPHA = 1, 2  # indices of held squares in the memory of a detector
 
 STATISTICS = ("level", "cusum", "glr")
-"""Columns of `statistics`, and choices of `ContactDetector`."""
+"""Names of the statistics: columns of `statistics`, and choices of `ContactDetector`."""
 MARGIN = 1.25
 """Ratio of threshold to the largest value in free motion. Normal noise exceeds it hundreds of times
 less often than that value, which is reached about once in a record of the same length."""
@@ -56,10 +56,10 @@ class NoiseFloor:
     """Noise floor of the eliminated wrench.
 
     Attributes:
-        noise: (6,) n [N, N m].
-        covariance: (16, 16) P, finite, see `finite_covariance`.
-        per_acceleration: (6, 2) k [N, N m per m/s^2] and l [per rad/s^2].
-        correlation: (6, 6) of r / sigma.
+        noise: (6,) noise n at rest [N, N m].
+        covariance: (16, 16) covariance P, finite, see `finite_covariance`.
+        per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
+        correlation: (6, 6) correlation of r / sigma between channels.
         rho: (6,) lag-one correlation of z.
         widths: (8,) w_n of sums of 1, 2, 4 ... `WINDOW` innovations; 1 for white ones.
         fade: factor per sample on held squares of the acceleration, 0 for no hold.
@@ -102,7 +102,9 @@ class NoiseFloor:
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
-        """Kernel arguments: variances, P, squares of k and l, whitening, rho, widths, fade."""
+        """Arguments of compiled functions: n^2, P, squares of k and l (6, 2), the matrix (6, 6)
+        that decorrelates r / sigma, rho, widths and fade.
+        """
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
@@ -110,11 +112,11 @@ class NoiseFloor:
     def sigma(
         self, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, acceleration: ArrayLike
     ) -> Array:
-        """Return sigma (N, 6) along a free motion of N consecutive samples.
+        """Return the standard deviations sigma (N, 6) along a free motion of N consecutive samples.
 
         Args:
             s, omega, alpha: (N, 3) as for `regressor`.
-            acceleration: (N, 3) a of So without gravity, in any axes [m/s^2].
+            acceleration: (N, 3) acceleration a of So without gravity, in any axes [m/s^2].
         """
         rows = checked_motion(s=s, omega=omega, alpha=alpha, acceleration=acceleration)
         out = np.empty((len(rows[0]), 6))
@@ -129,14 +131,14 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
-    """Update the fading peaks of the squared accelerations."""
+    """Update the held squares of the accelerations in a detector's memory."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
 
 @njit(cache=True)
 def parameter_variance(s, omega, alpha, P, V, out):
-    """Write the diagonal of J P J^T into out (6,); V (6, 10) is scratch."""
+    """Write the parameters' variances (J P J^T)_cc into out (6,); V (6, 10) is scratch."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -169,7 +171,7 @@ def checked_motion(**arrays: ArrayLike) -> list[Array]:
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return a covariance (16, 16) with `natural_scale` instead of larger deviations.
+    """Return a covariance (16, 16) whose standard deviations are at most `natural_scale`.
 
     `tared` means offsets from the same record: their variance is 0.
     """

@@ -1,9 +1,9 @@
 """Online detection of a changed load: an object was grasped or released, Eqs. (T23), (T24).
 
-    known       the known load explains the means of blocks of `BLOCK` seconds
-    disturbed   neither the known nor a new load does: contact, or the moment of a grasp
-    changed     a new load has explained them for `HOLD` seconds
-    identified  its mass and first moments are identified: it is the known load from here on
+    known       the known load explains the mean wrench of blocks of `BLOCK` seconds
+    disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
+    changed     a new load has explained it for `HOLD` seconds
+    identified  mass and first moments of the new load are identified: it is now the known load
 
 Method: docs/theory.md, "Another load".
 """
@@ -38,9 +38,10 @@ STATES = ("known", "disturbed", "changed", "identified")
 KNOWN, DISTURBED, CHANGED, IDENTIFIED = range(4)
 
 BLOCK, WINDOW, HOLD, MEMORY = 0.016, 2.0, 0.2, 0.3
-"""Durations [s]: of a block, until a filter restarts, until a new load counts, of a model error."""
+"""Durations [s]: of a block, until a filter restarts, until a new load is accepted, and of a model
+error."""
 BOUND = 0.0025
-"""Default bound: four standard deviations are 1 % of the change of mass."""
+"""Default of `bound`: four standard deviations are 1 % of the change of mass."""
 OFFSET_DRIFT = (0.1,) * 3 + (0.005,) * 3
 """Default standard deviation of the offsets' drift since the identification [N, N m]."""
 
@@ -76,7 +77,7 @@ def whitening(motion, phi, noise, model_var, n):
         motion: (9,) mean [s, omega, alpha].
         phi: (10,) load.
         noise: (15 or more,) long-run variances per sample of wrench and motion.
-        model_var: squared model error.
+        model_var: squared relative model error.
         n: samples of the block.
     """
     root, N = np.zeros((6, 6)), np.zeros((6, 6))
@@ -112,7 +113,9 @@ def whitening(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate(estimate, V, wrench, root):
-    """Update [theta (16); P (256)] by a block, Eq. (T6); return the innovation's chi-squared."""
+    """Update [theta (16); covariance P (256)] by a block, Eq. (T6); return the innovation's
+    chi-squared.
+    """
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
     for c in range(6):
@@ -143,9 +146,9 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return chi-squared of its innovation.
+    """Update a filter by a block; return the chi-squared of its innovation.
 
-    Model errors count once for the test, and with their duration for the update.
+    The variance of model errors counts once in the test, and times its duration in the update.
     """
     phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
@@ -162,7 +165,7 @@ def _update_filter(memory, place, block, noise):
 
 @njit(cache=True)
 def _restart(memory, place):
-    """Reset a filter to the known load (the new load's filter with a wide prior), and its test."""
+    """Reset a filter and its test to the known load; the new load's filter gets a wide prior."""
     put(memory, place, memory, _KNOWN, 272)
     if place == _NEW:
         for j in range(10):
@@ -174,7 +177,7 @@ def _restart(memory, place):
 
 @njit(cache=True)
 def _is_identified(memory, bound):
-    """Return whether mass and first moments of the new load are certain to `bound`."""
+    """Return whether mass and moments of the new load are as precise as `bound` requires."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
@@ -203,9 +206,9 @@ def change_update(memory, sample, block, noise, window, hold, bound):
         memory: of `change_memory`, updated.
         sample: (15 or more,) see `regressor`.
         block: samples of a block.
-        noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared model
-            error, and its duration [blocks].
-        window, hold: [blocks].
+        noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared relative
+            model error, and the duration of this error [blocks].
+        window, hold: durations `WINDOW` and `HOLD` [blocks].
         bound: see `change_parameters`.
     """
     V = np.empty((6, 10))
@@ -228,7 +231,6 @@ def change_update(memory, sample, block, noise, window, hold, bound):
 
 @njit(cache=True)
 def _test_block(memory, block, noise, window, hold, bound):
-    """Test the means of a block and update the state."""
     if memory[_STATE] == memory[_BASE]:
         if memory[_AGE] >= window:
             excess = memory[_SUM]
@@ -295,11 +297,11 @@ def change_parameters(
     model_error: float = 0.0,
     bound: float | None = None,
 ) -> Parameters:
-    """Return the last arguments of `change_update`.
+    """Return the last arguments of `change_update`: block, noise, window, hold, bound.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
-        period: between samples [s].
+        period: time between samples [s].
         model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
         bound: required standard deviation of a new load's mass over the change of mass; default
             `BOUND`, or twice the model error.
@@ -322,8 +324,8 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
     """Return the memory of `change_update` before the first sample.
 
     Args:
-        theta, covariance: (16,), (16, 16) known [offsets; phi]; `PRIOR_STD` replaces larger
-            deviations.
+        theta, covariance: (16,), (16, 16) of the known [offsets; phi]; `PRIOR_STD` replaces larger
+            standard deviations.
         offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
@@ -363,7 +365,7 @@ def new_load(memory):
 
 @njit(cache=True)
 def new_load_age(memory):
-    """Return the samples since the start of the new load's filter."""
+    """Return the number of samples since the new load's filter started."""
     return memory[_SAMPLES] - memory[_START]
 
 
@@ -379,7 +381,7 @@ def watch_load(
 
     Args:
         memory: of `change_memory`, updated.
-        parameters: of `change_parameters`.
+        parameters: result of `change_parameters`.
         wrench, s, omega, alpha: (N, 6), (N, 3)... as for `identify`.
     """
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
@@ -389,10 +391,10 @@ def watch_load(
 
 
 def identified_load(memory: Array, known: Identification) -> Identification:
-    """Return the new load once it is identified, and `known` before.
+    """Return the new load if one was identified, else `known`.
 
-    Its `residual_rms` is per sample. Inertias without excitation keep their former values with a
-    large standard deviation; `condition_number` and `delay_s` are those of `known`.
+    `residual_rms` is per sample. Inertias without excitation keep their former values with a large
+    standard deviation; `condition_number` and `delay_s` are those of `known`.
     """
     if memory[_BASE] == KNOWN:
         return known

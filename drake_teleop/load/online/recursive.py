@@ -29,7 +29,7 @@ PRIOR_STD = (100.0,) * 3 + (10.0,) * 3 + (10.0,) + (3.0,) * 3 + (1.0,) * 6
 """Standard deviations of the default prior about zero [N, N m, kg, kg m, kg m^2]."""
 
 SETTLED = 0.05
-"""Default bound of `RecursiveEstimator.settled`."""
+"""Default of `bound`, relative to the natural scale."""
 
 # Smallest relative eigenvalue that is not rounding.
 _ROUNDING = 1e-16
@@ -43,7 +43,7 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
     """Update the estimate by each sample; compiled, without checks.
 
     Args:
-        theta: (16,) [offsets; phi], updated.
+        theta: (16,) estimate [offsets; phi], updated.
         P: (16, 16) covariance, exactly symmetric, updated.
         samples: (N, at least 15), see `regressor`.
         noise_std, forgetting: as for `RecursiveEstimator`.
@@ -92,15 +92,15 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 
 
 class RecursiveEstimator(ABC):
-    """Recursive estimate of [offsets; phi].
+    """Recursive estimator of [offsets; phi].
 
-    The state is theta (16,) and a `memory` array; both can be external, as in a Drake system.
+    The estimate is theta (16,) and a `memory` array; both can be external, as in a Drake system.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
         forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
-        prior_std: (16,) of the prior; an upper bound during forgetting.
-        bound: of `settled`.
+        prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
+        bound: relative standard deviation that `settled` requires.
 
     Raises:
         DrakeTeleopError: for values outside their range.
@@ -132,7 +132,7 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveEstimator:
-        """Return an estimator for noise of the wrench (6,) and, where supported, motion (9,)."""
+        """Return an estimator for noise of wrench (6,) and, where supported, motion (9,)."""
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -152,11 +152,11 @@ class RecursiveEstimator(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether all parameters are certain to `bound` of the natural scale, not by the prior."""
+        """Whether data, not the prior, determine all parameters to `bound` of the natural scale."""
         return self.settled_at(self._theta, self._memory)
 
     def settled_at(self, theta: Array, memory: Array) -> bool:
-        """Return `settled` of an external estimate."""
+        """Return `settled` for an external estimate."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
@@ -168,15 +168,15 @@ class RecursiveEstimator(ABC):
 
     @abstractmethod
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return `covariance` of an external estimate."""
+        """Return the covariance (16, 16) of an external estimate."""
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
         """Update an external estimate by one sample; compiled, without checks.
 
         Args:
             theta: (16,) estimate, updated.
-            memory: C-contiguous, as from `initial_memory`, updated.
-            sample: begins with [wrench, s, omega, alpha].
+            memory: C-contiguous array, as from `initial_memory`, updated.
+            sample: array that begins with [wrench, s, omega, alpha].
         """
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
 
@@ -205,13 +205,13 @@ class RecursiveEstimator(ABC):
         self._samples += 1
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by N samples (N, 6), (N, 3)... with one compiled loop; see `update`."""
+        """Update by N samples (N, 6), (N, 3)... in one compiled loop; see `update`."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate.
+        """Return the present estimate as an `Identification`.
 
         Raises:
             DrakeTeleopError: before the first update.
@@ -245,7 +245,7 @@ class RecursiveEstimator(ABC):
 
 
 class RecursiveLeastSquares(RecursiveEstimator):
-    """Recursive least squares for exact motion; noise of the motion makes it biased."""
+    """Recursive least squares for exact motion; noise of the motion causes a bias."""
 
     method = "recursive least squares"
 
@@ -264,7 +264,7 @@ class RecursiveLeastSquares(RecursiveEstimator):
         return np.diag(self._prior)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return a copy of the memory, which is the covariance (16, 16)."""
+        """Return a copy of the memory, the covariance (16, 16)."""
         return memory.copy()
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:

@@ -1,13 +1,14 @@
 """Recursive total least squares for load and offsets: noise in the measured motion too, Eq. (T18).
 
-Minimises lambda, the weighted squared residuals over their expected value (Kubus, Kroeger, Wahl,
-IROS 2008), by one step of the inverse iteration per sample. As in `batch.moments`, row c of [E V]
-is T_c z, here with
+The estimate minimises lambda, the weighted squared residuals over their expected value (Kubus,
+Kroeger, Wahl, IROS 2008), by one step of the inverse iteration per sample. As in `batch.moments`,
+row c of [E V] is T_c z, here with the wrench F last:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 
-Parameters are compensated only where the information exceeds that of the noise by 4
-sqrt(2 / samples) of it. Compiled functions allocate no memory and check no input.
+G, g are the normal equations, N is the noise in G. It is compensated only for parameters whose
+information exceeds that of the noise by 4 sqrt(2 / samples) of it. Compiled functions allocate no
+memory and check no input.
 """
 
 from __future__ import annotations
@@ -45,7 +46,9 @@ _MIN_SCALE_SAMPLES = 20
 
 @cache
 def terms() -> tuple[NDArray[np.uintp], Array]:
-    """Return the nonzero terms of T: (n, 3) [channel, element of z, parameter], and n factors."""
+    """Return the nonzero terms of T: indices (n, 3) [channel, element of z, parameter], and
+    factors.
+    """
     T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
@@ -54,7 +57,7 @@ def terms() -> tuple[NDArray[np.uintp], Array]:
 
 @njit(cache=True)
 def scratch():
-    """Return working arrays (E, g, L, LZ, inverse, S, W)."""
+    """Return working arrays (E, g, L, LZ, inverse, S, W) of `rtls_normal_equations`."""
     return (
         np.empty((13, 6, 16)),
         np.empty(16),
@@ -68,7 +71,7 @@ def scratch():
 
 @njit(cache=True)
 def write_z(wrench, motion, z):
-    """Write z of a wrench (6,) and a motion (9,) [s, omega, alpha]."""
+    """Write the signals of a wrench (6,) and a motion (9,) [s, omega, alpha] into z (19,)."""
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
@@ -82,7 +85,7 @@ def write_z(wrench, motion, z):
 
 @njit(cache=True)
 def add_outer_product(y, z, total):
-    """Add y z^T to total (19, 19)."""
+    """Add y z^T to `total` (19, 19)."""
     for i in range(19):
         for j in range(19):
             total[i, j] += y[i] * z[j]
@@ -90,7 +93,7 @@ def add_outer_product(y, z, total):
 
 @njit(cache=True)
 def forget(memory, theta, information, forgetting):
-    """Multiply the sums by `forgetting` and centre the prior at the present estimate."""
+    """Multiply the sums in the memory by `forgetting` and centre the prior at theta."""
     last = memory.shape[0] - 1
     for i in range(last):
         for j in range(19):
@@ -101,12 +104,12 @@ def forget(memory, theta, information, forgetting):
 
 @njit(cache=True)
 def residual_products(Z, theta, index, factors, L, LZ, S):
-    """Write L with r = F - [E V] theta = L z, L Z, and S = L Z L^T, the sum of r r^T.
+    """Write L, L Z and S = L Z L^T, the sum of r r^T, for the residual r = F - [E V] theta = L z.
 
     Args:
         Z: (19, 19) sum of z z^T, or a covariance of its noise.
         index, factors: from `terms`.
-        L, LZ: (6, 19), S: (6, 6), written.
+        L, LZ, S: (6, 19), (6, 19), (6, 6), written.
     """
     L[:] = 0.0
     LZ[:] = 0.0
@@ -130,7 +133,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise in the sum Z of z z^T into Q (19, 19), omega to first order."""
+    """Write the expected noise of the sum Z of z z^T into Q; omega to first order."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -146,10 +149,11 @@ def noise_products(Z, noise_std, motion_std, Q):
 
 @njit(cache=True)
 def weighted_gram(Z, W, index, factors, E, G, first):
-    """Write the sum of X^T W Y into columns `first`... of G, X and Y being [E V] of y and z.
+    """Write the sum of X^T W Y into the columns of G from `first`; X and Y are [E V] of y and z.
 
     Args:
         Z: (19, 19) sum of y z^T.
+        W: (6, 6) weights between the channels.
         index, factors: from `terms`.
         E: (13, 6, 16) scratch.
     """
@@ -173,7 +177,10 @@ def weighted_gram(Z, W, index, factors, E, G, first):
 
 @njit(cache=True)
 def weighted_right(LZ, W, index, factors, g):
-    """Write the sum of X^T W r into g (16,), from LZ (6, 19), the sum of r z^T."""
+    """Write the right-hand side g (16,), the sum of X^T W r with X = [E V] of z.
+
+    LZ (6, 19) is the sum of r z^T; r is the wrench or the residual.
+    """
     g[:] = 0.0
     for t in range(len(factors)):
         c, a = index[t, 0], index[t, 1]
@@ -185,7 +192,7 @@ def weighted_right(LZ, W, index, factors, g):
 
 @njit(cache=True)
 def eliminate(A):
-    """Turn [A B] into [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
+    """Replace [A B] by [D L^T, L^-1 B] in place, for the symmetric A = L D L^T (n, n)."""
     n, m = A.shape
     for k in range(n):
         inverse = 1.0 / A[k, k]
@@ -198,7 +205,7 @@ def eliminate(A):
 
 @njit(cache=True)
 def solve(A):
-    """Turn [A B], A symmetric and positive definite, into [-, A^-1 B] in place."""
+    """Replace the right part of [A B] by A^-1 B in place, A symmetric and positive definite."""
     n, m = A.shape
     for i in range(n):
         A[i, i] *= 1.0 + RIDGE
@@ -226,7 +233,7 @@ def invert(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator whose memory is sums of z z^T and the prior's part of the equations."""
+    """Recursive estimator whose memory contains the sum of z z^T and the prior's part."""
 
     def initial_memory(self, theta: Array) -> Array:
         """Return the memory (20, 19): sum of z z^T, and the prior's information times theta."""
@@ -247,9 +254,9 @@ class MomentEstimator(RecursiveEstimator):
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
-    """Set taper (16,) to 1 for parameters with compensated noise, otherwise to 0.
+    """Set `taper` (16,) to 1 for parameters whose noise is compensated, otherwise to 0.
 
-    G - strength N over them is positive definite; K (16, 16) is scratch.
+    G - strength N, N restricted to these parameters, is positive definite. K (16, 16) is scratch.
     """
     taper[:] = 1.0
     for i in range(16):
@@ -282,12 +289,13 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write G and g into G (16, >= 17) and N into N (16, 16); return lambda for theta.
+    """Write [G g] into G (16, >= 17) and the noise part of G into N (16, 16); return lambda.
 
     Args:
         Z: (19, 19) sum of z z^T.
         noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        index, factors: from `terms`, space: from `scratch`, Q: (19, 19) scratch.
+        index, factors: from `terms`.
+        space, Q: scratch, from `scratch` and (19, 19).
     """
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
@@ -316,10 +324,11 @@ def rtls_update(
     """Update the estimate by each sample; compiled, without checks.
 
     Args:
-        theta: (16,) [offsets; phi], updated.
+        theta: (16,) estimate [offsets; phi], updated.
         memory: (20, 19) sum of z z^T, and the prior's part; updated.
         samples: (N, at least 15), see `regressor`.
-        forgetting, information: factor per sample, and (16,) of the prior.
+        noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
+        forgetting, information: factor per sample, and (16,) inverse variances of the prior.
     """
     space, Q, z, taper = scratch(), np.empty((19, 19)), np.empty(19), np.empty(16)
     G, N, K = np.empty((16, 17)), np.empty((16, 16)), np.empty((16, 16))
@@ -349,7 +358,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
     Args:
         noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
-        motion_std: (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2]; zeros give least squares.
+        motion_std: (9,) noise of s [m/s^2], omega [rad/s], alpha [rad/s^2]; zeros: least squares.
     """
 
     method = "recursive total least squares"
@@ -372,7 +381,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """Return an estimator for noise of (6,) wrench and (9,) motion."""
+        """Return an estimator for noise of wrench (6,) and motion (9,)."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -381,7 +390,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._normal_equations(self._theta, self._memory)[2]
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
+        """Return the covariance lambda H^-1 G H^-1 (16, 16), H = G - lambda N.
 
         Directions without sufficient information get the prior's variance.
         """
@@ -399,7 +408,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._within_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
-        """Return G and N (16, 16) without prior, and lambda (1 for few samples)."""
+        """Return the matrices G and N (16, 16) without prior, and lambda (1 for few samples)."""
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
@@ -413,7 +422,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
 
 def _cholesky(A: Array) -> Array:
-    """Return the Cholesky factor of A with its diagonal raised by rounding."""
+    """Return the Cholesky factor of A with a diagonal raised against rounding errors."""
     return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
 
 

@@ -1,14 +1,14 @@
-"""Load for the elimination while a known load is monitored, sample by sample.
+"""Load that is eliminated while a known load is monitored, sample by sample.
 
     settled     the known load explains the wrench and is used
     disturbed   contact, or the moment of a grasp; the known load is used
     changed     another load: the fallback (gripper or nothing) is used until the known load
-                explains the wrench again or the new one is identified
+                explains the wrench again or the new load is identified
 
-Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight: a
-new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
-seconds, with a centre of mass within `MAX_COM_DISTANCE_M`. At rest, offsets follow residuals below
-`MAX_OFFSET_RESIDUAL`.
+Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight. A
+new load therefore counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for
+`EXPLAINED` seconds, with a centre of mass within `MAX_COM_DISTANCE_M`. At rest, the offsets follow
+residuals below `MAX_OFFSET_RESIDUAL`.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ from drake_teleop.load.regressor import (
 )
 
 LOAD_STATES = ("learning", "settled", "disturbed", "changed")
-"""States of a load estimator, by index; "learning" precedes this module."""
+"""States of a load estimator, by index; "learning": the load is not identified yet."""
 LEARNING, SETTLED, DISTURBED, OTHER_LOAD = range(4)
 
 FADE, REST, FOLLOW, EXPLAINED = 0.1, 0.3, 3.0, 0.1
-"""Durations [s]: cross-fade, rest before offsets follow, their time constant, new load explains."""
+"""Durations [s]: cross-fade, rest before offsets follow residuals, time constant of the offsets,
+and explanation of a changed force by a new load."""
 MAX_OFFSET_RESIDUAL = np.array([0.3] * 3 + [0.015] * 3)
 """Largest residual that offsets follow, three times `change.OFFSET_DRIFT` [N, N m]."""
 MIN_FORCE_CHANGE_N = 0.5
@@ -72,7 +73,7 @@ def watched_memory(theta: Array, covariance: Array) -> Array:
 
 @njit(cache=True)
 def watched_state(memory):
-    """Return the index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
+    """Return the state, an index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
     return int(memory[_STATE])
 
 
@@ -95,7 +96,7 @@ def _is_at_rest(memory, sample, period):
 
 @njit(cache=True)
 def _force_has_changed(memory, residual, age, period):
-    """Return whether a new load, `age` samples old, has explained a changed residual force."""
+    """Return whether the residual force changed since the new load's start, `age` samples ago."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
     lowest, highest = memory[_LOWEST:_HIGHEST], memory[_HIGHEST:_CHANGED_SAMPLES]
     share = 1.0 if age == 0.0 else period / (_LOW_PASS_S + period)
@@ -119,15 +120,15 @@ def _is_within_reach(known, new):
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """Update by one sample; compiled, without checks.
+    """Update `out` and `memory` by one sample; compiled, without checks.
 
     Args:
         out: (16,) [offsets; phi] for the elimination, updated.
         memory: of `watched_memory`, updated.
         sample: (15 or more,) see `regressor`.
-        fallback: (10,) phi for a changed load.
-        period: between samples [s].
-        block, noise, window, hold, bound: of `change.change_parameters`.
+        fallback: (10,) phi that is used for a changed load.
+        period: time between samples [s].
+        block, noise, window, hold, bound: from `change.change_parameters`.
     """
     watch = memory[_CHANGE:]
     change_update(watch, sample, block, noise, window, hold, bound)

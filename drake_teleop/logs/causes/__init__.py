@@ -1,1 +1,1 @@
-"""Search for causes of a misfit: why a rigid load does not explain a wrench."""
+"""Search for causes of a misfit: reasons why a rigid load does not explain a wrench."""

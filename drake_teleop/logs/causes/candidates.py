@@ -1,4 +1,4 @@
-"""Extensions of a model in the order of plausibility, and their minimum effects."""
+"""Candidate causes: extensions of a model in order of plausibility, and their minimum effects."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fitted extension with twice the gain of the log likelihood minus its cost."""
+    """Model that is fitted with one more extension.
+
+    `score` is twice the gain in log likelihood minus a cost of the added parameters.
+    """
 
     name: str
     state: State
@@ -63,8 +66,9 @@ class Candidate:
 
 
 def candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit the possible extensions and keep those of sufficient effect; `first`: of the rigid load
-    alone.
+    """Fit all possible extensions and yield those with sufficient effect.
+
+    `first`: the state is the first model of a search, the rigid load alone.
     """
     model, data = state.model, state.data
     if first:
@@ -140,7 +144,7 @@ def has_negative_inertia(state: State) -> bool:
 
 
 def is_plausible(state: State) -> bool:
-    """Return whether the parameters are possible in a laboratory."""
+    """Return whether the fitted parameters are possible in a laboratory."""
     if has_negative_inertia(state):
         return False
     parts, deviation = state.model.parts, float(np.sqrt(state.fit.covariance[6, 6]))
@@ -173,7 +177,10 @@ def _is_tilt_significant(state: State) -> bool:
 
 
 def tilt_start(state: State) -> Array | None:
-    """Return start values for a large tilt, from the force alone: f = o + m a + R u, u = -m g."""
+    """Return start parameters for a large tilt of gravity, from the force alone, or None.
+
+    The force is f = o + m a + R u with u = -m g.
+    """
     y = state.data.only(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -268,7 +275,6 @@ def similar_factors(state: State) -> list[State]:
 
 
 def _axes(state: State) -> Iterator[Candidate]:
-    """Yield the signed permutation that explains the force best."""
     from itertools import permutations, product
 
     y = state.data.only(state.rows.used).y[:, state.model.columns]

@@ -1,4 +1,4 @@
-"""Causes of a misfit in words: name, time, value with interval."""
+"""Causes of a misfit in words: name, time, value with its interval."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Cause:
             "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
             "contact", "cable" or "no load".
         message: cause, value with its interval, and remedy.
-        start_s, stop_s: time interval since the start of the record [s]; None: unlimited.
+        start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
     """
 
@@ -46,9 +46,9 @@ class Stretch:
     """Part of a record with one load.
 
     Attributes:
-        start_s, stop_s: since the start of the record [s].
-        phi: (10,) the load about So in S.
-        covariance: (16, 16) of [offsets; phi].
+        start_s, stop_s: times since the start of the record [s].
+        phi: (10,) load about So in S.
+        covariance: (16, 16) covariance of [offsets; phi].
     """
 
     start_s: float
@@ -58,12 +58,12 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """(16,) whether the part determines a parameter of [offsets; phi]."""
+        """Booleans (16,): True where the part determines a parameter of [offsets; phi]."""
         return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """Return the causes in a fitted model in the order of time, except the given parts."""
+    """Return the causes in a fitted model in the order of time, without the parts `given`."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -86,7 +86,10 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """Return the loads of a changing load; covariance (16, 16): of the first part."""
+    """Return the parts of a record between changes of the load.
+
+    `covariance` (16, 16) belongs to [offsets; phi] of the first part.
+    """
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:
         return []

@@ -23,7 +23,10 @@ _SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.00
 
 
 def add_step(state: State, kind: str) -> State | None:
-    """Return the state with one more step of "offsets" or "load" at the most likely time."""
+    """Return the state with one more step of "offsets" or "load" at the most likely time.
+
+    None if no step is significant.
+    """
     best: State | None = None
     for time in _likely_times(state, kind):
         found = _refine_time(state, kind, time)
@@ -58,7 +61,7 @@ def _likely_times(state: State, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Gain by a step at any instant, with white noise."""
+    """Gain in log likelihood (times 2) by a step at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
@@ -101,7 +104,7 @@ def with_ramps(
 ) -> State:
     """Fit gradual steps of `kinds` at `times` [s]; rows within `widths` (>= `RAMP_S`) are omitted.
 
-    `spans` are other omitted rows; `state` has the initial parameters.
+    `spans` are other omitted time spans; `state` has the initial parameters.
     """
     widths = [max(RAMP_S, w + RAMP_S) for w in (widths or [0.0] * len(times))]
     around = tuple((t - 0.5 * w, t + 0.5 * w) for t, w in zip(times, widths, strict=True))
@@ -138,7 +141,7 @@ def _significance(state: State, i: int) -> float:
 def _ramp_middle(
     state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
 ) -> float:
-    """Return the time of half of the k-th change."""
+    """Return the time at which half of the k-th change has happened."""
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
     rows = np.flatnonzero(data.used & in_spans(data, (span,)))

@@ -24,7 +24,7 @@ _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
 def contact_spans(state: State) -> Spans:
-    """Return (start, stop) of blocks whose residual far exceeds noise and calm blocks."""
+    """Return the time spans (start, stop) whose residual far exceeds the noise and calm blocks."""
     blocks = _Blocks(state)
     contact_blocks = blocks.contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -38,7 +38,8 @@ def contact_spans(state: State) -> Spans:
 def replace_contacts_by_steps(larger: State) -> State | None:
     """Explain long contacts by other loads and offsets; None if these do not explain the wrench.
 
-    The blocks are fitted repeatedly. If few runs cover the record, their borders become steps.
+    Each load is fitted to blocks that the former ones do not explain. If a few runs of blocks cover
+    the record, the borders between them become steps.
     """
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
@@ -75,7 +76,7 @@ def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
 
 
 class _Blocks:
-    """Normal equations of a model for blocks of rows."""
+    """Normal equations of a model for each block of rows."""
 
     def __init__(self, state: State) -> None:
         data = state.data
@@ -99,7 +100,7 @@ class _Blocks:
             self._square += np.einsum("i,bij,j->b", left, sums, left)
 
     def contact_blocks(self, among: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-        """Return the blocks with a residual far above the calmest; None for too few blocks."""
+        """Return True for blocks with a residual far above the calmest; None for too few blocks."""
         found = self._fit_calmest(np.flatnonzero(among))
         if found is None:
             return None
@@ -110,7 +111,7 @@ class _Blocks:
         return np.asarray((level > _CONTACT_LEVEL) & (level > _CALM_RATIO * usual) & among)
 
     def _fit_calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        """Return residuals of the blocks, level of the calmest, and the fit's change."""
+        """Return residuals of the blocks, of the calmest, and the parameters' change."""
         if len(blocks) < 2 * _FEWEST_BLOCKS:
             return None
         starts = [blocks]
@@ -145,7 +146,7 @@ class _Blocks:
 
 
 def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
-    """(blocks,) residual level that errors of fast motion cause, by the calmest fast blocks."""
+    """Return the residuals (blocks,) by errors of fast motion, from the calmest fast blocks."""
     data, rows = state.data, state.data.block
     y = data.with_steps(state.model.times)
     wrench = y @ state.model.wrench(x[None])[0].T
@@ -165,7 +166,7 @@ def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np
 def replace_steps_by_contact(state: State) -> State:
     """Replace changes of the offsets by a contact if the residual requires it.
 
-    Two changes explain the level of a contact, but with a wrong load.
+    Two changes can explain the force of a contact, but with a wrong load.
     """
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
@@ -189,7 +190,7 @@ def replace_steps_by_contact(state: State) -> State:
 
 
 def shrink_contacts(state: State) -> State:
-    """Reduce contacts to the rows with a large residual."""
+    """Shorten the time spans of contacts to the rows with a large residual."""
     dt = state.data.dt
     spans = [_contact_span(state, span) for span in state.spans]
     return State.of(state.data, state.model, state.x, tuple((a - dt, b + dt) for a, b in spans))

@@ -1,4 +1,4 @@
-"""Explanation of a wrench: test, search, and the load within the result."""
+"""Explanation of a wrench: noise test, search for causes, and the load in the result."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class Explanation:
     """Causes of a record and the load within their model.
 
     Attributes:
-        causes: effects beside a rigid load with constant offsets.
+        causes: effects other than a rigid load with constant offsets.
         explained: whether the residual is sensor noise.
         theta: (16,) [offsets; phi] of the first part of the record.
-        covariance: (16, 16) of theta.
-        deviations: (16,) of theta by the unexplained rest (`misfit_deviations`).
+        covariance: (16, 16) covariance of theta.
+        deviations: (16,) standard deviations of theta due to the misfit (`misfit_deviations`).
         delay_s: additional delay of the motion behind the wrench [s].
-        loads: of a record whose load changes.
-        removed_weight: (4,) [m, m c] removed from the wrench, or None.
-        given: active parts of the model that are no causes.
+        loads: parts of a record whose load changes.
+        removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
+        given: active parts of the model that are not causes.
         state: model and residual.
     """
 
@@ -59,12 +59,12 @@ class Explanation:
 
     @property
     def misfit(self) -> bool:
-        """Whether the residual is clearly not noise, even if coloured."""
+        """Whether the residual is clearly not noise, not even coloured noise."""
         return not self.explained and is_clear_misfit(self.state)
 
     @property
     def several_gains(self) -> bool:
-        """Whether gains represent errors of the whole matrix of gains."""
+        """Whether the gains stand for errors of the sensor's whole gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
@@ -73,10 +73,10 @@ class Explanation:
 def explain(
     data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
 ) -> Explanation:
-    """Test whether a rigid load explains a record, and search for causes if not.
+    """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are active parts, such as
-    "weight".
+    `with_delay` returns the record with an additional delay [s]; `given` are active parts of the
+    model, such as "weight".
     """
     with one_blas_thread():
         state, delay_s, rejected = search(data, with_delay, given)

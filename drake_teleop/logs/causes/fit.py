@@ -28,9 +28,9 @@ class Fit:
         rows: fitted rows.
         x: (size,) parameters.
         covariance: (size, size); huge for undetermined parameters.
-        residual: (6, W) coefficients of the residual in y.
-        filters: (6, 5) white noise = sum over d of filters[c, d] noise[n - d].
-        power: (6,) variance of that white noise.
+        residual: (6, W) coefficients of the residual in the signals y.
+        filters: (6, 5) filters that whiten the residual e: sum over d of filters[c, d] e_c[n - d].
+        power: (6,) variance of the whitened residual.
     """
 
     model: Model
@@ -47,7 +47,7 @@ class Fit:
         return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
 
     def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
-        """Return Gram matrix and right-hand side of an iteration of a model from x."""
+        """Return Gram matrix and right-hand side of the normal equations of `model` at x."""
         whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
         J = model.derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
@@ -59,7 +59,7 @@ class Fit:
 def fit(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
-    """Fit a model to rows from `start` (size,) in at most `steps` iterations."""
+    """Fit a model to rows in at most `steps` iterations from the parameters `start` (size,)."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count

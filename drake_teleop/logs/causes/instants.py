@@ -1,12 +1,12 @@
-"""Wrench and motion as block means at about 50 Hz, and their sums of products by block and lag.
+"""Wrench and motion as block means at about 50 Hz, and sums of their products.
 
 All models of this package are linear in the signals of one instant,
 
 y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
-with s the specific force of So, g gravity, R = R_SW and p the position of S in the world. Means
-are exact because of this linearity. The sums of y_n y_{n-d}^T + y_{n-d} y_n^T, d = 0 ... 4,
-suffice for a fit with autoregressive noise of order 4.
+with s the specific force of So, g gravity, F the wrench, R = R_SW and p the position of S in the
+world. Means are exact because of this linearity. The sums of y_n y_{n-d}^T + y_{n-d} y_n^T for the
+lags d = 0 ... 4 suffice for a fit with autoregressive noise of order 4.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ class Instants:
     Attributes:
         t: (M,) middle of each block [s].
         y: (M, WIDTH) signals; 0 in unused rows.
-        used: (M,) rows without gaps and edges.
+        used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
-        gravity_W: (3,) [m/s^2], or None without orientation.
+        gravity_W: (3,) gravity [m/s^2], or None without orientation.
         positions: whether p is known.
-        shake: noise of the acceleration in a block mean [m/s^2].
-        alpha_noise_share: noise share of the variance of an IMU's angular acceleration.
+        acceleration_noise: noise of the acceleration in a block mean [m/s^2].
+        alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
     t: Array
@@ -74,7 +74,7 @@ class Instants:
 
     @cached_property
     def accelerates_enough(self) -> bool:
-        """Whether accelerations suffice to separate inertia from weight."""
+        """Whether accelerations are large enough to separate inertia from weight."""
         if self.gravity_W is None:
             return self.alpha_noise_share < _MAX_NOISE_SHARE
         a = (self.y[:, S] + self.y[:, G])[self.used]
@@ -89,16 +89,16 @@ class Instants:
 
     @cached_property
     def block(self) -> int:
-        """Rows of a block."""
+        """Number of rows in a block."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
     def only(self, used: NDArray[np.bool_]) -> Instants:
-        """Return the record with other used rows (M,)."""
+        """Return the record with `used` (M,) as its used rows."""
         return replace(self, y=np.where(used[:, None], self.y, 0.0), used=used)
 
     def with_steps(self, times: tuple[float, ...]) -> Array:
-        """(M, WIDTH + 25 len(times)) y, and its motion after each time."""
+        """Return y with copies of its motion after each time, (M, WIDTH + 25 len(times))."""
         parts = [self.y]
         for time in times:
             share = np.clip((self.t - time) / self.dt + 0.5, 0.0, 1.0)
@@ -106,7 +106,7 @@ class Instants:
         return np.hstack(parts)
 
     def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
-        """(blocks, lags, W, W) of y (M, W), in blocks of so many rows."""
+        """Return sums of products of y (M, W), (blocks, lags, W, W), for blocks of `rows` rows."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -132,12 +132,12 @@ def instants(
     """Return block means of a record.
 
     Args:
-        t: (N,) evenly spaced [s].
+        t: (N,) times, evenly spaced [s].
         wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
         motion: a function of time, or its values at `t`.
-        gravity_W: (3,) [m/s^2]; None without orientation.
-        lost: (N,) ignored samples.
-        shake: noise of the acceleration [m/s^2].
+        gravity_W: (3,) gravity [m/s^2]; None without orientation.
+        lost: (N,) True for ignored samples.
+        acceleration_noise: noise of the acceleration [m/s^2].
     """
     dt = float(t[-1] - t[0]) / (len(t) - 1)
     size = max(1, round(1.0 / (_RATE_HZ * dt)), -(-len(t) // _MAX_ROWS))
@@ -165,7 +165,7 @@ def instants(
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
-    """Smooth a noisy angular acceleration in place; return its noise share."""
+    """Smooth noisy angular accelerations in place; return the former share of noise in them."""
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
     for width in _SMOOTHING_WIDTHS:
@@ -177,7 +177,6 @@ def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
 
 
 def _white_noise(x: Array) -> Array:
-    """Return the standard deviation of white noise in each column, from third differences."""
     return np.asarray(np.median(np.abs(np.diff(x, 3, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0))
 
 
@@ -217,7 +216,6 @@ def _write_columns(y: Array, columns: Array) -> None:
 
 
 def _columns(motion: Sequence[Array], gravity_W: Array | None) -> Array:
-    """(K, 15, 24 or 51) s, g, alpha, products of omega, R_SW, R_SW p."""
     s, omega, alpha = motion[:3]
     products = np.stack([omega[:, i] * omega[:, k] for i, k in _PAIRS], axis=1)
     if len(motion) == 3 or gravity_W is None:
@@ -236,8 +234,8 @@ def _legendre(x: Array) -> Array:
 def free_delay(data: Instants) -> float:
     """Return the delay [s] of the smallest residual, within 0.25 s or a tenth of the record.
 
-    Each channel is fitted with the 16 signals of the motion, because a wrong load model would bias
-    it.
+    Each channel is fitted with free coefficients of the 16 signals of the motion, because a wrong
+    load model would bias the delay.
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

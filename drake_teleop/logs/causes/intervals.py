@@ -1,4 +1,4 @@
-"""Covariance of a load including unexplained misfit (docs/theory.md, "Causes of a misfit")."""
+"""Covariance of a load with the effect of misfit (docs/theory.md, "Causes of a misfit")."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LARGEST_GAIN_ERROR = 0.025
 def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """(16, 16) of [offsets; phi], widened by unexplained misfit and rejected candidates."""
+    """Return the covariance (16, 16) of [offsets; phi] with misfit and rejected candidates."""
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
@@ -49,7 +49,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """(16,) deviations of [offsets; phi] for a record without named causes."""
+    """Return standard deviations (16,) of [offsets; phi] for a record without named causes."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -62,7 +62,6 @@ def misfit_deviations(
 
 
 def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
-    """(16,) squared distances of possible candidates."""
     squares = np.zeros(16)
     for candidate in rejected:
         other = candidate.state
@@ -77,9 +76,10 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
 
 
 def gain_covariance(state: State) -> Array:
-    """(16, 16) of [offsets; phi] caused by errors of all gains, of the size in the residual.
+    """Return the covariance (16, 16) of [offsets; phi] that errors of all gains cause.
 
-    The 36 errors have one standard deviation (of a torque at `ARM`); 0 if gains explain little.
+    The residual determines their size, one standard deviation for all 36 errors (of a torque at
+    `ARM`). The result is 0 if gains explain little.
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
@@ -115,7 +115,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return (16, 16) of [offsets; phi] by other known factors of the torque that fit as well."""
+    """Return the covariance (16, 16) of [offsets; phi] by other plausible torque factors."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]
@@ -124,7 +124,7 @@ def factor_covariance(state: State) -> Array:
 
 
 def misfit_factor(state: State, blocks: Array) -> float:
-    """Factor of all deviations; 1 for stationary noise."""
+    """Return the factor that widens all standard deviations; 1 for stationary noise."""
     deviations = np.sqrt(np.diag(state.fit.covariance)[LOAD])
     shown = deviations < natural_scale(state.x[6:16])
     factor = 1.0
@@ -139,7 +139,7 @@ def misfit_factor(state: State, blocks: Array) -> float:
 
 
 def block_deviations(state: State) -> Array:
-    """(16,) jackknife deviations over twelve parts of the record."""
+    """Return jackknife deviations (16,) of [offsets; phi] over twelve parts of the record."""
     rows = state.rows
     at = np.array_split(np.flatnonzero(rows.used), _GROUPS)
     whole, right = state.fit.normal(state.model, state.x)

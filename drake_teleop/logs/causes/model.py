@@ -50,27 +50,27 @@ _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Step:
-    """Change at `time` [s] of the "offsets" (6) or of the "load" (10)."""
+    """Change of the "offsets" (6) or of the "load" (10) at `time` [s]."""
 
     kind: str
     time: float
 
     @property
     def size(self) -> int:
-        """Number of parameters."""
+        """Number of parameters of the step."""
         return 6 if self.kind == "offsets" else 10
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Selection of active extensions.
+    """Rigid load with a selection of active extensions.
 
     Attributes:
-        parts: names of `_SIZES`.
+        parts: names of active extensions, keys of `_SIZES`.
         gains: channels with a free gain.
         steps: changes, in the order of their columns.
-        axes: (3, 3) Q, a signed permutation.
-        factor: of the torque; "torque factor" multiplies it.
+        axes: (3, 3) signed permutation of the wrench's axes.
+        factor: factor of the torque; the part "torque factor" multiplies it.
     """
 
     parts: tuple[str, ...] = ()
@@ -102,7 +102,7 @@ class Model:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Columns of y and its steps that determine the wrench."""
+        """Indices of the columns of y, with its steps, that determine the wrench."""
         wide = bool({"gravity", "cable"} & set(self.parts))
         kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
         if not wide:
@@ -113,7 +113,7 @@ class Model:
 
     @cached_property
     def limits(self) -> Array:
-        """(size,) largest change of each parameter in an iteration."""
+        """Largest change (size,) of each parameter in an iteration."""
         out = np.full(self.size, np.inf)
         out[DELAY] = _LARGEST_DELAY
         for name, where in self.slices.items():
@@ -126,7 +126,7 @@ class Model:
         return tuple(step.time for step in self.steps)
 
     def start(self, x: Array, of: Model) -> Array:
-        """(size,) parameters x of another model; new parameters are 0."""
+        """Return parameters (size,) from the parameters x of the model `of`; new ones are 0."""
         out = np.zeros(self.size)
         out[: DELAY + 1] = x[: DELAY + 1]
         for name, where in self.slices.items():
@@ -135,7 +135,7 @@ class Model:
         return out
 
     def wrench(self, x: Array) -> Array:
-        """(B, 6, W) coefficients of the wrench in y, with parameters x (B, size)."""
+        """Return coefficients (B, 6, W) of the wrench in y, for parameters x (B, size)."""
         width, parts = WIDTH + len(MOTION) * len(self.steps), self.slices
         motion = self._motion(x)
         out = np.zeros((len(x), 6, width))
@@ -172,7 +172,7 @@ class Model:
                 out[:, :, TIME.start : TIME.start + degree] += rows
 
     def _motion(self, x: Array) -> Array:
-        """(B or 1, 12, WIDTH) s, alpha and the products of omega as functions of y."""
+        """Return s, alpha and products of omega as functions of y, (B or 1, 12, WIDTH)."""
         parts = self.slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, WIDTH))
@@ -194,9 +194,10 @@ class Model:
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def derivative(self, x: Array) -> Array:
-        """(size, 6, k) derivative of the coefficients in `columns` at x (size,).
+        """Return the derivative (size, 6, k) of the coefficients in `columns` at x (size,).
 
-        Central differences are exact, because all parameters but the rotation are linear.
+        Central differences are exact, because the wrench is linear in each parameter but the
+        rotation.
         """
         steps = np.ones(self.size)
         if "rotation" in self.slices:
@@ -207,7 +208,7 @@ class Model:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual(self, x: Array) -> Array:
-        """(6, k) coefficients of the residual in `columns`."""
+        """Return coefficients (6, k) of the residual in `columns`."""
         out = -self.wrench(x[None])[0]
         out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

@@ -20,13 +20,13 @@ Spans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Rows with the signals of a model.
+    """Selected rows of a record with the signals of a model.
 
     Attributes:
         data: the record.
-        used: (M,) selected rows.
-        times: of the model's steps [s].
-        columns: of y with its steps.
+        used: (M,) True for selected rows.
+        times: times of the model's steps [s].
+        columns: indices of columns of y with its steps.
     """
 
     data: Instants
@@ -35,22 +35,22 @@ class Rows:
     columns: NDArray[np.intp]
 
     def fits(self, model: Model) -> bool:
-        """Return whether the columns are those of another model."""
+        """Return whether the columns are also those of `model`."""
         return self.times == model.times and np.array_equal(self.columns, model.columns)
 
     @cached_property
     def y(self) -> Array:
-        """(M, W) signals, 0 in unused rows."""
+        """Signals (M, W), 0 in unused rows."""
         return self.data.only(self.used).with_steps(self.times)[:, self.columns]
 
     @cached_property
     def sums(self) -> Array:
-        """(5, W, W) sums of products at lags 0 to 4."""
+        """Sums (5, W, W) of products of the signals at lags 0 to 4."""
         return np.asarray(self.data.sums(self.y, rows=len(self.y))[0])
 
     @cached_property
     def whole(self) -> NDArray[np.intp]:
-        """Indices of rows with four used rows before them."""
+        """Indices of rows whose four predecessors are used, too."""
         whole = self.used.copy()
         whole[:ORDER] = False
         for d in range(1, ORDER + 1):
@@ -59,7 +59,7 @@ class Rows:
 
     @cached_property
     def _partial(self) -> Array:
-        """(K, 5, W) histories that cross the end of a run of rows."""
+        """Histories (K, 5, W) of signals that cross an end of a run of rows."""
         padded = np.concatenate([self.used, np.zeros(ORDER, bool)])
         near = padded.copy()
         for d in range(1, ORDER + 1):
@@ -70,7 +70,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened(self, filters: Array) -> Array:
-        """(6, W, W) sums of the rows filtered by filters (6, 5)."""
+        """Return sums of products (6, W, W) of the rows after filters (6, 5), one per channel."""
         width = self.y.shape[1]
         taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
@@ -79,7 +79,7 @@ class Rows:
         return np.asarray(out - edge.transpose(0, 2, 1) @ edge)
 
     def noise(self, residual: Array, floor: Array, order: int = ORDER) -> tuple[Array, Array]:
-        """Fit an autoregression to the residual (6, W): filters (6, 5) and power (6,)."""
+        """Return whitening filters (6, 5) and noise power (6,) for the residual (6, W)."""
         e = self.y @ residual.T
         filters = np.zeros((6, ORDER + 1))
         filters[:, 0] = 1.0
@@ -95,13 +95,13 @@ class Rows:
         return filters, np.maximum(power, floor)
 
     def rms(self, residual: Array) -> Array:
-        """(6,) of a residual (6, W)."""
+        """Return the RMS (6,) of a residual (6, W)."""
         e = self.y @ residual.T
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 
 
 def in_spans(data: Instants, spans: Spans) -> NDArray[np.bool_]:
-    """(M,) rows within a span."""
+    """Return (M,) booleans: True for rows within a time span."""
     inside = np.zeros(len(data.t), bool)
     for start, stop in spans:
         inside |= (data.t >= start) & (data.t <= stop)

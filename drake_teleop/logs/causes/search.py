@@ -1,4 +1,4 @@
-"""Absolute test of a fit, and search for causes if it fails (docs/theory.md)."""
+"""Noise test of a fit, and search for causes if it fails (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ ROUNDS = 4
 WithDelay = Callable[[float], Instants]
 _SMALLEST_DELAY_S, _LARGEST_DELAY_S, _SAME_DELAY_S, _DELAY_ITERATIONS = 5e-4, 0.3, 0.004, 4  # s
 MAX_RESIDUAL_RATIO, MAX_SMOOTH_MISFIT, MAX_EXTENSION_SCORE = 1.25, 2.2, 20.0
-"""Limits of the absolute test: residual over white noise, `State.probe`, `State.score`."""
+"""Limits of the noise test: `State.residual_ratio`, `State.smooth_misfit`, `State.score`."""
 _MIN_SCORE, _SCORE_MARGIN, _SCORE_MARGIN_SHARE = 40.0, 25.0, 0.02
 _HALVED, _FIFTH, _COLOURED_NOISE_RATIO, _REDUCED, _CERTAIN_SCORE = 0.5, 0.2, 15.0, 0.9, 1000.0
 _ATTENUATED_SHARE = 1.0 / 3.0
 _GOOD_SMOOTH_MISFIT = 1.35
-"""Largest probe of good records."""
+"""Largest smooth misfit of good records."""
 _STEP_CAUSES, _LARGEST_INCREASE = ("offsets", "load"), 3.0
 _SMOOTH_CAUSES = ("axes", "gravity", "weight", "torque factor", "contact")
 """Causes whose misfit may be as smooth as coloured noise."""
@@ -40,7 +40,7 @@ _FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"),
 
 
 def is_noise(state: State) -> bool:
-    """Return whether the residual is sensor noise: size, smooth columns, extensions."""
+    """Return whether the residual is sensor noise, by its size, smooth signals and extensions."""
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_RESIDUAL_RATIO
@@ -64,12 +64,12 @@ def search(
 ) -> Found:
     """Return the model of a record, an additional delay [s], and the last rejected candidates.
 
-    If nothing explains the record, the search is repeated with the delay from `free_delay`,
+    If no model explains the record, the search is repeated with the delay from `free_delay`,
     because a wrong model may have caused a wrong delay.
 
     Args:
         data: the record.
-        with_delay: returns the record with an additional delay of the motion [s].
+        with_delay: function that returns the record with an additional delay of the motion [s].
         given: active parts of the model.
     """
     found = _search(_initial_state(data, given), 0.0, with_delay)
@@ -133,9 +133,9 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Remove the cable if an attenuated inertial mass explains a third of its score.
+    """Return the candidates without "cable" if an attenuated inertia explains a third of its score.
 
-    Noise of the accelerations attenuates it if the load hardly accelerates.
+    Noise of the accelerations attenuates the inertial mass if the load hardly accelerates.
     """
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
@@ -146,7 +146,7 @@ def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
 def _remove_delay(
     state: State, delay_s: float, with_delay: WithDelay | None
 ) -> tuple[State, float]:
-    """Remove the remaining delay from the motion; the model is linear in it."""
+    """Remove the delay that remains in the motion; the model is linear in the delay."""
     for _ in range(_DELAY_ITERATIONS):
         if (
             with_delay is None

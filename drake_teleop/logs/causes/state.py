@@ -23,7 +23,7 @@ class State:
 
     Attributes:
         data: the record.
-        spans: (start, stop) of contacts [s].
+        spans: time spans (start, stop) of contacts [s].
         fit: the fit to the other rows.
     """
 
@@ -35,12 +35,12 @@ class State:
     def of(
         cls, data: Instants, model: Model, start: Array | None = None, spans: Spans = ()
     ) -> State:
-        """Fit a model outside of the spans."""
+        """Return the state of a model fitted outside of the time spans."""
         used = data.used & ~in_spans(data, spans)
         return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
 
     def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
-        """Fit another model to the same rows."""
+        """Return the state of another model, fitted to the same rows."""
         if start is None:
             start = model.start(self.x, self.model)
         return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))
@@ -52,12 +52,12 @@ class State:
 
     @property
     def model(self) -> Model:
-        """The fitted model."""
+        """Fitted model."""
         return self.fit.model
 
     @property
     def x(self) -> Array:
-        """(size,) parameters."""
+        """Fitted parameters (size,)."""
         return self.fit.x
 
     def extension(self, name: str) -> tuple[Array, Array]:
@@ -67,7 +67,7 @@ class State:
 
     @property
     def rows(self) -> Rows:
-        """The rows outside of contacts."""
+        """Rows outside of contacts."""
         return self.fit.rows
 
     @cached_property
@@ -84,12 +84,12 @@ class State:
 
     @cached_property
     def whole(self) -> Array:
-        """Indices of rows with four used rows before them."""
+        """Indices of rows whose four predecessors are used, too."""
         return np.asarray(Rows(self.data, self.data.used, (), self.model.columns).whole)
 
     @cached_property
     def residual_ratio(self) -> float:
-        """Largest ratio of rms residual and white noise of a channel."""
+        """Ratio of RMS residual to white noise, of the channel where it is largest."""
         white = np.maximum(self.data.white, 1e-12)
         return float(np.max(self.rows.rms(self.fit.residual) / white))
 
@@ -97,7 +97,7 @@ class State:
     def smooth_misfit(self) -> float:
         """Gain of twice the log likelihood per degree of freedom by generic smooth columns.
 
-        These are all signals, offsets of six parts of the record, R and springs, for each channel.
+        For each channel, these are all signals, offsets of six parts of the record, R and springs.
         The gain is about 1 or below for noise of any colour.
         """
         gain, freedom = self.smooth_gain
@@ -126,12 +126,11 @@ class State:
         return used + list(range(R.start, R.stop)) if self.data.gravity_W is not None else used
 
     def _segments(self) -> Array:
-        """(M, 5) offsets of parts of the record."""
         part = np.linspace(0.0, _SEGMENTS, len(self.data.t), endpoint=False).astype(int)
         return np.asarray(part[:, None] == np.arange(1, _SEGMENTS), float)
 
     def score(self, model: Model) -> float:
-        """Expected gain of twice the log likelihood by a larger model, to first order."""
+        """Return the first-order gain of twice the log likelihood by a larger model."""
         x = model.start(self.x, self.model)
         rows = self._rows_of(model)
         residual = self.fit.residual if rows is self.rows else model.residual(x)
@@ -139,7 +138,7 @@ class State:
 
 
 def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[float, int]:
-    """Return right^T gram^-1 right and the rank; diagonals below `least` are rounding errors."""
+    """Return right^T gram^-1 right and the rank; diagonals below `least` count as rounding."""
     diagonal = np.diag(gram)
     used = diagonal > np.maximum(least, 1e-12 * diagonal.max())
     if not used.any():
@@ -153,7 +152,6 @@ def gain_of(gram: Array, right: Array, least: Array | float = 0.0) -> tuple[floa
 
 
 def _springs() -> Array:
-    """(18, 27) entries of R_SW K p for six symmetric K."""
     out = np.zeros((6, 3, 27))
     for row, (j, k) in enumerate(_STIFFNESS_PAIRS):
         for i in range(3):

@@ -1,4 +1,4 @@
-"""Edits of the description with which a load explains the wrench, Eqs. (1)-(2)."""
+"""Corrections of a log description with which a load explains the wrench, Eqs. (1)-(2)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from drake_teleop.logs.read.description import Description
 UNDETERMINED_SHARE = 0.9
 """Unexplained share of the wrench's variance above which a load is undetermined."""
 SMALLEST_LAG_S = 0.002
-"""Shorter delays are not reported [s]."""
+"""Smallest reported delay [s]."""
 _PARTS, _FEWEST_PARTS = 8, 4
 _SMALLEST_DRIFT_S, _LARGEST_DEVIATION = 0.03, 0.15
 """Smallest change of the delay [s]; largest deviation from a line, as a share of it."""
@@ -43,7 +43,7 @@ _HALVED = 0.5
 
 
 def against_load(description: Description, data: LogData) -> tuple[list[Finding], float | None]:
-    """Return findings about wrench, orientation and clocks, and the delay."""
+    """Return findings about wrench, orientation and clocks, and the motion's delay [s]."""
     log = data.read(description)
     delay = None if log.static else estimate_delay(log, 30.0)
     thin = data.thin(description)
@@ -175,7 +175,7 @@ def _clock_edits(description: Description, log: Log) -> Iterator[tuple[None, Des
 
 
 def lag_finding(description: Description, delay: float | None) -> list[Finding]:
-    """Return the remedy if the motion is `delay` seconds behind the wrench."""
+    """Return a finding with a remedy if the motion is `delay` [s] behind the wrench."""
     if delay is None or abs(delay) <= SMALLEST_LAG_S or description.wrench is None:
         return []
     side = "behind" if delay > 0 else "ahead of"

@@ -25,9 +25,10 @@ _MIN_NOISE_SHARE = 1e-6
 def channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """Return findings about single channels of "wrench" or "imu", which invalidate further checks.
+    """Return findings about single channels of the stream "wrench" or "imu".
 
-    A constant channel is dead only beside a noisy one: simulated channels may be constant.
+    They invalidate further checks. A constant channel counts as dead only beside a noisy one,
+    because simulated channels may be constant.
     """
     described = getattr(description, stream)
     found: list[Finding] = []

@@ -1,8 +1,9 @@
-"""Errors of convention in a log, found by the laws of motion.
+"""Errors of convention in a log description, found by the laws of motion.
 
-Each suspicion is a correction of the description (`corrections`). It is reported only if the data
-agree decisively better with it: with Eqs. (1)-(2) for some load, or, of an IMU, with the poses.
-`drake_teleop.logs.causes` finds axes and units of the wrench and the frame of the poses.
+Each suspected error has a correction of the description (`corrections`). It is reported only if
+the data agree decisively better with the correction: with Eqs. (1)-(2) for some load, or, of an
+IMU, with the poses. `drake_teleop.logs.causes` finds axes and units of the wrench and the frame of
+the poses.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ class Conventions:
 
     Args:
         findings: suspected errors.
-        fit: of a load, apart from errors of the IMU.
-        mounting: of the IMU against the pose, if determined.
-        delay_s: of the motion behind the wrench, if determined [s].
+        fit: fit of a load, after correction of IMU errors.
+        mounting: mounting of the IMU relative to the pose, if determined.
+        delay_s: delay of the motion behind the wrench, if determined [s].
     """
 
     findings: tuple[Finding, ...]
@@ -61,7 +62,7 @@ class Conventions:
 
 
 def check_file(path: Path) -> Conventions:
-    """Compare a canonical log or a log description with its data.
+    """Check a canonical log or a log description against its data.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -84,9 +85,9 @@ def question_fit(
     Args:
         log: used samples.
         load: identified load.
-        predicted: (N, 6) wrench of that load.
+        predicted: (N, 6) wrench that this load predicts.
         delay: removed delay [s]; None if undetermined.
-        check: compares the log's description with its data.
+        check: function that checks the log's description against its data.
 
     Raises:
         DrakeTeleopError: if the result is worthless and a finding has a remedy.
@@ -130,7 +131,7 @@ def question_fit(
 
 
 def errors_of_motion(check: Callable[[], Conventions]) -> tuple[Finding, ...]:
-    """Return the errors of the described motion."""
+    """Return the findings of `check` that are errors of the described motion."""
     return tuple(x for x in _findings(check) if x.name in MOTION_ERRORS)
 
 
@@ -167,7 +168,7 @@ def _is_suspicious(log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Compare the description with its data.
+    """Check a description against its data.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -226,7 +227,7 @@ def _one_clock(
     mounting: Mounting | None,
     delay: float | None,
 ) -> list[Finding]:
-    """Merge two clock findings if IMU and wrench differ from the pose by the same time."""
+    """Merge clock findings of IMU and wrench if both have the same time offset from the pose."""
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
         return findings
@@ -242,7 +243,6 @@ def _one_clock(
 
 
 def _rest_finding(log: Log) -> Finding | None:
-    """Return a finding for too few or too similar poses at rest."""
     if not log.static:
         return None
     if len(log) < _FEWEST_POSES:

@@ -1,4 +1,4 @@
-"""Findings, and corrections of a description, each of which corrects one suspected error."""
+"""Findings about a log, and edits of its description, each for one suspected error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOTION_ERRORS = (
 )
 """Errors of the described motion, which resemble causes."""
 MIN_CLOCK_ERROR_S = 0.05
-"""Larger delays are errors of a clock, not the lag of a filter [s]."""
+"""Delay above which a clock error, not the lag of a filter, is the reason [s]."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def _gravity_field(description: Description) -> str | None:
 
 
 def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return a finding for an accelerometer in another unit, and the corrected description."""
+    """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
     field = _gravity_field(description)
     unit = None if field is None else _right_unit(description, log, field)
     if field is None or unit is None:
@@ -103,7 +103,7 @@ def _edit(description: Description, name: str, text: str, path: str, value: Any)
 
 
 def pose_edits(description: Description) -> Iterator[Edit]:
-    """Yield other forms of orientation and reversed gravity."""
+    """Yield edits of the form of the orientation and of the sign of gravity."""
     pose, imu = description.pose, description.imu
     sensed = imu is not None and imu.specific_force is not None
     if imu is not None and sensed:
@@ -143,7 +143,7 @@ def pose_edits(description: Description) -> Iterator[Edit]:
 
 
 def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
-    """Return the result for an edited description; None if it cannot be read."""
+    """Return `function(edited)`, or None if the edited description cannot be read."""
     try:
         return function(edited)
     except DrakeTeleopError:
@@ -151,7 +151,7 @@ def try_edit(function: Callable[[Description], Any], edited: Description) -> Any
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """Yield other signs, axes and units of wrench and motion, and `pose_edits`."""
+    """Yield edits of signs, axes and units of wrench and motion, and `pose_edits`."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"
@@ -175,7 +175,6 @@ def load_edits(description: Description) -> Iterator[Edit]:
 
 
 def _axis_edits(description: Description, stream: str, sensor: Any) -> Iterator[Edit]:
-    """Yield other orders of the wrench's columns, and right-angled rotations of its axes."""
     if len(sensor.force.columns) == 3 and len(sensor.torque.columns) == 3:
         for order in list(permutations(range(3)))[1:]:
             force, torque = (

@@ -66,7 +66,7 @@ _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {r
 
 
 class _Columns(NamedTuple):
-    """Columns of one kind, and the unit in their names ("" for none)."""
+    """Columns of one quantity, and the unit in their names ("" for none)."""
 
     columns: list[str]
     unit: str
@@ -76,11 +76,11 @@ _NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
-    """Guess a log description (YAML) from names and magnitudes of a table's columns.
+    """Return a log description (YAML) guessed from names and magnitudes of a table's columns.
 
     Args:
         table: any table.
-        folder: of the draft, start of the relative path to the table.
+        folder: folder of the draft; the path to the table is relative to it.
         header: whether the file contains column names.
     """
     plain = {name: _normalized(name) for name in table.columns}

@@ -1,4 +1,4 @@
-"""Checks of an IMU: consistency of its three quantities, and its motion against the pose.
+"""Checks of an IMU: consistency of its three signals, and its motion against the pose.
 
 - The angular acceleration is the derivative of the angular velocity.
 - Rotated back by the gyroscope for a few seconds, the mean specific force is minus gravity.
@@ -29,7 +29,7 @@ from drake_teleop.logs.read.mounting import Mounting, find_mounting
 from drake_teleop.logs.read.rotations import rotation_matrices
 
 DEGREE_RATIOS = (40.0, 80.0)
-"""Range of the ratio 180 / pi of two speeds with noise and gain errors."""
+"""Range of a speed ratio of 180 / pi, degrees over radians, with noise and gain errors."""
 MIN_GRAVITY_ERROR = 0.02
 """Smallest reported error of gravity; calibrated sensors are within 1 %."""
 _SIGNIFICANT = 5.0
@@ -41,7 +41,7 @@ _ROTATION_HZ, _MIN_MISFIT, _MIN_RATIO = 25.0, 0.05, 3.0
 
 
 def against_itself(description: Description, log: Log) -> tuple[list[Finding], Description]:
-    """Return findings about an IMU, and the corrected description."""
+    """Return findings about contradictions within an IMU, and the corrected description."""
     imu = description.imu
     if imu is None or imu.angular_velocity is None or log.static or imu.automatic:
         return [], description
@@ -97,7 +97,7 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
-    """Return a finding for axes of the gyroscope that differ from the accelerometer."""
+    """Return a finding and corrected columns if gyroscope and accelerometer differ in axes."""
     assert imu.angular_velocity is not None
     few = log.only(slice(None, None, max(1, round(1.0 / (_ROTATION_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
@@ -158,14 +158,14 @@ def _signed_permutations() -> list[Array]:
 
 @dataclass(frozen=True)
 class MeanGravity:
-    """Length of the mean specific force over gravity, and its standard deviation."""
+    """Ratio of the mean specific force's length to gravity, and its standard deviation."""
 
     ratio: float
     deviation: float
 
 
 def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
-    """Return the ratio from all windows; None if the record is too short."""
+    """Return the mean ratio over all time windows; None if the record is too short."""
     forces = _mean_forces(log, np.eye(3))[0]
     if len(forces) < _MIN_WINDOWS:
         return None
@@ -174,7 +174,7 @@ def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
 
 
 def _mean_forces(log: Log, P: Array) -> Array:
-    """(2, n, 3) Hann-weighted mean specific force of windows, and half a window later [m/s^2]."""
+    """Return mean specific forces (2, n, 3) of Hann windows, and half a window later [m/s^2]."""
     length = float(np.clip((log.t[-1] - log.t[0]) / 4.0, *_WINDOW_S))
     half = max(1, int(0.5 * length / log.dt))
     count = max(0, len(log) // half - 2)
@@ -194,7 +194,7 @@ def _mean_forces(log: Log, P: Array) -> Array:
 
 
 def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
-    """Return the rms distance of the means from gravity and from each other."""
+    """Return the RMS difference of mean specific forces from gravity and from each other."""
     means = _mean_forces(log, P) / gravity
     if means.shape[1] == 0:
         return np.nan
@@ -229,7 +229,7 @@ def _gravity_finding(imu: Imu, log: Log, gravity: float) -> Finding | None:
 def against_pose(
     description: Description, data: LogData
 ) -> tuple[list[Finding], Mounting | None, Description]:
-    """Return findings about the IMU, its mounting, and the corrected description."""
+    """Return findings of IMU against pose, the IMU's mounting, and the corrected description."""
 
     def mounting(edited: Description) -> Mounting | None:
         pose_alone = edited.model_copy(update={"imu": None})

@@ -1,7 +1,8 @@
 """Share of a wrench that a load explains, and limits for a better description.
 
-Unexplained variances of n independent noise samples have ratios of Fisher's F(n, n). An edit must
-exceed its quantile for one false alarm in a million logs. n = 2 * cut-off * duration (Shannon).
+For n independent noise samples, the ratio of two unexplained variances has Fisher's distribution
+F(n, n). An edit must exceed the quantile for one false alarm in a million logs. n = 2 * cut-off *
+duration (Shannon).
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from drake_teleop.logs.read.alignment import low_passed, measured
 from drake_teleop.logs.read.canonical import Log
 
 GOOD_SHARE = 0.02
-"""Unexplained share of the variance, beside white noise, of a good fit with positive mass."""
+"""Largest unexplained share of the variance, without white noise, of a good fit."""
 VALID_SHARE = 0.05
-"""Largest unexplained share, beside noise, of a valid hypothesis."""
+"""Largest unexplained share of the variance, without white noise, of a valid description."""
 MIN_IMPROVEMENT = 4.0
-"""Smallest factor by which an edit reduces the unexplained share."""
+"""Smallest factor by which an edit must reduce the unexplained share."""
 _FALSE_ALARMS, _TESTED_EDITS = 1e-6, 50
 _CUTOFF_HZ = 15.0
 _MAX_SAMPLES = 1500
@@ -29,11 +30,11 @@ _MAX_SAMPLES = 1500
 
 @dataclass(frozen=True)
 class LoadFit:
-    """Least squares of Eq. (5).
+    """Result of a least squares fit of a load, Eq. (5).
 
     Args:
-        unexplained: share of the wrench's variance.
-        mass: of the fit [kg].
+        unexplained: unexplained share of the wrench's variance.
+        mass: fitted mass [kg].
         noise: share of white noise in the variance.
         independent: number of independent samples.
     """
@@ -50,7 +51,7 @@ class LoadFit:
 
 
 def load_fit(log: Log) -> LoadFit:
-    """Fit a constant offset and a load to a log, low-passed at 15 Hz."""
+    """Return the fit of a constant offset and a load to a log, low-passed at 15 Hz."""
     cutoff = _cutoff(log)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
@@ -77,14 +78,14 @@ def load_fit(log: Log) -> LoadFit:
 
 
 def unexplained_share(wrench: Array, residual: Array) -> float:
-    """Share of the variance of a wrench (N, 6) in a residual (N, 6)."""
+    """Return the variance of a residual (N, 6) over that of the wrench (N, 6)."""
     scale = _scale(wrench)
     total = float((wrench / scale).var(axis=0).sum()) + 1e-30
     return float((residual / scale).var(axis=0).sum()) / total
 
 
 def white_noise(x: Array) -> Array:
-    """Standard deviations (k,) of white noise in (N, k), from third differences."""
+    """Return standard deviations (k,) of white noise in x (N, k), from third differences."""
     if len(x) < 4:
         return np.zeros(x.shape[1:])
     # The squares of 1, 3, 3, 1 sum to 20; 1.4826 median |x| is the deviation of a normal x.

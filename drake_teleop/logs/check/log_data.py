@@ -1,4 +1,4 @@
-"""Tables of a log for repeated reading with other descriptions: whole, or at 100 Hz."""
+"""Tables of a log, whole and thinned to 100 Hz, for repeated reading with edited descriptions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TIME_COLUMN = "time stamps of a stream without"
 
 
 class LogData:
-    """Tables of a log by `source`, whole and thinned."""
+    """Tables of a log by their stream's `source`, whole and thinned."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
@@ -42,11 +42,11 @@ class LogData:
             self._thin(stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
-        """Read the whole log."""
+        """Return the whole log, read with a description."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
-        """Read the log at about 100 Hz."""
+        """Return the log at about 100 Hz, read with a description."""
         stamped = {
             name: stream.model_copy(
                 update={
@@ -60,7 +60,7 @@ class LogData:
         return read_description(description, self._source, tables=self._thinned)
 
     def start(self, stream: Any, description: Description) -> float:
-        """Return the time of the stream's first row [s]."""
+        """Return the time of a stream's first row [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
         t = self.tables[stream.source].single(stream.time.column, "time")

@@ -39,9 +39,9 @@ _SAME_COM = 0.03
 
 
 def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
-    """Return a finding for positions in another unit, or of another point than So.
+    """Return findings for positions in a wrong unit, or of another point than So.
 
-    In S, a_P = k (a_S + alpha x r + omega x (omega x r)) with the unit k and the point r.
+    With the unit k and the point r, a_P = k (a_S + alpha x r + omega x (omega x r)) in S.
     """
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
@@ -89,9 +89,9 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
 
 
 def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
-    """Return a finding for positions in another unit than `now`.
+    """Return a finding if positions are not in the unit `now`, or None.
 
-    `kappa` is the acceleration of another instrument over that of the positions.
+    `kappa` is the acceleration from another instrument over that from the positions.
     """
     if not abs(kappa) > _SIGNIFICANT * deviation:
         return None
@@ -111,10 +111,10 @@ def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
 def _fit_with_offset(
     columns: Array, target: Array, independent: float
 ) -> tuple[Array, Array] | None:
-    """Solve columns (N, c, k) x + offsets (c,) = target (N, c).
+    """Solve columns (N, c, k) x + offsets (c,) = target (N, c) by least squares.
 
     Returns:
-        x (k,) and its standard deviations, None if x is undetermined.
+        x (k,) and its standard deviations; None if x is undetermined.
     """
     if len(columns) == 0:
         return None
@@ -133,12 +133,12 @@ def _fit_with_offset(
 
 
 def usable(log: Log) -> bool:
-    """Return whether the poses of a log suffice for its motion."""
+    """Return whether the poses of a log suffice to estimate the motion."""
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
 
 
 def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
-    """Return a finding for positions in another unit, or for a pose frame that is not S."""
+    """Return a finding for positions in a wrong unit, or for a pose frame that is not S."""
     assert log.posed is not None
     pose = None if log.described is None else log.described.pose
     seen = found.seen
@@ -150,7 +150,7 @@ def pose_finding(found: PoseEstimate, log: Log) -> Finding | None:
 
 
 def frame_finding(found: PoseEstimate, posed: Posed) -> Finding | None:
-    """Return the finding for a displaced or rotated pose frame, unless another error is likely."""
+    """Return a finding for a displaced or rotated pose frame, unless another error is likely."""
     frame, seen, phi = found.frame, found.seen, found.free.state.theta[6:]
     if not (frame.shifted or frame.turned) or phi[0] <= 0.0:
         return None

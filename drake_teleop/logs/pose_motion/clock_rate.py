@@ -1,4 +1,4 @@
-"""Relative clock rate of poses and wrench, Eq. (T76)."""
+"""Rate of the poses' clock relative to the wrench's clock, Eq. (T76)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_CHANGE_S = 0.2
 
 
 def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float) -> float:
-    """Return the relative rate, such as 5e-5, or 0 if insignificant."""
+    """Return the relative rate of the poses' clock, such as 5e-5, or 0 if insignificant."""
     first, grid = window.spectra(cache.at(spacing), delay), window.grid
     now, best = first, 0.0
     least = start = now.fit().cost
@@ -36,7 +36,7 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
 
 
 def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock; `delay` [s] holds at mid-record."""
+    """Return the poses on the wrench's clock; at mid-record, the `delay` [s] does not change."""
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 

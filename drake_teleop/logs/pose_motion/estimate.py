@@ -55,7 +55,7 @@ SEARCHED_S = 120.0
 MIN_SHIFT, MAX_SHIFT_DEVIATION = 0.01, 0.02
 """Least shift that is reported, and largest standard deviation of a known one [m]."""
 MIN_ROTATION_DEG, MAX_ROTATION_DEVIATION_DEG = 5.0, 1.0
-"""The same of a rotation [deg]."""
+"""Least rotation that is reported, and largest standard deviation of a known one [deg]."""
 _MIN_WALD, _MIN_DEVIATIONS = 50.0, 5.0
 _SHARE_OF_RATE = 0.45
 # Least gap that splines cannot bridge, and excluded margin beside it [s].
@@ -72,8 +72,8 @@ class Frame:
     Attributes:
         p_SoPo_S: (3,) origin [m].
         R_SP: (3, 3) rotation.
-        position_deviations: (3,) standard deviations [m]; inf if undetermined.
-        turn_deviations_deg: (3,) about the axes of S [deg].
+        position_deviations: (3,) standard deviations of the origin [m]; inf if undetermined.
+        turn_deviations_deg: (3,) standard deviations of rotations about the axes of S [deg].
         shifted: whether the origin differs from the description.
         turned: whether the axes differ.
     """
@@ -87,25 +87,25 @@ class Frame:
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """(3,) whether each coordinate is determined."""
+        """Booleans (3,): True where a coordinate is determined."""
         return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
     def rotation_known(self) -> NDArray[np.bool_]:
-        """(3,) whether the rotation about each axis of S is determined."""
+        """Booleans (3,): True where the rotation about an axis of S is determined."""
         return np.asarray(self.turn_deviations_deg < MAX_ROTATION_DEVIATION_DEG)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """Motion of poses, with knots and delay fitted to a wrench.
+    """Motion from poses, with knots and delay fitted to a wrench.
 
     Attributes:
         splines: of the poses, on the wrench's clock.
-        delay_s: of the motion behind the wrench [s].
-        delay_deviation: standard deviation [s]; inf if undetermined.
+        delay_s: delay of the motion behind the wrench [s].
+        delay_deviation: standard deviation of the delay [s]; inf if undetermined.
         clock_rate: relative rate of the poses' clock, such as 5e-5; 0 if insignificant.
-        imu_agrees: whether an IMU agrees; True without one.
+        imu_agrees: whether an IMU agrees with the poses; True without one.
     """
 
     splines: PoseSplines
@@ -126,12 +126,12 @@ class PoseEstimate(PoseMotion):
 
     Attributes:
         fit: load with the frame as described or estimated.
-        frame: of `free`.
-        free: fit with a free frame.
+        frame: estimated frame of the fit `free`.
+        free: fit of the load with a free frame.
         seen: figures of the linear model.
-        t: (M,) [s].
-        rejected: (M,) disturbed instants.
-        note: for the user; usually empty.
+        t: (M,) instants [s].
+        rejected: (M,) True for disturbed instants.
+        note: note for the user; usually empty.
     """
 
     fit: RigidFit
@@ -144,12 +144,12 @@ class PoseEstimate(PoseMotion):
 
     @property
     def theta(self) -> Array:
-        """(16,) [offsets; phi]."""
+        """Estimate (16,) of [offsets; phi]."""
         return self.fit.state.theta
 
     @property
     def covariance(self) -> Array:
-        """(16, 16) of theta."""
+        """Covariance (16, 16) of theta."""
         return self.fit.covariance[LOAD, LOAD]
 
 
@@ -167,19 +167,19 @@ def estimate_from_poses(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Estimate load, offsets, delay and pose frame.
+    """Estimate load, offsets, delay and pose frame P.
 
     Args:
-        t: (N,) evenly spaced [s].
+        t: (N,) times, evenly spaced [s].
         wrench: (N, 6) [f; tau] in S about So, sign of Eq. (1) [N, N m].
         poses: of P, on the same clock except for a delay.
-        gravity_W: (3,) [m/s^2].
-        p_SoPo_S: (3,) [m], or None to estimate it.
-        R_SP: (3, 3), or None to estimate it.
-        delay: of the poses behind the wrench [s], or None to estimate it.
-        near: centre of the delays searched [s].
+        gravity_W: (3,) gravity [m/s^2].
+        p_SoPo_S: (3,) origin of P [m], or None to estimate it.
+        R_SP: (3, 3) rotation of P, or None to estimate it.
+        delay: delay of the poses behind the wrench [s], or None to estimate it.
+        near: centre of the searched delays [s].
         gain: standard deviation of the sensor gains, such as 0.01.
-        lost: (N,) excluded samples.
+        lost: (N,) True for excluded samples.
         imu: IMU data of S, used if they lower the cost.
 
     Raises:
@@ -239,10 +239,10 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """Return the motion with which a load (6, 16) of `load_coefficients` fits a wrench best.
+    """Return the motion with which an identified load fits a wrench best.
 
-    Other arguments are those of `estimate_from_poses`, for P = S. Raises an error for wrong shapes,
-    or if fewer than 32 instants remain.
+    `load` (6, 16) is from `load_coefficients`. Other arguments are those of `estimate_from_poses`,
+    for P = S. Raises an error for wrong shapes, or if fewer than 32 instants remain.
     """
     with one_blas_thread():
         found = _find_motion(
@@ -261,7 +261,7 @@ def motion_of_load(
 
 @dataclass(frozen=True, eq=False)
 class _FoundMotion:
-    """Splines of all poses, and the spectra and window of the record that determined them."""
+    """Splines of all poses, spectra that determined knots and delay, window of the whole record."""
 
     splines: PoseSplines
     last: Spectra
@@ -329,7 +329,6 @@ def _poses_near(poses: Poses, grid: Grid) -> Poses:
 
 
 def _most_varied_part(grid: Grid) -> slice:
-    """Return the part of the record in which the force changes most."""
     rows, length = len(grid.t), round(SEARCHED_S / grid.dt)
     if rows <= length:
         return slice(0, rows)
@@ -341,7 +340,6 @@ def _most_varied_part(grid: Grid) -> slice:
 
 
 def _base_taper(grid: Grid, poses: Poses, lost: NDArray[np.bool_] | None, delay: float) -> Array:
-    """Return the (M,) taper without ends, gaps and `lost` samples."""
     stamps = poses.t - delay
     start, stop = max(grid.t[0], stamps[0]), min(grid.t[-1], stamps[-1])
     if stop - start < 1.0:
@@ -365,7 +363,7 @@ def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) ->
 
 
 def _free_start(fit: RigidFit, start: State, seen: ReadOff) -> State:
-    """Return the described frame, or that of the linear model if it differs."""
+    """Return the start of the free fit: described frame, or the linear model's if it differs."""
     turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
         return fit.state
@@ -403,7 +401,7 @@ def _estimate_frame(free: RigidFit, start: State) -> Frame:
 
 
 def _is_significant(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
-    """Return whether the length of x is determined, and larger than `least` and its noise."""
+    """Return whether the vector x is determined, and longer than `least` and its noise."""
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)

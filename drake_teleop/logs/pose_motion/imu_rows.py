@@ -26,7 +26,7 @@ _COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class _Sensor:
-    """Model y = b + (1 + D) x(t + tau) of one sensor, and its noise power density."""
+    """Model y = b + (1 + D) x(t + tau) of a sensor for the motion x, and its noise power."""
 
     D: Array
     b: Array
@@ -38,7 +38,7 @@ class _Sensor:
 
 
 def compare_imu(splines: PoseSplines, imu: Inertial, gravity_W: Array) -> ImuRows | None:
-    """Return the corrected IMU data for splines of poses, or None if the two do not agree."""
+    """Return the IMU data, corrected to fit splines of poses, or None if the two do not agree."""
     powers = tuple(std**2 / splines.rate for std in splines.noise())
     averaged, sensors = imu.averaged(_COMPARISON_RATE_HZ), []
     for which, y in enumerate((averaged.specific_force, averaged.angular_velocity)):
@@ -83,7 +83,7 @@ def _fit_sensor(
     which: int,
     pose_noise: tuple[float, int],
 ) -> _Sensor | None:
-    """Fit y (K, 3) at t (K,) to the splines; return None if these do not explain it.
+    """Fit a sensor's data y (K, 3) at t (K,) to the splines; return None if these do not explain y.
 
     `which` is 0 for the specific force and 1 for the angular velocity. `pose_noise` is the power of
     the poses' noise and its exponent of the angular frequency.
@@ -131,7 +131,7 @@ def _fit_sensor(
 def _least_squares(
     y: Complex, X: Complex, one: Complex, change: Complex, weight: Array
 ) -> tuple[Array, Array, float]:
-    """Return D (3, 3), b (3,) and tau of y = X D^T + b + tau change, from spectra."""
+    """Return D (3, 3), b (3,) and tau of y = X D^T + b + tau change, fitted to spectra."""
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
     for i in range(3):
@@ -149,7 +149,7 @@ def _least_squares(
 def _noise_power(
     residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
 ) -> float:
-    """Return the IMU's noise power from the residual power and the poses' share, both (K,).
+    """Return the IMU's noise power from the residual's power and the poses' noise power, both (K,).
 
     Return `white` where the poses' noise dominates at most frequencies.
     """

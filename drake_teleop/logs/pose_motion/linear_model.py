@@ -1,4 +1,4 @@
-"""Linear model of the wrench with free coefficients, Eqs. (T73) to (T75); choice of knots."""
+"""Linear model of the wrench with free coefficients C, Eqs. (T73) to (T75); choice of knots."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from drake_teleop.logs.pose_motion.splines import (
 )
 
 SPACINGS = (0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025)
-"""Knot distances that are tried before two beside the best [s]."""
+"""Knot distances that are tried first; then two between the best and its neighbours [s]."""
 MAX_DELAY_CHANGE_S = 0.25
 """Largest change of the delay in the search, or a tenth of the record [s]."""
 ROUNDING = 1e-7
@@ -55,9 +55,9 @@ class LinearFit:
 
     Attributes:
         coefficients: (6, 16) C; zero for constant signals.
-        covariance: (6, 16, 16) of the rows of C.
+        covariance: (6, 16, 16) covariances of the rows of C.
         power: (bands, 6) mean noise power.
-        costs: (6,) of the channels.
+        costs: (6,) costs of the channels.
     """
 
     coefficients: Array
@@ -67,12 +67,12 @@ class LinearFit:
 
     @property
     def cost(self) -> float:
-        """Cost (T75)."""
+        """Total cost, Eq. (T75)."""
         return float(self.costs.sum())
 
 
 def fit_linear_model(Z: Array, levels: Levels) -> LinearFit:
-    """Fit the model to moments (bands, 38, 38)."""
+    """Fit the model to second moments Z (bands, 38, 38)."""
     return _fit_moments(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z), levels)
 
 
@@ -83,9 +83,10 @@ def _wrench_powers(Z: Array) -> Array:
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the model to moments zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6).
+    """Fit the model to moments of signals and wrench.
 
-    Leading dimensions are separate fits. With `load` (6, 16) only the constants are free.
+    These are zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6). Leading dimensions
+    are separate fits. With `load` (6, 16), only the constants are free.
     """
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
@@ -132,7 +133,7 @@ def _inverses(gram: Array) -> Array:
 
 
 def least_power(Z: Array, sizes: Array) -> Array:
-    """Return (6,) power of rounding errors."""
+    """Return the power (6,) of rounding errors in each channel."""
     return _rounding_power(_wrench_powers(Z), sizes)
 
 
@@ -143,7 +144,7 @@ def _rounding_power(ff: Array, sizes: Array) -> Array:
 
 
 def fit_levels(Z: Array, of: Bands) -> Levels:
-    """Return levels with the corner of lowest cost in each channel, Eq. (T74)."""
+    """Return noise levels whose corner frequency has the lowest cost in each channel, Eq. (T74)."""
     levels = Levels.flat(of)
     least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
     for corner in _CORNERS_HZ:
@@ -159,11 +160,11 @@ class Spectra:
     """Spectra of a record for one taper, splines and delay.
 
     Attributes:
-        of: bands.
-        wrench: (K, 6).
-        signals: (K, 16), of P at t + `delay`.
-        delay: [s].
-        grid, taper, zeta: of the record; zeta is (M, 16) in time.
+        of: frequency bands.
+        wrench: (K, 6) spectrum of the wrench.
+        signals: (K, 16) spectrum of the signals of P at t + `delay`.
+        delay: delay of the signals [s].
+        grid, taper, zeta: of the record; zeta (M, 16) are the signals in time.
     """
 
     of: Bands
@@ -181,16 +182,17 @@ class Spectra:
 
     @cached_property
     def taper_fixed(self) -> bool:
-        """Whether the taper excludes interior samples, or the load is known.
+        """Whether the taper stays in place when the delay of the signals changes.
 
-        Then edges of the taper would bias the delay if they moved with the signals.
+        It stays if it excludes interior samples, because their edges would bias the delay, or if
+        the load is known.
         """
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
-        """Return the spectra with signals at another delay; `zeta` is unchanged."""
+        """Return the spectra with the signals at another delay [s]; `zeta` is unchanged."""
         shift, signals = delay - self.delay, self.signals
         if self.taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
@@ -200,7 +202,7 @@ class Spectra:
         return replace(self, signals=late)
 
     def moments(self) -> Array:
-        """Return (bands, 38, 38) moments, with derivatives of the signals alone."""
+        """Return second moments (bands, 38, 38), with derivatives of the signals, not the taper."""
         rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
         edges = taper_derivative(self.grid, self.taper)
         rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
@@ -217,7 +219,7 @@ class Spectra:
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
     def costs(self, delays: Array) -> Array:
-        """Return (D,) costs at delays (D,)."""
+        """Return the costs (D,) at the delays (D,) [s]."""
         if self.taper_fixed:
             Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
             zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
@@ -228,9 +230,10 @@ class Spectra:
         return fits.costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
-        """Return (D, bands, 16, 16) and (D, bands, 16, 6) moments at delays (D,) for a whole taper.
+        """Return the moments zz (D, bands, 16, 16) and zf (D, bands, 16, 6) at delays (D,).
 
-        Phases cancel in products of signals, except with the constant.
+        The taper moves with the signals. Phases then cancel in products of signals, except with the
+        constant.
         """
         of, Z = self.of, moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
@@ -250,7 +253,7 @@ class Spectra:
         return zz, zf[..., :6]
 
     def with_motion(self, splines: PoseSplines, gravity_W: Array, delay: float) -> Spectra:
-        """Return the spectra with other splines and delay [s]."""
+        """Return the spectra with the signals of other splines at a delay [s]."""
         zeta = splines.signals(self.grid.t + delay, gravity_W)
         signals = signal_spectrum(self.grid, self.taper, zeta, len(self.wrench))
         return replace(self, signals=signals, delay=delay, zeta=zeta)
@@ -258,7 +261,7 @@ class Spectra:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Record for a fit: grid, taper (M,), gravity (3,) [m/s^2] and highest frequency [Hz]."""
+    """Data of a fit: grid, taper (M,), gravity (3,) [m/s^2] and highest frequency [Hz]."""
 
     grid: Grid
     taper: Array
@@ -266,7 +269,7 @@ class Window:
     top: float
 
     def part(self, rows: slice) -> Window:
-        """Return a part of the grid, with ramps at its ends."""
+        """Return the window of some rows of the grid, with ramps at its ends."""
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
@@ -286,7 +289,7 @@ class Window:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay of lowest cost within `reach`, to `finest` [s], and the cost."""
+    """Return the delay of lowest cost within `reach`, accurate to `finest` [s], and this cost."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
@@ -334,7 +337,7 @@ def guess_spacing(
 def choose_spacing(
     window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return the choice, knot distance [s] and delay [s] of lowest cost.
+    """Return the element of `choices`, knot distance [s] and delay [s] of lowest cost.
 
     Knots are slightly closer than at the minimum, because fits do not compensate for motion that
     the splines miss.
@@ -362,7 +365,7 @@ def choose_spacing(
 
 
 def averaged_splines(poses: Poses) -> SplineCache:
-    """Return splines of averaged poses, at the rate that the search needs."""
+    """Return a cache of splines of averaged poses, at the rate that a search needs."""
     return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 

@@ -29,7 +29,7 @@ class Poses:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def continued(self) -> Poses:
-        """Return the poses with quaternion signs that are continuous."""
+        """Return the poses with quaternions whose signs do not jump."""
         products = np.einsum("ki,ki->k", self.quaternion[1:], self.quaternion[:-1])
         if (products >= 0.0).all():
             return self
@@ -37,7 +37,7 @@ class Poses:
         return Poses(self.t, self.position, self.quaternion * sign[:, None])
 
     def averaged(self, count: int) -> Poses:
-        """Return means of `count` poses with continuous signs, for a faster search."""
+        """Return means of `count` consecutive poses, whose quaternion signs must not jump."""
         rows = len(self.t) // count * count
         t, p, q = (
             x[:rows].reshape(-1, count, *x.shape[1:]).mean(axis=1)
@@ -51,7 +51,7 @@ class Inertial:
     """IMU data of S at So, in the axes of S.
 
     Attributes:
-        t: (K,) evenly spaced except for gaps [s].
+        t: (K,) times, evenly spaced except for gaps [s].
         specific_force: (K, 3) [m/s^2], or None.
         angular_velocity: (K, 3) [rad/s], or None.
     """
@@ -66,7 +66,7 @@ class Inertial:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def averaged(self, fastest: float) -> Inertial:
-        """Return means of rows at a rate of at least `fastest` [Hz], without gaps."""
+        """Return means of rows, at least `fastest` per second [Hz], without means across gaps."""
         count = max(1, int(self.rate / fastest))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
@@ -84,10 +84,10 @@ class Posed:
     """Poses of a log with their description.
 
     Attributes:
-        poses: of S, if the description is right.
-        gravity_W: (3,) [m/s^2].
+        poses: poses of S, if the description is right.
+        gravity_W: (3,) gravity [m/s^2].
         p_SoPo_S: (3,) described origin of P [m].
-        R_SP: (3, 3) described rotation.
+        R_SP: (3, 3) described rotation of P.
         imu: IMU data, or None.
     """
 
@@ -98,6 +98,6 @@ class Posed:
     imu: Inertial | None = None
 
     def earlier(self, start: float) -> Posed:
-        """Return the record with times relative to `start` [s]."""
+        """Return the poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

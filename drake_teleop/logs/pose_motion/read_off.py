@@ -1,4 +1,4 @@
-"""Units, axes and masses from the coefficients of the linear model, before any load is assumed."""
+"""Units, axes and masses from the linear model's coefficients, before a load is assumed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ class ReadOff:
 
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
-        kappa_deviation: its standard deviation; inf if undetermined.
-        gravity_force: (3, 3) M_g [kg].
+        kappa_deviation: standard deviation of kappa; inf if undetermined.
+        gravity_force: (3, 3) M_g, force over minus gravity [kg].
         deviation: largest standard deviation of M_g [kg].
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
         masses: (3,) singular values of M_g [kg].
         permutation: (3, 3) signed permutation nearest to R_SP.
-        oblique_deg: angle between the two [deg].
+        oblique_deg: angle between permutation and R_SP [deg].
         gravity_torque: (3, 3) torque over minus gravity [kg m].
         turning_force: (3, 3) force over minus angular acceleration [kg m]; equal if Po is So.
-        moment_deviations: of the norms of the last and of the one before.
+        moment_deviations: standard deviations of the norms of turning_force and gravity_torque.
     """
 
     kappa: float
@@ -49,12 +49,12 @@ class ReadOff:
 
     @property
     def mirrored(self) -> bool:
-        """Whether the axes are left-handed."""
+        """Whether the axes of wrench and poses are mirror images."""
         return bool(np.linalg.det(self.R_SP) < 0.0)
 
 
 def read_off(fit: LinearFit) -> ReadOff:
-    """Return the figures of a fit."""
+    """Return the figures of a fitted linear model."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
@@ -102,7 +102,7 @@ def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[
 
 
 def nearest_permutation(R: Array) -> Array:
-    """Return the signed permutation matrix (3, 3) with the largest trace with R."""
+    """Return the signed permutation matrix (3, 3) nearest to the matrix R."""
     from scipy.optimize import linear_sum_assignment
 
     rows, columns = linear_sum_assignment(-np.abs(R))

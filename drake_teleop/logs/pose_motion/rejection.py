@@ -19,11 +19,11 @@ _NORMAL_MAD = 1.4826
 _MAX_LOSS = 2.5
 _PASSED_SHARE = 0.3
 _MIN_MARGIN_S = 0.1
-"""Least margin of a rejected stretch [s]."""
+"""Least margin on both sides of a rejected time span [s]."""
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return (M,) flags of disturbed instants, and a note for the user.
+    """Return (M,) booleans: True for disturbed instants; and a note for the user.
 
     For an identified load only the offsets are fitted.
     """
@@ -70,7 +70,7 @@ def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
 
 
 def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
-    """Return (M,) largest ratio of residual to robust deviation over the channels."""
+    """Return (M,) ratios of residual to robust deviation, of the worst channel."""
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
@@ -80,7 +80,7 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
 
 
 def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    """Return the largest growth of a deviation, relative to random loss of as many samples."""
+    """Return the largest growth of a deviation, relative to a random loss of as many samples."""
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     every, some = (

@@ -1,6 +1,6 @@
 """Rigid load, delay and transform between pose frame and sensor, Eqs. (T78) to (T81).
 
-Gauss-Newton on second moments that are compensated for noise of the poses.
+The fit is Gauss-Newton on second moments that are compensated for noise of the poses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from drake_teleop.logs.pose_motion.spectra import FORCES, RATES, WIDTH, Levels
 from drake_teleop.logs.pose_motion.splines import GRAVITY_COLUMNS, SIGNALS
 
 PARAMETERS = 23
-"""[offsets; phi] (16), tau, r (3), rho (3)."""
+"""Number of parameters: [offsets; phi] (16), tau, r (3), rho (3)."""
 LOAD, DELAY, LEVER, TURN = slice(0, 16), slice(16, 17), slice(17, 20), slice(20, 23)
 _STEPS, _CONVERGED = 40, 1e-4
 _MAX_RIGID_RATIO, _GAIN_ALLOWANCE, _NOISE_RATIO = 4.0, 1.5, 1.5
@@ -32,7 +32,7 @@ _RANK_TOLERANCE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Parameters: theta (16), tau [s], r = p_PoSo (3) [m], R_PS (3, 3)."""
+    """Parameters: theta (16,), delay tau [s], lever arm r = p_PoSo (3,) [m], R_PS (3, 3)."""
 
     theta: Array
     tau: float
@@ -45,12 +45,12 @@ class RigidFit:
     """Fit of a rigid load.
 
     Attributes:
-        state: estimate; tau is relative to the delay of the moments.
-        covariance: (23, 23) of [theta, tau, r, rho], rho in the axes of S; inf on the diagonal if
-            undetermined, 0 if not free.
+        state: estimated parameters; tau is relative to the delay of the moments.
+        covariance: (23, 23) of [theta, tau, r, rho], rho the rotation about the axes of S; inf on
+            the diagonal if undetermined, 0 if not free.
         misfit: log likelihood ratio to the linear model (times 2).
-        degrees: expected misfit.
-        misfit_of_gains: expected increase by stated gain errors.
+        degrees: degrees of freedom of the misfit.
+        misfit_of_gains: expected increase of the misfit by stated gain errors.
         one_weight: whether all bands had one weight.
     """
 
@@ -75,13 +75,13 @@ class RigidFit:
 
     @property
     def inflation(self) -> float:
-        """Factor on standard deviations; noise alone causes 1.5 times the degrees."""
+        """Factor on standard deviations due to misfit; noise causes 1.5 times the degrees."""
         left = self.misfit - _GAIN_ALLOWANCE * self.misfit_of_gains
         return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
-    """Return (19, 22) M of z = M [zeta; F], Eq. (T79)."""
+    """Return the matrix M (19, 22) of z = M [zeta; F], Eq. (T79)."""
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, SIGNALS:] = np.eye(6)
@@ -94,7 +94,7 @@ def motion_map(R: Array, r: Array) -> Array:
 
 
 def _centripetal(r: Array) -> Array:
-    """Return (3, 6) map from products of omega to omega x (omega x r)."""
+    """Return the matrix (3, 6) from products of omega to omega x (omega x r)."""
     x, y, z = r
     return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
@@ -103,9 +103,10 @@ _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
-    """Return (6, 16) coefficients C of a load for P = S, Eq. (T73).
+    """Return the coefficients C (6, 16) of a load in the linear model for P = S, Eq. (T73).
 
-    `phi` is (10,). `removed_weight` (4,) is [m, m c] of a weight that the wrench does not contain.
+    `phi` (10,) is the load. `removed_weight` (4,) is [m, m c] of a weight that the wrench does not
+    contain.
     """
     C = _coefficients_of(phi)
     if removed_weight is not None:
@@ -121,7 +122,6 @@ def _coefficients_of(phi: Array) -> Array:
 
 
 def _rotated_products(R: Array) -> Array:
-    """Return (6, 6) map from products of omega to those of R^T omega."""
     out = np.empty((6, 6))
     for row, (i, j) in enumerate(_PRODUCT_PAIRS):
         for column, (k, m) in enumerate(_PRODUCT_PAIRS):
@@ -142,11 +142,11 @@ def fit_rigid(
     """Fit a rigid load; use one weight for all bands if no rigid load explains the wrench.
 
     Args:
-        Z: (bands, 38, 38) `spectra.moments`.
-        Q: (bands, 38, 38) `spectra.noise_moments`.
+        Z: (bands, 38, 38) second moments, `Spectra.moments`.
+        Q: (bands, 38, 38) noise of the poses in Z, `spectra.noise_moments`.
         levels: noise of the bands.
         start: initial state.
-        free: (23,) estimated parameters.
+        free: (23,) True for estimated parameters.
         linear: linear model, whose residual gives the first weights.
         gain: standard deviation of the sensor gains.
     """
@@ -180,7 +180,7 @@ class _Record:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """State, last columns B (6, 23, 38), weights W and residual covariances R (bands, 6, 6)."""
+    """Solution: state, columns B (6, 23, 38), weights W, residual covariances R (bands, 6, 6)."""
 
     state: State
     B: Array
@@ -212,7 +212,7 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
 
 
 def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
-    """Return the (23, 23) covariance by noise, gain errors and misfit."""
+    """Return the covariance (23, 23) due to noise, gain errors and misfit."""
     B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
     middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
@@ -230,7 +230,7 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
 
 
 def _weight_estimation_factors(record: _Record, solution: _Solution) -> Array:
-    """Return (23,) factors on deviations by estimated weights, Eq. (T81)."""
+    """Return factors (23,) on standard deviations, because weights are estimated, Eq. (T81)."""
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
     weight = np.diagonal(solution.W, axis1=1, axis2=2)
@@ -253,7 +253,7 @@ def _residual_map(state: State) -> Array:
 
 
 def _columns(state: State) -> tuple[Array, Array]:
-    """Return (6, 23, 38) B = -de/dx and (6, 38) e, as functions of y."""
+    """Return the residual e (6, 38) and B = -de/dx (6, 23, 38), in coefficients of y."""
     L, M = _residual_map(state), _map(state)
     B = np.zeros((6, PARAMETERS, WIDTH))
     B[:, LOAD] = coefficients() @ M
@@ -278,7 +278,7 @@ def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the (23, 23) pseudo-inverse and (23,) flags of undetermined parameters."""
+    """Return the pseudo-inverse (23, 23) and flags (23,) of undetermined parameters."""
     diagonal = np.diag(gram)
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
@@ -301,7 +301,7 @@ def _residual_sums(record: _Record, state: State) -> Array:
 def _residual_covariances(
     record: _Record, state: State, sums: Array, used: Array | None = None
 ) -> Array:
-    """Return (bands, 6, 6) R_b of Eq. (T80)."""
+    """Return the residual covariances R_b (bands, 6, 6) of Eq. (T80)."""
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
@@ -313,7 +313,7 @@ def _residual_covariances(
 
 
 def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    """Return (bands, 6) degrees of freedom that parameters use."""
+    """Return the degrees of freedom (bands, 6) that the parameters use."""
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
     gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)
@@ -321,7 +321,6 @@ def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
 
 
 def _gain_effects(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    """Return (23, 36) effects of unit gain errors on the parameters."""
     BF = (B.reshape(-1, WIDTH) @ Z)[:, :, FORCES].reshape(len(Z), 6, PARAMETERS, 6)
     return gain_effects(BF, W, inverse)
 

@@ -1,7 +1,7 @@
-"""Spectra, second moments and noise of wrench and signals in bands (docs/theory.md).
+"""Spectra, second moments and noise of wrench and signals in frequency bands (docs/theory.md).
 
-The signals have about 100 Hz, the wrench its own rate over the same span, so that their frequencies
-agree.
+The signals have about 100 Hz, the wrench its own rate over the same time span, so that the
+frequencies of their spectra agree.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_FREQUENCY_HZ = 25.0
 RAMP_S = 1.0
 """Length of the taper's ramps at the ends of the record [s]."""
 EDGE_S = 0.2
-"""Length of its ramps beside excluded samples [s]."""
+"""Length of the taper's ramps beside excluded samples [s]."""
 _GRID_RATE_HZ = 100.0
 _GROUP_EDGES_HZ = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0, 18.0, MAX_FREQUENCY_HZ)
 _MIN_GROUP_SIZE = 8.0
@@ -41,8 +41,8 @@ class Grid:
     """Instants of the signals and samples of the wrench.
 
     Attributes:
-        t: (M,) evenly spaced, about 100 Hz [s].
-        wrench: (N, 6) with N = M stride.
+        t: (M,) instants, evenly spaced, about 100 Hz [s].
+        wrench: (N, 6) samples, N = M stride.
         stride: wrench samples per instant.
         load: (6, 16) coefficients of an identified load, or None.
     """
@@ -54,7 +54,7 @@ class Grid:
 
     @classmethod
     def of(cls, t: Array, wrench: Array, load: Array | None = None) -> Grid:
-        """Return the grid of evenly spaced samples (N,), (N, 6)."""
+        """Return the grid of evenly spaced times (N,) and wrenches (N, 6)."""
         dt = (t[-1] - t[0]) / (len(t) - 1)
         stride = max(1, int(1.0 / (_GRID_RATE_HZ * dt) + 1e-6))
         rows = len(t) // stride
@@ -67,24 +67,24 @@ class Grid:
 
     @cached_property
     def length(self) -> int:
-        """Number of samples of the transform."""
+        """Number of samples of the Fourier transforms."""
         return int(next_fast_len(len(self.t), real=True))
 
     @cached_property
     def frequency(self) -> Array:
-        """(L,) frequencies of the transforms [Hz]."""
+        """Frequencies (L,) of the Fourier transforms [Hz]."""
         return np.asarray(np.fft.rfftfreq(self.length, self.dt), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Bands of frequency.
+    """Frequency bands, which form groups with a common noise level.
 
     Attributes:
         frequency: (K,) used frequencies [Hz].
-        band: (K,) band of each.
-        weight: (K,) half the independent numbers of each.
-        group: (count,) group of each band.
+        band: (K,) index of each frequency's band.
+        weight: (K,) half the independent numbers of each frequency.
+        group: (count,) index of each band's group.
     """
 
     frequency: Array
@@ -99,18 +99,18 @@ class Bands:
 
     @cached_property
     def sizes(self) -> Array:
-        """(count,) half the independent numbers of each band."""
+        """Half the independent numbers (count,) of each band."""
         return np.asarray(np.bincount(self.band, self.weight), np.float64)
 
     def sums(self, values: Array) -> Array:
-        """Return (count, ...) weighted sums of (K, ...)."""
+        """Return the weighted sums (count, ...) over the bands of values (K, ...)."""
         flat = values.reshape(len(values), -1) * self.weight[:, None]
         starts = np.searchsorted(self.band, np.arange(self.count))
         return np.add.reduceat(flat, starts, axis=0).reshape(self.count, *values.shape[1:])
 
 
 def bands(grid: Grid, taper: Array, top: float) -> Bands:
-    """Return bands up to `top` [Hz]; groups with few numbers join the next."""
+    """Return bands up to `top` [Hz]; groups with few numbers are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
     weight = np.full(len(frequency), worth)
@@ -131,20 +131,20 @@ def bands(grid: Grid, taper: Array, top: float) -> Bands:
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
-    """Return (M,) 1 between start and stop, with cosine ramps, and 0 outside."""
+    """Return a taper (M,), 1 between start and stop, 0 outside, with cosine ramps."""
     ramp = min(RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
 def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
-    """Return the taper, 0 within `margin` [s] of `lost` (M,), with cosine edges."""
+    """Return the taper, set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
     edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
 def distance(flags: NDArray[np.bool_]) -> Array:
-    """Return (M,) instants to the nearest flag of (M,); inf without any."""
+    """Return the number (M,) of instants to the nearest flag; inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
     after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
@@ -152,7 +152,7 @@ def distance(flags: NDArray[np.bool_]) -> Array:
 
 
 def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
-    """Return (count, 6) of the tapered wrench, scaled as spectra of the signals."""
+    """Return the spectrum (count, 6) of the tapered wrench, scaled as those of the signals."""
     fine = np.zeros(grid.length * grid.stride)
     n = len(grid.wrench)
     full = np.interp(np.arange(n) / grid.stride, np.arange(len(taper)), taper)
@@ -164,7 +164,7 @@ def wrench_spectrum(grid: Grid, taper: Array, count: int) -> Complex:
 
 
 def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Complex:
-    """Return (count, 16) of the tapered signals (M, 16)."""
+    """Return the spectrum (count, 16) of the tapered signals zeta (M, 16)."""
     out = np.empty((count, zeta.shape[1]), np.complex128)
     for c, column in enumerate(zeta.T):
         out[:, c] = np.fft.rfft(column * taper, grid.length)[:count]
@@ -172,19 +172,19 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
 
 
 def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
-    """Return spectra (K, 16) of signals and taper `shift` [s] later; the constant stays."""
+    """Return spectra (K, 16) with signals and taper `shift` [s] later, except the constant."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
 
 
 def shift_taper(grid: Grid, taper: Array, shift: float) -> Array:
-    """Return the (M,) taper moved by `shift` [s]."""
+    """Return the taper (M,) moved by `shift` [s]."""
     return _filter(grid, taper, np.exp(-2j * np.pi * grid.frequency * shift))
 
 
 def taper_derivative(grid: Grid, taper: Array) -> Array:
-    """Return the (M,) derivative of the taper [1/s]."""
+    """Return the time derivative (M,) of the taper [1/s]."""
     return _filter(grid, taper, 2j * np.pi * grid.frequency)
 
 
@@ -193,9 +193,9 @@ def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Arra
 
 
 def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
-    """Return (bands, 38, 38) sums of Re y* y^T, y = [zeta (16), F (6), d zeta/dt (16)].
+    """Return second moments (bands, 38, 38), sums of Re y* y^T.
 
-    Without rates the result is (bands, 22, 22).
+    y is [zeta (16), F (6), d zeta/dt (16)]. Without rates the result is (bands, 22, 22).
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
     y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
@@ -217,9 +217,9 @@ class Levels:
     """Noise with one level for each group of bands and channel.
 
     Attributes:
-        sizes: (bands,) half the number of independent numbers.
-        group: (bands,) number of the group.
-        shape: (bands, 6) relative power.
+        sizes: (bands,) half the independent numbers of each band.
+        group: (bands,) index of each band's group.
+        shape: (bands, 6) power relative to the level.
     """
 
     sizes: Array
@@ -228,11 +228,12 @@ class Levels:
 
     @classmethod
     def flat(cls, of: Bands) -> Levels:
-        """Return white noise within each group."""
+        """Return levels of noise that is white within each group."""
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
     def power(self, sums: Array, used: Array | None = None) -> Array:
-        """Return (..., bands, 6) mean power of residual power `sums` (..., bands, 6).
+        """Return the noise power (..., bands, 6) that a residual of power `sums` (..., bands, 6)
+        implies.
 
         `used` (bands, 6) are degrees of freedom used by parameters.
         """
@@ -245,7 +246,7 @@ class Levels:
         return np.asarray(level[..., self.group, :] * self.shape)
 
     def grouped(self, x: Array) -> Array:
-        """Return (groups, ...) sums of (bands, ...)."""
+        """Return the sums (groups, ...) over the bands of each group, of x (bands, ...)."""
         return np.asarray(np.add.reduceat(x, self._starts, axis=0))
 
     @cached_property
@@ -257,12 +258,12 @@ class Levels:
         return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
-        """Return (..., 6) costs (T75) of powers (..., bands, 6)."""
+        """Return the costs (..., 6), Eq. (T75), of noise powers (..., bands, 6)."""
         return np.asarray(self.sizes @ np.log(power))
 
 
 def random_walk_shape(of: Bands, corner: float) -> Array:
-    """Return (bands,) means of 1 + (corner / f)^2, Eq. (T74)."""
+    """Return the mean (bands,) of 1 + (corner / f)^2 in each band, Eq. (T74)."""
     f = np.maximum(of.frequency, of.frequency[1])
     return np.asarray(1.0 + of.sums((corner / f) ** 2) / of.sizes)
 
@@ -280,7 +281,7 @@ def noise_moments(
     of: Bands,
     noise: tuple[float, float],
 ) -> Array:
-    """Return (bands, 38, 38) Q that noise of the poses adds to `spectra.moments`.
+    """Return the matrices Q (bands, 38, 38) that noise of the poses adds to `Spectra.moments`.
 
     `zeta` (M, 16) are the signals, `noise` standard deviations of position [m] and rotation [rad].
     """
@@ -309,7 +310,7 @@ def noise_moments(
 
 
 def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
-    """Return covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
+    """Return signal covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
     still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
     mean = weight @ zeta
     for left in (_A, _G):

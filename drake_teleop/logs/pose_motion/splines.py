@@ -30,12 +30,12 @@ class ImuRows:
     """IMU data that refine the splines, corrected to the axes, clock and zero bias of the poses.
 
     Attributes:
-        t: (K,) [s].
-        rate: [Hz].
-        acceleration_W: (K, 3) of So [m/s^2], or None.
-        quaternion_rate: (K, 4) [1/s], or None.
-        pose_powers: power densities of position [m^2/Hz] and rotation [rad^2/Hz].
-        own_powers: of acceleration and angular velocity.
+        t: (K,) times [s].
+        rate: samples per second [Hz].
+        acceleration_W: (K, 3) acceleration of So [m/s^2], or None.
+        quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
+        pose_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
+        own_powers: noise power densities of acceleration and angular velocity.
     """
 
     t: Array
@@ -58,7 +58,7 @@ class ImuRows:
         pose_powers: tuple[float, float],
         own_powers: tuple[float, float],
     ) -> ImuRows:
-        """Return the rows of s and omega (K, 3), with the orientation of `splines`."""
+        """Return the rows of specific force s and omega (K, 3), oriented by `splines`."""
         q = splines.quaternion(t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -71,7 +71,7 @@ class ImuRows:
         return cls(t, rate, acceleration, rates, pose_powers, own_powers)
 
     def share(self, frequency: Array) -> tuple[Array, Array]:
-        """Return the remaining shares of the poses' noise at frequencies (K,), Eq. (T83)."""
+        """Return the shares of the poses' noise that remain at frequencies (K,), Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -90,9 +90,9 @@ class PoseSplines:
     """Least-squares splines of poses.
 
     Attributes:
-        poses: fitted poses with continuous signs.
+        poses: fitted poses, whose quaternion signs do not jump.
         spacing: knot distance [s].
-        rate: of the poses [Hz].
+        rate: rate of the poses [Hz].
         imu_rows: IMU data, or None.
     """
 
@@ -108,7 +108,7 @@ class PoseSplines:
             self._spline = self._fit(t, _thin_knots(knots, t))
 
     def _fit(self, t: Array, knots: Array) -> BSpline:
-        """Solve banded normal equations.
+        """Return the spline from banded normal equations.
 
         They are five times faster than `scipy.interpolate.make_lsq_spline` and sufficiently
         accurate.
@@ -139,11 +139,11 @@ class PoseSplines:
         return BSpline(knots, np.hstack(columns), DEGREE)
 
     def quaternion(self, t: Array) -> Array:
-        """Return (N, 4) at times t, nearly of unit length."""
+        """Return quaternions (N, 4) at times t, nearly of unit length."""
         return np.asarray(self._at(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
-        """Return (N, 3) at times t [m]."""
+        """Return positions (N, 3) at times t [m]."""
         return np.asarray(self._at(t, 0)[:, :3])
 
     def _at(self, t: Array, order: int) -> Array:
@@ -151,9 +151,9 @@ class PoseSplines:
         return np.asarray(self._spline(at, order))
 
     def signals(self, t: Array, gravity_W: Array) -> Array:
-        """Return (N, 16) signals zeta of Eq. (T73) at times t (N,) [s], in the axes of P.
+        """Return the signals zeta (N, 16) of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        Outside of the poses, the signals of the ends are held.
+        Before and after the poses, the signals of the ends are held.
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))
@@ -165,12 +165,12 @@ class PoseSplines:
         return zeta
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """Return (N, 3) specific force of Po, omega and alpha of P, in its axes."""
+        """Return specific force of Po, omega and alpha of P (N, 3), in the axes of P."""
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """Return (N, 3) gravity in the axes of P [m/s^2]."""
+        """Return gravity (N, 3) in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
         for part in _row_blocks(len(t)):
             q = self.quaternion(t[part])
@@ -179,7 +179,6 @@ class PoseSplines:
         return out
 
     def _motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array, Array]:
-        """Return (N, 3) a, -g, omega and alpha."""
         out = np.empty((4, len(t), 3))
         for part in _row_blocks(len(t)):
             out[:, part] = self._motion_at(t[part], gravity_W)
@@ -198,9 +197,10 @@ class PoseSplines:
         return _in_P(q, n, second[:, :3]), _in_P(q, n, gravity_rows), omega, alpha
 
     def noise(self) -> tuple[float, float]:
-        """Return standard deviations per axis of position [m] and rotation [rad].
+        """Return the noise per axis of position [m] and rotation [rad], as standard deviations.
 
-        They come from residuals just above the passed frequencies, because noise can be coloured.
+        It is estimated from residuals just above the frequencies that the splines pass, because
+        noise can be coloured.
         """
         if self.imu_rows is not None:
             position_power, rotation_power = self.imu_rows.pose_powers
@@ -226,7 +226,7 @@ class PoseSplines:
 
 
 class SplineCache:
-    """Splines of the same poses with several knot distances, each fitted once."""
+    """Splines of the same poses by knot distance, each fitted once."""
 
     def __init__(self, poses: Poses, imu_rows: ImuRows | None = None) -> None:
         self.poses, self.imu_rows = poses, imu_rows
@@ -234,11 +234,11 @@ class SplineCache:
 
     @property
     def rate(self) -> float:
-        """Rate of the fitted rows [Hz]."""
+        """Rate of the fitted poses and IMU rows together [Hz]."""
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
-        """Return the splines with this knot distance [s]."""
+        """Return the splines with a knot distance [s]."""
         if spacing not in self._fit:
             self._fit[spacing] = PoseSplines(self.poses, spacing, self.imu_rows)
         return self._fit[spacing]
@@ -252,7 +252,6 @@ def passed(frequency: Array, spacing: float) -> Array:
 
 
 def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
-    """Return uniform knots, without those in gaps of the samples."""
     inner = np.arange(t[0] + spacing, t[-1] - 0.5 * spacing, spacing)
     if with_imu:
         return np.concatenate([np.repeat(t[0], DEGREE + 1), inner, np.repeat(t[-1], DEGREE + 1)])
@@ -280,7 +279,7 @@ def _row_blocks(count: int) -> list[slice]:
 def _normal(
     parts: Iterable[tuple[Array, Array]], knots: Array, degree: int, width: int
 ) -> tuple[Array, Array]:
-    """Return band (degree + 1, n) and right side (n, width) of the normal equations."""
+    """Return the normal equations of a spline: band (degree + 1, n) and right side (n, width)."""
     size, order = len(knots) - degree - 1, degree + 1
     band, right = np.zeros((order, size)), np.zeros((size, width))
     for t, x in parts:
@@ -298,7 +297,7 @@ def _normal(
 
 
 def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    """Return the same for values of a derivative of the spline."""
+    """Return the normal equations for values x of a derivative of the spline."""
     change = eye_array(len(knots) - DEGREE - 1, format="csr")
     for k in range(order):  # maps coefficients of a spline to those of its derivative
         inner, degree = knots[k : len(knots) - k], DEGREE - k
@@ -320,14 +319,12 @@ def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Arra
 
 
 def _relative_vector(q: Array, p: Array) -> Array:
-    """Return (N, 3) vector part of q* p."""
     v, w = q[:, 1:], p[:, 1:]
     out: Array = q[:, :1] * w - p[:, :1] * v - _cross(v, w)
     return out
 
 
 def _in_P(q: Array, n: Array, x: Array) -> Array:
-    """Return (N, 3) world vectors in the axes of P."""
     v = -q[:, 1:]
     once = _cross(v, x)
     out: Array = x + 2.0 * (q[:, :1] * once + _cross(v, once)) / n
@@ -335,7 +332,7 @@ def _in_P(q: Array, n: Array, x: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return (N, 3) cross products, five times faster than NumPy."""
+    """Return cross products (N, 3), five times faster than NumPy."""
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

@@ -1,1 +1,1 @@
-"""Foreign files into one table."""
+"""Readers that convert log files of other software into one table."""

@@ -22,7 +22,7 @@ SMOOTHER_WINDOW = 1.8
 
 
 def spacing(t: Array) -> float:
-    """Return the mean step of (N,) times."""
+    """Return the mean step of the times `t` (N,)."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
@@ -36,7 +36,7 @@ def uniform_times(t: Array) -> Array:
 
 
 def resample(t_new: Array, t: Array, x: Array) -> Array:
-    """Interpolate (N, ...) samples linearly at `t_new`; hold the end values."""
+    """Interpolate samples x (N, ...) linearly at `t_new`; hold the end values."""
     if np.array_equal(t_new, t):
         return x
     out = np.empty((len(t_new), *x.shape[1:]))
@@ -57,10 +57,10 @@ def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
 
 
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
-    """Filter (N, ...) samples of spacing `dt` [s] without phase shift, Eq. (T10).
+    """Filter samples x (N, ...) of spacing `dt` [s] without phase shift, Eq. (T10).
 
     The ends are continued by point reflection. A cut-off of None or above the Nyquist rate changes
-    nothing. `scipy.signal.sosfiltfilt` has another gain near that rate.
+    nothing. `scipy.signal.sosfiltfilt` has another gain near the Nyquist rate.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
@@ -85,7 +85,8 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
 def smooth_derivatives(
     x: Array, dt: float, bandwidth_hz: float | None
 ) -> tuple[Array, Array, Array]:
-    """Return x, dx/dt and d^2x/dt^2 of (N, ...) samples by sliding polynomials of degree 5.
+    """Return smoothed x, dx/dt and d^2x/dt^2 of samples (N, ...) by sliding polynomials of degree
+    5.
 
     This is the filter of Savitzky and Golay (1964). The window is 1.8 / `bandwidth_hz` [s], at
     least 9 samples. `scipy.signal.savgol_filter` is inaccurate above 700 samples.
@@ -109,13 +110,13 @@ def smooth_derivatives(
 
 
 def noise_gain(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return (3,) white-noise gains of `smooth_derivatives`: [1], [1/s], [1/s^2]."""
+    """Return the gains (3,) of `smooth_derivatives` for white noise: [1], [1/s], [1/s^2]."""
     weights = smoother(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
 def smoother(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return (6, w) weights from the samples of a window to polynomial coefficients; w <= n."""
+    """Return weights (6, w) that map the w <= n samples of a window to polynomial coefficients."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
     half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
@@ -162,7 +163,7 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def undelayed(log: Log, delay_s: float) -> Log:
-    """Return the log with its motion advanced by its lag `delay_s` behind the wrench.
+    """Return the log with its motion advanced by `delay_s` [s], the lag behind the wrench.
 
     Samples without motion are removed; an error is raised if fewer than 8 remain.
     """
@@ -197,14 +198,14 @@ def undelayed(log: Log, delay_s: float) -> Log:
 
 
 def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) flags of samples that no gap affects, even after a low-pass."""
+    """Return (N,) booleans: True for samples that no gap affects, even after a low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
 
 
 def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) flags of samples within `length_s`, or a low-pass period, of either end."""
+    """Return (N,) booleans: True within `length_s`, or a low-pass period, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out
@@ -216,7 +217,7 @@ def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_
 
 
 def widened(flags: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Return the (N,) flags, also set within `by` samples of a set flag."""
+    """Return (N,) booleans: True within `by` samples of a set flag."""
     count = np.concatenate([[0], np.cumsum(flags)])
     at = np.arange(len(flags))
     return count[np.minimum(at + by + 1, len(flags))] > count[np.maximum(at - by, 0)]

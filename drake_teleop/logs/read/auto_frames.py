@@ -1,4 +1,4 @@
-"""Estimates for `auto` in the frames of IMU and pose."""
+"""Estimates for the value `auto` in the frames of IMU and pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_LAG_S = 0.05
 def describe_mounting(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Replace `auto` in the IMU's frame and position by estimates; return notes.
+    """Return the description with estimates for `auto` in the IMU's frame and position, and notes.
 
     Raises an error if the data do not determine a value.
     """
@@ -142,9 +142,9 @@ def _format_mm(lever: LeverArm) -> str:
 def describe_pose_frame(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Replace `auto` in the pose frame by estimates from the wrench; return notes.
+    """Return the description with estimates for `auto` in the pose frame, and notes.
 
-    Raises an error if the data do not determine a value.
+    The estimates are from the wrench. Raises an error if the data do not determine a value.
     """
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 

@@ -69,8 +69,8 @@ class Topic:
     """Topic of a bag.
 
     Attributes:
-        name: such as "/ft/wrench".
-        type: such as "geometry_msgs/msg/WrenchStamped".
+        name: name, such as "/ft/wrench".
+        type: message type, such as "geometry_msgs/msg/WrenchStamped".
         messages: number of messages.
         rate_hz: mean rate; 0 for an empty bag.
     """
@@ -87,7 +87,7 @@ def is_bag(path: Path) -> bool:
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """Return the topics of a bag by name; raise an error if it cannot be read."""
+    """Return the topics of a bag, sorted by name; raise an error if it cannot be read."""
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -132,7 +132,10 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a stream: its file or topic. Raises an error without a topic."""
+    """Return the table of a stream: its file, or its topic of a bag.
+
+    Raises an error for a bag without a topic.
+    """
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
     if is_bag(stream.file):
@@ -141,7 +144,7 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
 
 
 def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
-    """Return a draft description as YAML with suitable topics and paths relative to `folder`."""
+    """Return a draft description (YAML) with suitable topics and paths relative to `folder`."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
@@ -164,7 +167,7 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:
-    """Return the error for a bag without a named topic."""
+    """Return the error for a bag whose topic is not specified."""
     return DrakeTeleopError(
         "is a bag, and no topic is specified",
         where=str(path),
@@ -225,7 +228,7 @@ def _check_unpacked_size(path: Path) -> None:
 
 @contextmanager
 def _limit_memory() -> Iterator[None]:
-    """Raise MemoryError for more than `_MAX_MEMORY_BYTES` additional bytes (Linux only)."""
+    """Raise MemoryError above `_MAX_MEMORY_BYTES` of additional memory (Linux only)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -309,7 +312,7 @@ def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
-    """Remove groups whose covariance begins with -1; return their names."""
+    """Remove column groups whose covariance begins with -1; return their names."""
     absent = tuple(
         name.removesuffix("_covariance")
         for name, values in columns.items()
@@ -321,7 +324,6 @@ def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
 
 
 def _short_names(columns: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return columns of the standard groups by unique short name."""
     found: dict[str, list[str]] = {}
     for path in columns:
         *_, group, axis = ["", *path.split(".")]

@@ -57,15 +57,15 @@ class Log:
         specific_force: (N, 3) s = a - g of So, in S [m/s^2].
         angular_velocity: (N, 3) omega_WS_S [rad/s].
         angular_acceleration: (N, 3) alpha_WS_S [rad/s^2].
-        gravity: (N, 3) in S [m/s^2], or None.
-        static: the samples are separate poses at rest.
-        bridged: (N,) samples interpolated over gaps, or None.
+        gravity: (N, 3) gravity in S [m/s^2], or None.
+        static: True if the samples are separate poses at rest.
+        bridged: (N,) True for samples interpolated over gaps, or None.
         notes: assumptions of the reader.
         source: file name for messages.
         posed: recorded poses, if they have positions.
         gain_std: stated standard deviation of the sensor gains.
-        R_WS: (N, 3, 3) orientation, or None.
-        gravity_W: (3,) in the world [m/s^2], or None.
+        R_WS: (N, 3, 3) orientation of S, or None.
+        gravity_W: (3,) gravity in the world [m/s^2], or None.
         one_sided_s: length of each end with one-sided derivatives [s].
         described: the description, with estimates for `auto`.
         free: causes left to the data: "gravity" and "weight".
@@ -117,7 +117,7 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Sample spacing [s], without steps across removed gaps."""
+        """Sample spacing [s]; steps across removed gaps do not count."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
@@ -161,7 +161,7 @@ def describe_canonical(path: Path, table: Table) -> Description:
     """Return the description of a canonical table.
 
     Rows without `t` are static poses. So are rows slower than 5 Hz, if gravity turns by more than
-    10 deg in a fifth of the steps. Raises an error if wrench or kinematics are absent.
+    10 deg in a fifth of the steps. Raises an error if wrench or motion is absent.
     """
 
     def present(names: Sequence[str]) -> bool:

@@ -39,8 +39,8 @@ class Clock:
     """Times of the rows of a stream.
 
     Attributes:
-        t: (N,) increasing, on the common clock [s].
-        rows: (N,) their rows of the table.
+        t: (N,) times, increasing, on the common clock [s].
+        rows: (N,) row of the table for each time.
         total: number of stamps before removal.
         notes: corrections.
     """
@@ -51,14 +51,14 @@ class Clock:
     notes: tuple[str, ...] = ()
 
     def select(self, x: Array) -> Array:
-        """Return the rows of (total, ...) values that have a time."""
+        """Return those rows of values x (total, ...) that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """Return the times of a stream's rows; raise an error by the table of this module.
+    """Return the times of a stream's rows; raise an error according to the table of this module.
 
-    A repeated row equals the previous one in all `columns`. `where` names the field.
+    A repeated row equals the previous row in all `columns`. `where` names the field.
     """
     if time.column is None:
         assert time.rate is not None
@@ -107,7 +107,7 @@ def _to_common_clock(t: Array, time: Time) -> Array:
 
 
 def spread(t: Array) -> Array:
-    """Return times of rows with shared stamps: means over 50 distinct stamps.
+    """Return times for rows with shared stamps, by means over 50 distinct stamps.
 
     Windows end at steps of more than three median steps. `t` (N,) must not decrease.
     """
@@ -120,7 +120,7 @@ def spread(t: Array) -> Array:
 
 
 def gaps(t: Array, bandwidth_hz: float | None) -> Array:
-    """Return (G, 2) start and end of the gaps in increasing times `t` (N,) [s].
+    """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s].
 
     A gap is longer than four median steps and half a period of the low-pass.
     """
@@ -130,12 +130,12 @@ def gaps(t: Array, bandwidth_hz: float | None) -> Array:
 
 
 def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
-    """Return the shortest gap [s] for a median `step` [s]."""
+    """Return the least length of a gap [s] for a median `step` [s]."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
 def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
-    """Return the moving average of the stamps over 2 half + 1 rows, with straight ends."""
+    """Return the moving average of the stamps over 2 half + 1 rows; the ends are straight lines."""
     n = len(t)
     if t[0] == t[-1]:
         return t[0] + dt * (np.arange(n) - (n - 1) / 2)
@@ -160,7 +160,6 @@ def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
 def _remove_repetitions(
     rows: NDArray[np.intp], t: Array, table: Table, columns: Sequence[str | int], where: str
 ) -> NDArray[np.intp]:
-    """Return `rows` without repetitions of the previous row."""
     values = [table.raw(column, where) for column in columns]
     values = [x[rows] for x in values if len(x) == len(t)]
     same = np.diff(t[rows]) == 0

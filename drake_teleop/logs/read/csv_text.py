@@ -67,7 +67,7 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
 
 
 def _normalize(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
-    """Return the text with LF, decimal points and no empty end; None if it is unchanged."""
+    """Return the text with LF and decimal points, without an empty end; None if unchanged."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
@@ -88,7 +88,7 @@ def _content_length(text: bytes) -> int:
 
 
 def _parse(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Parse with types of the first rows if all are numeric; otherwise of all rows (slow)."""
+    """Parse with the types of the first rows if all are numeric, else of all rows (slow)."""
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):

@@ -122,7 +122,7 @@ class _Stream(Strict):
 
     @property
     def source(self) -> Path:
-        """File and, in a bag, topic."""
+        """Path of the file, in a bag with the topic."""
         return self.file
 
 
@@ -196,7 +196,7 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether frame or position is `auto`."""
+        """Whether the frame or the position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
@@ -237,7 +237,7 @@ class Pose(_Recorded):
 
     @property
     def R_SP(self) -> Array | None:
-        """(3, 3) rotation from the posed frame to S; None for the axes of S."""
+        """Rotation (3, 3) from the posed frame to S; None if its axes are those of S."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -321,11 +321,11 @@ class Description(Strict):
 
     @property
     def gravity_W(self) -> Array:
-        """(3,) gravity in W [m/s^2]; along -z for `auto`."""
+        """Gravity (3,) in W [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Return poses of S with gravity, the pose frame and IMU data."""
+        """Return the poses of S with gravity, the described pose frame and IMU data."""
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
@@ -351,7 +351,7 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a description from a YAML file; its paths are relative to the folder.
+    """Read a description from a YAML file, whose paths are relative to its folder.
 
     Raises an error that names file and field.
     """

@@ -116,7 +116,7 @@ PositionOrAuto = Annotated[Vector | Literal["auto"], BeforeValidator(_parse_posi
 
 
 class Strict(BaseModel):
-    """Frozen model without unknown fields, and with numbers of at most 1e12."""
+    """Frozen model that rejects unknown fields and numbers beyond 1e12."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -17,7 +17,7 @@ from drake_teleop.logs.read.description import STANDARD_GRAVITY, Description
 
 
 def log_instants(log: Log) -> Instants:
-    """Return block means of wrench and motion."""
+    """Return block means of a log's wrench and motion."""
     gravity = None
     motion: tuple[Array, ...] = log.motion
     if log.R_WS is not None and log.gravity_W is not None:
@@ -26,15 +26,15 @@ def log_instants(log: Log) -> Instants:
 
 
 def weight_wrench(weight: Array, gravity: Array) -> Array:
-    """Return the (N, 6) wrench of [m, m c] at rest in gravity (N, 3) in S, Eq. (1)."""
+    """Return the wrench (N, 6) of a weight [m, m c] at rest, for gravity (N, 3) in S, Eq. (1)."""
     return np.hstack([-weight[0] * gravity, np.cross(weight[1:], -gravity)])
 
 
 def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
-    """Return the log with the weight of [m, m c] (4,) in S [kg, kg m] added to its wrench.
+    """Return the log with the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] added.
 
-    The robot's own pose has the wrench's clock, so the orientation in `motion_log`, the same log
-    with motion, is evaluated at the delay.
+    The robot's own pose has the wrench's clock. The orientation in `motion_log`, the same log with
+    motion, is therefore evaluated at the delay.
     """
     assert motion_log.gravity is not None
     at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
@@ -50,7 +50,7 @@ _MAX_DEVIATION_DEG = 2.0
 def describe_gravity(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Replace `gravity: auto` by a vector of standard magnitude; return notes.
+    """Return the description with an estimate of standard magnitude for `gravity: auto`, and notes.
 
     Raises an error if the direction is undetermined.
     """

@@ -17,7 +17,7 @@ Pairs = list[tuple[Array, Array]]
 
 
 def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
-    """Return (N, 3) signals of the pose at `t` with those of the IMU on its clock."""
+    """Return pairs of signals (N, 3): of the pose at `t`, and of the IMU on its clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
         pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
@@ -25,7 +25,10 @@ def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
 
 
 def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
-    """Return the shift [s] of the best affine maps, without effects linear in `arm` (N, k)."""
+    """Return the shift [s] at which affine maps of the IMU signals fit those of the pose best.
+
+    Effects that are linear in `arm` (N, k) are removed first.
+    """
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
 
@@ -54,10 +57,10 @@ def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -
 def clock_drift(
     t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
-    """Return lag at mid-record [s] and drift [s/s], from a constant lag [s].
+    """Return the lag at mid-record [s] and its drift [s/s], starting from a constant `lag` [s].
 
     `independent` is the number of independent samples. A drift that is insignificant or below 10 ms
-    is 0.
+    in total is returned as 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])

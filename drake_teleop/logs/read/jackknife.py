@@ -21,7 +21,8 @@ def solve(
     """Return the solution (n,) and standard deviations (n,); inf if undetermined.
 
     Args:
-        residual: of x (n,), (N, 3 k). Each three channels are weighted by their residual.
+        residual: function of x (n,) that returns residuals (N, 3 k). Each three channels are
+            weighted by their residual.
         x: start.
         linear: (N, 3 k, m) constant derivatives by the last m parameters.
     """
@@ -51,7 +52,7 @@ def _fit(residual: Callable[[Array], Array], x: Array, linear: Array) -> Any:
 
 
 def jackknife(jacobian: Array, residual: Array, width: int) -> Array:
-    """Return (n,) jackknife standard deviations for blocks of `width` rows."""
+    """Return jackknife standard deviations (n,) of the parameters, for blocks of `width` rows."""
     size = np.linalg.norm(jacobian, axis=0) + 1e-300
     _, singular, Vt = np.linalg.svd(jacobian / size, full_matrices=False)
     known = singular > RANK * singular[0]

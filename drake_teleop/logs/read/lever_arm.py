@@ -37,7 +37,7 @@ class LeverArm:
     """Estimated position of the accelerometer.
 
     Attributes:
-        p_SoIo_S: (3,) relative to the described position, in S [m].
+        p_SoIo_S: (3,) position relative to the described one, in S [m].
         deviations: (3,) standard deviations [m]; inf if undetermined.
         source: "pose" or "wrench".
     """
@@ -48,15 +48,15 @@ class LeverArm:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """(3,) whether each coordinate is determined."""
+        """Booleans (3,): True where a coordinate is determined."""
         return self.deviations < MAX_LEVER_DEVIATION
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
-    """Fit offsets, load, delay and lever arm to the wrench of a rigid load, Eq. (T21).
+    """Return the lever arm, fitted to a wrench with offsets, load and delay, Eq. (T21).
 
     Returns None if more than 5 % of the variance remains (contact), or gaps leave less than a
-    tenth.
+    tenth of the samples.
     """
     cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -94,16 +94,16 @@ def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) 
 
 
 def lever_matrix(omega: Array, alpha: Array) -> Array:
-    """Return (N, 3, 3) K of Eq. (T20)."""
+    """Return the matrix K (N, 3, 3) of Eq. (T20)."""
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
 
 def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) axes along which the motion exceeds its noise, which biases the arm to zero.
+    """Return (3,) booleans: True for axes along which the motion is large enough.
 
-    The noise below the cut-off is at most a seventh of that in the next octave, because its power
-    density grows at least with f^2.
+    Noise of the motion biases the lever arm to zero. Below the cut-off it is at most a seventh of
+    that in the next octave, because its power density grows at least with f^2.
     """
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)

@@ -61,7 +61,6 @@ def read_mat(path: Path) -> dict[str, NDArray]:
 
 
 def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    """Yield type and content of each element."""
     start = 0
     while start < len(data):
         if len(data) - start < 8:
@@ -82,7 +81,6 @@ def _iterate_elements(data: memoryview, order: str) -> Iterator[tuple[int, memor
 def _add_variable(
     kind: int, content: memoryview, order: str, name: str | None, depth: int, found: dict
 ) -> None:
-    """Add the arrays of a variable or named field to `found`."""
     parts = list(_iterate_elements(content, order)) if kind == _MATRIX else []
     if len(parts) < 3 or [kind for kind, _ in parts[:2]] != _FLAGS_AND_SIZE:  # objects have no size
         return
@@ -110,7 +108,7 @@ def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
 
 
 def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
-    """Add an array: vectors as 1-D, matrix stacks with the stack axis first."""
+    """Add an array to `found`: vectors as 1-D, matrix stacks with the stack axis first."""
     if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:

@@ -27,11 +27,12 @@ from drake_teleop.logs.read.lever_arm import (
 from drake_teleop.logs.read.rotations import right_angled_rotations, rotation_matrices
 
 RIGHT_ANGLED_DEG = 5.0
-"""Largest angle from an exchange of axes of a right-angled mounting."""
+"""Largest angle between a right-angled mounting and a rotation that maps axes to axes [deg]."""
 MAX_DEVIATION_DEG = 1.0
-"""Largest standard deviation of a determined rotation."""
+"""Largest standard deviation of a determined rotation [deg]."""
 MAX_UNEXPLAINED_GRAVITY = 0.005
-"""As `MAX_UNEXPLAINED`, without positions: unmodelled accelerations resemble a rotation."""
+"""Lower limit than `MAX_UNEXPLAINED`, for logs without positions: unmodelled accelerations resemble
+a rotation."""
 _MAX_LAG_S = 1.0
 
 
@@ -45,11 +46,11 @@ class Mounting:
         lag_middle_s: lag at mid-record [s].
         middle_s: mid-record on the pose's clock [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained: share of the specific force's variance.
-        unexplained_turning: the same of the angular velocity; None without a gyroscope.
+        unexplained: unexplained share of the specific force's variance.
+        unexplained_turning: this share of the angular velocity; None without a gyroscope.
         mirrored: a reflection fits clearly better, so R_SI is invalid.
         speed_ratio: angular speed of gyroscope over pose (rms), or None.
-        deviations_deg: (3,) standard deviations about the axes of S [deg].
+        deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
         lever: lever arm; None without positions.
     """
 
@@ -67,12 +68,12 @@ class Mounting:
 
     @property
     def angle_deg(self) -> float:
-        """Angle of R_SI [deg]."""
+        """Rotation angle of R_SI [deg]."""
         return _angle_deg(self.R_SI)
 
     @property
     def right_angled(self) -> Array:
-        """(3, 3) nearest of the 24 rotations that map axes to axes."""
+        """Rotation (3, 3) nearest to R_SI, of the 24 that map axes to axes."""
         return max(right_angled_rotations(), key=lambda R: float(np.trace(R.T @ self.R_SI)))
 
     @property
@@ -82,7 +83,7 @@ class Mounting:
 
     @property
     def is_right_angled(self) -> bool:
-        """Whether R_SI maps axes to axes."""
+        """Whether R_SI maps axes to axes, within 5 deg."""
         return self.oblique_deg < RIGHT_ANGLED_DEG
 
     @property
@@ -104,13 +105,13 @@ class Mounting:
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, position and clock of an IMU; `pose` is the log without it.
+    """Estimate rotation, position and clock of an IMU; `pose` is the same log read without the IMU.
 
     The clock is found within +-1 s by free linear maps. Then least squares refine rotation, biases,
     lever arm and lag, starting from the rotation of Kabsch (1976), at 8 Hz.
 
-    Returns None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too
-    little.
+    Returns None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too few
+    samples.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
@@ -176,11 +177,11 @@ def _refine(
     R: Array,
     lag: float,
 ) -> tuple[Array, Array, Array]:
-    """Solve the least squares of `find_mounting` for k signals `pairs`.
+    """Solve the least squares of `find_mounting` for k signals in `pairs`.
 
     `t` (N,) are times on the pose's clock, `drift_lag` (N,) lags by drift, `t_imu` (M,) times on
-    the IMU's clock [s]; K (N, 3, 3) of Eq. (T20). Returns (7 + 3 k,) rotation vector [rad], lag
-    [s], p [m] and biases, their standard deviations, and (N, 3 k) residuals.
+    the IMU's clock [s]; K (N, 3, 3) is the matrix of Eq. (T20). Returns (7 + 3 k,) rotation vector
+    [rad], lag [s], lever arm [m] and biases, their standard deviations, and (N, 3 k) residuals.
     """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
@@ -201,7 +202,7 @@ def _refine(
 
 
 def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
-    """Return R of least |y - R x - b|, and whether a reflection fits clearly better."""
+    """Return the R that minimises |y - R x - b|, and whether a reflection fits clearly better."""
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     U, _, Vt = np.linalg.svd(y.T @ x)
     side = np.linalg.det(U @ Vt)

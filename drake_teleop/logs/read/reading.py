@@ -102,7 +102,7 @@ def read_log(
 def read_description(
     description: Description, source: str, *, tables: dict[Path, Table] | None = None
 ) -> Log:
-    """Return the log of a description with absolute paths, as `read_log`."""
+    """Return the log of a description with absolute paths, read as by `read_log`."""
     return _Reader(description, source, 30.0, tables).log()
 
 
@@ -164,14 +164,13 @@ class _Reader:
         return restore_weight(log, np.array(weight), self._read_other(other))
 
     def _replace_auto(self, describe: _Describe, *, differentiate: bool = True) -> None:
-        """Replace `auto` by the estimates of `describe`."""
+        """Replace `auto` in the description by the estimates of `describe`."""
         self._description, notes = describe(
             self._description, self._source, partial(self._read_other, differentiate=differentiate)
         )
         self._notes += notes
 
     def _read_other(self, description: Description, *, differentiate: bool = True) -> Log:
-        """Return the log of another description of the same files."""
         for name in ("wrench", "imu", "pose"):
             if (stream := getattr(self._description, name)) is not None:
                 self._table(stream)
@@ -210,7 +209,7 @@ class _Reader:
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
-        """Return the differentiated motion, or only the poses to save memory."""
+        """Return the pose stream with its differentiated motion, or, to save memory, without."""
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
         t, raw = uniform_times(clock.t), None
@@ -238,7 +237,7 @@ class _Reader:
         )
 
     def _poses_of_S(self, stream: Pose, table: Table, clock: Clock) -> tuple[Array, Array | None]:
-        """Return (N, 4) quaternions [w, x, y, z] of R_WS, and (N, 3) p_WoSo_W or None."""
+        """Return quaternions (N, 4) [w, x, y, z] of R_WS, and positions p_WoSo_W (N, 3) or None."""
         position = None
         if stream.position is not None:
             position = self._vectors("pose", "position", stream.position, table, clock.total)
@@ -352,7 +351,6 @@ class _Reader:
         )
 
     def _resolution(self, stream: Static, table: Table) -> tuple[float, float]:
-        """Return the steps of force and torque [N, N m]."""
         force, torque = (
             decimal_step(table.numbers(quantity.columns, 3, f"static.{field}", table.rows))
             * (self._description.scale(quantity.unit) * np.abs(quantity.scale).max())
@@ -361,7 +359,7 @@ class _Reader:
         return force, torque
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        """Return the times of a stream; record its notes and gaps."""
+        """Return the times of a stream; record notes and gaps of the stream."""
         columns = [
             column
             for field in type(stream).model_fields
@@ -434,7 +432,7 @@ class _Reader:
         )
 
     def _bridged(self, t: Array) -> NDArray[np.bool_] | None:
-        """Return (N,) flags of samples that a gap affects, or None."""
+        """Return (N,) booleans: True for samples that a gap affects; None without gaps."""
         if not self._gaps:
             return None
         flags = np.zeros(len(t), bool)

@@ -13,7 +13,7 @@ WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vec
 
 
 def rotation_matrices(columns: Array, form: str) -> Array:
-    """Return (N, 3, 3) matrices from columns (N, WIDTHS[form]), without normalization.
+    """Return rotation matrices (N, 3, 3) from columns (N, WIDTHS[form]), without normalization.
 
     Matrices are row-major, rotation vectors in [rad].
     """
@@ -25,13 +25,13 @@ def rotation_matrices(columns: Array, form: str) -> Array:
 
 
 def rotation_error(R: Array) -> Array:
-    """Return max |R^T R - I| of (..., 3, 3) matrices; at least 2 for reflections."""
+    """Return max |R^T R - I| of matrices (..., 3, 3); at least 2 for reflections."""
     error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
     return np.where(np.linalg.det(R) < 0, np.maximum(error, 2.0), error)
 
 
 def nearest_rotation(R: Array) -> Array:
-    """Return the rotations closest to (..., 3, 3) near-rotations."""
+    """Return the rotations closest to near-rotations (..., 3, 3)."""
     # Newton-Schulz iteration for the polar factor; 4 steps reduce an error of 0.3 below 1e-15.
     for _ in range(4):
         R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
@@ -39,7 +39,7 @@ def nearest_rotation(R: Array) -> Array:
 
 
 def quaternions(R: Array) -> Array:
-    """Return (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
+    """Return quaternions (N, 4) [w, x, y, z] of rotations (N, 3, 3), with either sign."""
     from scipy.spatial.transform import Rotation
 
     return np.asarray(Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]])

@@ -38,7 +38,7 @@ MAX_VALUES = {
 
 @dataclass(frozen=True)
 class Stream:
-    """Signals (N, ...) on one clock `t` [s], or None.
+    """Signals (N, ...) of one stream on its clock `t` [s]; None for absent signals.
 
     `raw` are the recorded poses of S, `inertial` the IMU data in S.
     """
@@ -66,12 +66,12 @@ def on_clock(t: Array, stream: Stream, values: Array) -> Array:
 
 
 def in_S(R_WS: Array, vectors_W: Array) -> Array:
-    """Return (N, 3) vectors in S of vectors in W."""
+    """Return the vectors `vectors_W` (N, 3), given in W, in the axes of S."""
     return np.einsum("nji,nj->ni", R_WS, np.broadcast_to(vectors_W, (len(R_WS), 3)))
 
 
 def wrench_in_S(R_SW: Array, wrench_W: Array) -> Array:
-    """Return (N, 6) wrenches in S of wrenches in W."""
+    """Rotate wrenches (N, 6) from the axes of W to those of S, about the same point."""
     both = np.einsum("nij,nkj->nki", R_SW, wrench_W.reshape(-1, 2, 3))
     return both.reshape(-1, 6)
 
@@ -84,7 +84,7 @@ def move_to_So(
     alpha: Array | None,
     pose: Stream | None,
 ) -> Array:
-    """Return the specific force of So from that of Io on the same rigid body."""
+    """Return the specific force of So from that of Io, a point of the same rigid body."""
     if omega is None or alpha is None:
         assert pose is not None and pose.angular_velocity is not None
         assert pose.angular_acceleration is not None
@@ -111,13 +111,13 @@ class Orientations:
             self._columns *= description.scale(orientation.unit)
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:
-        """Return (n, 3, 3) R_WS of n rows; raise an error for other matrices."""
+        """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
         R = rotation_matrices(self._columns[rows], self._orientation.form)
         self._check_errors(rotation_error(R), rows)
         return nearest_rotation(np.swapaxes(R, 1, 2) if self._orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
-        """Return (n, 4) [w, x, y, z] of `rotations`, without matrices where possible."""
+        """Return `rotations` as quaternions (n, 4) [w, x, y, z], if possible without matrices."""
         if not self._orientation.form.startswith("quaternion"):
             return quaternions(self.rotations(rows))
         q = self._columns[rows]

@@ -44,7 +44,7 @@ class Table:
         path: file name for messages.
         columns: arrays (N,) of any type by name; also (N, ...) with columns `name[0]`, row-major.
         first_row: number of the first data row in the file.
-        absent: groups that the file marks as not provided.
+        absent: names of column groups that the file marks as not provided.
     """
 
     path: Path
@@ -54,13 +54,13 @@ class Table:
 
     @property
     def rows(self) -> int:
-        """Rows of the longest column."""
+        """Number of rows of the longest column."""
         return max(len(column) for column in self.columns.values())
 
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return (N, width) finite numbers of the named columns, side by side.
+        """Return the finite numbers (N, width) of the named columns, side by side.
 
         Raises an error if a column is absent, a cell is not finite, or `width` or `rows` differ.
         """
@@ -88,13 +88,13 @@ class Table:
                 )
 
     def all_raw(self, names: Sequence[str | int], where: str) -> Array:
-        """Return `raw` of several columns with equal numbers of rows, side by side."""
+        """Return `raw` of several columns, which must have equal rows, side by side."""
         columns = [self.raw(name, where) for name in names]
         self._check_rows(names, columns, where, None)
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> Array:
-        """Return (N, k) numbers of a column, including NaN and infinity, or raise an error."""
+        """Return the numbers (N, k) of a column, with NaN and infinity; raise if it is absent."""
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
@@ -103,7 +103,7 @@ class Table:
         return numbers
 
     def single(self, name: str | int, where: str) -> Array:
-        """Return (N,) numbers of a column as `raw`; raise an error if it is wider."""
+        """Return the numbers (N,) of a column as `raw`; raise an error if it is wider."""
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
@@ -121,7 +121,7 @@ class Table:
         where: str,
         remedy: str = "check the column and its unit, or delete the row",
     ) -> None:
-        """Raise an error for the first row with a finite value beyond `largest`."""
+        """Raise an error that names the first row with a finite value beyond `largest`."""
         if not values.size or (values.min() >= -largest and values.max() <= largest):
             return
         bad = ((np.abs(values) > largest) & np.isfinite(values)).any(axis=1)
@@ -188,7 +188,7 @@ def decimal_step(values: Array) -> float:
 def read_table(path: Path, *, header: bool = True) -> Table:
     """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
 
-    Without a header the columns of a text file are named from "0".
+    Without a header the columns of a text file are named from "0" on.
     """
     if path.suffix.lower() not in FORMATS:
         raise DrakeTeleopError(
