@@ -237,7 +237,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Write z axis, origin, inertial force and moment about Wo, Eqs. (1)-(2), to link[row]."""
+    """Write a link's z axis, origin, inertial force and moment about Wo, Eqs. (1)-(2)."""
     phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], nine(x, 12), three(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
     s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
@@ -353,7 +353,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
 
 @njit(cache=True)
 def solve_spd(M: Array, x: Array) -> None:
-    """Replace x by M^-1 x (Cholesky method); the rounding differs from `vectors.solve`."""
+    """Replace x by M^-1 x (Cholesky method); the rounding differs from that of `vectors.solve`."""
     n = x.shape[0]
     for j in range(n):
         for k in range(j):

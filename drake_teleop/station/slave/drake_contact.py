@@ -26,7 +26,7 @@ def contact_wrench_W(
 ) -> NDArray[np.float64]:
     """Return the wrench (6,) of all contacts on the tool, about the world's origin, in W [N, N m].
 
-    `bodies` and `shapes` are the indices of the tool's bodies and collision shapes.
+    `bodies` contains indices of the tool's bodies, `shapes` identifiers of its collision shapes.
     """
     wrench_W = np.zeros(6)
     for k in range(results.num_point_pair_contacts()):

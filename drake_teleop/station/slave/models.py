@@ -300,7 +300,7 @@ def _weld_other_joints(
 
 
 def _default_pose(joint: Joint) -> RigidTransform:
-    # `GetDefaultPose` exists for few kinds of joints.
+    # Drake's `GetDefaultPose` covers few kinds of joints.
     q = joint.default_positions()
     if isinstance(joint, RevoluteJoint):
         return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))

@@ -35,7 +35,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
     Args:
         arm: `ArmModel.table`.
-        pairs: (k, 28) shapes in contact, `Pairs.known`.
+        pairs: (k, 28) pairs of shapes, `Pairs.known`.
         joints: (m, 21) joints of moving bodies, `JointTable`.
         applied_W: (6,) additional [f; tau] about So, in W [N, N m].
         q, v: (n,) joint positions and speeds.
