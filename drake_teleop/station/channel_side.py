@@ -1,4 +1,4 @@
-"""The channel between master and slave: direct wires, or a network with a passivity method."""
+"""Channel between master and slave: direct wires, or a network with a passivity method."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         - pose_command: (7,) X_WS, from the master side
         - wrench_B: (6,) F_E_B, wrench to render, from the slave side [N, N m]
         - contact: (1,) flag of the slave's detector (with contact detection)
-        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m] (network)
+        - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m] (network)
         - pose_slave: (7,) actual X_WS of the slave (network)
         - saturated: (1,) 1 while the wrench is invalid (network)
         - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load; only `ledger`
@@ -41,8 +41,8 @@ def MakeChannel(scenario: Scenario) -> Diagram:
         output_ports:
         - pose_to_slave: (7,) X_WS, setpoint of the slave
         - wrench_to_master: (6,) F_E_B, wrench to render [N, N m]
-        - contact_at_hand: signal (with contact detection)
-        - pose_received, ports: signals (network)
+        - contact_at_hand: signal for the log (with contact detection)
+        - pose_received, ports: signals for the log (network)
     """
     check_scenario(scenario)
     builder = DiagramBuilder()
@@ -87,7 +87,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
 
 
 def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """Limit the method's wrench to the largest wrench of the device.
+    """Return the passivity method with its wrench limited to the largest wrench of the device.
 
     Otherwise the energy balance would contain a wrench that the device does not display.
     """
@@ -100,7 +100,7 @@ def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> Passivit
 
 
 def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
-    """Return the scenario's method; add mass and servo of the arm for `ledger`.
+    """Return the scenario's passivity method; for `ledger`, add mass and servo of the arm.
 
     Raises:
         DrakeTeleopError: if the arm has fewer than six joints, so that its mass is unbounded in
@@ -126,9 +126,10 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 
 
 def power_scale(scenario: Scenario) -> Array:
-    """Return (2,) master power units per slave power unit, for translation and rotation.
+    """Return the master's power over the slave's (2,), for translation and rotation.
 
-    A motion scale of zero counts as 1: there is no energy then.
+    This scale is force scale over motion scale. A motion scale of 0 counts as 1, because no power
+    is transmitted then.
     """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])

@@ -39,7 +39,7 @@ FRAMES_PER_SECOND = 50
 # A longer replay has a lower frame rate; a frame takes 3 kB and the browser interpolates.
 _MAX_FRAMES = 2000
 _MIN_DURATION_S = 6.0  # shortest replay with the default speed [s]
-_SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # speeds of the player
+_SLOW_MOTION_FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)  # slow-motion factors of the player
 
 _SHAFT_RADIUS_M, _HEAD_LENGTH_M = 0.006, 0.03  # radius of an arrow's shaft, length of its head [m]
 _ARROW_M_PER_N = 0.003
@@ -66,9 +66,9 @@ class Reading:
 
     Args:
         name, unit: label.
-        values: (F,) one value per frame; NaN if there is none.
-        colour: colour of its curve, "#rrggbb"; "" for no curve. All curves share one scale.
-        arrow: whether arrows of this colour represent it.
+        values: (F,) one value per frame; NaN where the number does not exist.
+        colour: colour of the curve, "#rrggbb"; "" for no curve. All curves share one scale.
+        arrow: True if arrows of this colour represent the number.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Reading:
     arrow: bool = False
 
     def for_page(self) -> dict[str, object]:
-        """Return the data that the player reads."""
+        """Return label and values as the data that the player reads."""
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -92,7 +92,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Film:
-    """Contents of a replay.
+    """Contents of a 3D replay, except the scene.
 
     Args:
         title: one line.
@@ -115,7 +115,7 @@ class Film:
     curves: str = ""
 
     def write(self, path: Path, make_scene: Callable[[Meshcat], Show]) -> None:
-        """Write the replay.
+        """Write the replay to an HTML file.
 
         Args:
             path: HTML file.
@@ -172,10 +172,10 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return frame times and slow motion.
+    """Return the times of the frames, and the slow motion.
 
     Args:
-        start, stop: interval [s].
+        start, stop: displayed interval [s].
         slow_motion: seconds of replay per second; by default the player's lowest speed factor
             with which the replay lasts 6 s.
 
@@ -193,7 +193,7 @@ def frame_times(start: float, stop: float, slow_motion: float | None = None) -> 
 
 
 def set_plain_background(meshcat: Meshcat) -> None:
-    """Set a light background without grid and axes."""
+    """Set a light Meshcat background without grid and axes."""
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
     meshcat.SetProperty("/Background/<object>", "top_color", [0.97, 0.98, 1.0])
@@ -207,7 +207,7 @@ def add_shapes(
     shapes: Iterable[GeometryId],
     colour: Rgba = _DEFAULT_COLOUR,
 ) -> None:
-    """Add a body's shapes below its path, in the model's colours or else in `colour`."""
+    """Add a body's shapes to Meshcat below `path`, in the model's colours or else in `colour`."""
     for shape in shapes:
         seen = inspector.GetIllustrationProperties(shape)
         own = colour if seen is None else seen.GetPropertyOrDefault("phong", "diffuse", colour)
@@ -217,12 +217,12 @@ def add_shapes(
 
 
 def rgba(colour: str) -> Rgba:
-    """Return the colour of "#rrggbb" for Drake."""
+    """Convert the colour "#rrggbb" to Drake's `Rgba`."""
     return Rgba(*(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)))
 
 
 class Arrow:
-    """Arrow of a force, 3 mm long per newton."""
+    """Arrow in Meshcat that represents a force, 3 mm long per newton."""
 
     def __init__(self, meshcat: Meshcat, name: str, colour: str) -> None:
         self._path = f"/forces/{name}"
@@ -234,7 +234,7 @@ class Arrow:
         meshcat.SetObject(f"{self._path}/head/scaled", head, rgba(colour))
 
     def show(self, canvas: Canvas, film_time: float, place: Array, force: Array) -> None:
-        """Show `force` (3,) [N] at `place` (3,) [m], both in W, at a recording time [s]."""
+        """Show `force` (3,) [N] at the point `place` (3,) [m], both in W; `film_time` in s."""
         length = _ARROW_M_PER_N * float(np.linalg.norm(force))
         shaft = max(length - _HEAD_LENGTH_M, 1e-3)
         along = RotationMatrix.MakeFromOneVector(force, 2) if length > 0 else RotationMatrix()

@@ -1,4 +1,4 @@
-"""The master side: operator, haptic device and kinematic scaling."""
+"""Master side of the station: operator, haptic device and kinematic scaling."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - wrench_command: (6,) F_E_B, wrench to render [N, N m]
         - clutch: (1,) engaged if above 0.5; engaged if unconnected
         - intended_pose: (7,) X_BE that replaces the scenario's intent; may stay unconnected
-        - intended_twist: (6,) its twist [v; omega] in B; zero if unconnected
+        - intended_twist: (6,) twist [v; omega] of intended_pose, in B; zero if unconnected
         - slave_state: [q; v] of the slave, for the operator's view of the tool (with a task)
         output_ports:
         - pose_command: (7,) X_WS, setpoint of the slave
         - leader_joints: (n,) setpoint of the slave's joints (leader arm in joint mode) [rad]
-        - hand_wrench_E: (6,) of the hand on the stylus, in B [N, N m]
+        - hand_wrench_E: (6,) wrench of the hand on the stylus, in B [N, N m]
         - intent, master_state, pose_master, twist_master, force_to_master, fault_at_hand: signals
-        - displayed_and_fault: the last two in one port, for the log
+        - displayed_and_fault: force_to_master and fault_at_hand in one port, for the log
         - task_state: signal (with a task)
 
     Args:

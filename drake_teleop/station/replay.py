@@ -58,12 +58,12 @@ _TABLE_TOP = 0.60
 # Origin of the haptic device's base frame B in W [m].
 _P_WB = np.array([1.15, -0.10, _TABLE_TOP + 0.28])  # B is 0.28 m above the foot
 _CAMERA, _TARGET = np.array([0.80, -1.15, 0.92]), np.array([0.70, 0.0, 0.50])
-_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target
+_CAMERA_SHIFT_W = np.array([-0.3, 0.0, 0.0])  # offset of camera and target without a haptic device
 
 
 _FLOOR, _WOOD, _STEEL = Rgba(0.93, 0.94, 0.95), Rgba(0.78, 0.66, 0.50), Rgba(0.40, 0.43, 0.47)
 _P_EGRIP_E = np.array([0.09, 0.0, 0.0])  # where the hand holds the stylus
-_P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # of the arm
+_P_SWRIST_S = np.array([0.0, 0.0, -0.085])  # wrist of the arm
 # Arrows inside arm and tool would be hidden.
 _WRIST_ARROW_OFFSET_W = np.array([0.07, -0.09, 0.0])
 _TIP_ARROW_OFFSET_W = np.array([-0.06, 0.0, 0.0])
@@ -112,7 +112,7 @@ def write_replay(
 
     Args:
         path: HTML file.
-        result: needs slave_state, measured_wrench_S, load_estimate; also shows master_state,
+        result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
             contact_wrench_S, force_to_master and sheet_state.
         scenario: scenario of the run.
         slow_motion: initial speed: seconds of replay per second of the run; by default the
@@ -179,7 +179,7 @@ def _row_norms(vectors: Array) -> Array:
 
 
 def _find_logs(run: Path) -> list[Path]:
-    """Return the log itself, or the logs in a folder that have a scenario."""
+    """Return the log `run` itself; of a folder, its log.parquet, or its logs with a scenario."""
     if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
     if run.suffix == ".parquet":
@@ -209,7 +209,7 @@ def _find_scenario(log: Path) -> Path:
 
 
 class ReplayScene:
-    """Objects of a replay; shows one sample at a time.
+    """Meshcat scene of a replay, which shows one sample at a time.
 
     Attributes:
         plant: slave, surroundings and haptic device, for shapes and kinematics only.
@@ -263,7 +263,7 @@ class ReplayScene:
                 yield path, body
 
     def show(self, film_time: float, signals: Mapping[str, Array], sample: int) -> None:
-        """Show one sample of the signals at a time of the recording [s]."""
+        """Show row `sample` of the signals at a time of the recording [s]."""
         plant, context = self.plant, self.context
         plant.SetPositions(context, self._slave, signals["slave_state"][sample, : self._joints])
         if self._master is not None:
@@ -286,7 +286,7 @@ class ReplayScene:
             arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose of a free body of the surroundings; its parents must be set before."""
+        """Set the pose (7,) of a moving body of the surroundings; set its parents before."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
@@ -298,7 +298,10 @@ class ReplayScene:
         self.plant.SetPositions(self.context, q)
 
     def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
-        """Return forces of the load on the sensor in W, opposite in sign to Eq. (1)."""
+        """Return the forces (3,) of the load on the sensor by name, in W.
+
+        The sign is opposite to Eq. (1).
+        """
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
@@ -318,10 +321,10 @@ class ReplayScene:
 
 
 class _Device(NamedTuple):
-    """Haptic device in the plant.
+    """Haptic device in the plant of a replay.
 
     Attributes:
-        hand: frame at the stylus; the hand holds it at `grip` (3,) [m].
+        hand: frame at the stylus; the hand holds the point `grip` (3,) [m] of this frame.
         positions: converts joint positions of the device state to those of the plant.
         folder: folder of converted meshes, kept while shapes are in use.
     """

@@ -45,10 +45,10 @@ _CANONICAL_COLUMNS = {
 
 @dataclass(frozen=True)
 class Signal:
-    """Description of a signal.
+    """Description of a recorded signal.
 
     Args:
-        name: name of its port, such as "measured_wrench_S".
+        name: name of the signal's port, such as "measured_wrench_S".
         components: name of each of the k components ("f_x", ...).
         units: unit of each component, or one string for all ("1" for dimensionless).
         description: one line.
@@ -121,7 +121,7 @@ class SimulationResult:
 
     @property
     def t(self) -> NDArray[np.float64]:
-        """(N,) sample times [s]."""
+        """Sample times (N,) [s]."""
         return self._t
 
     @property
@@ -131,7 +131,7 @@ class SimulationResult:
 
     @property
     def specs(self) -> tuple[Signal, ...]:
-        """Descriptions, in the order of `signals`."""
+        """Descriptions of the signals, in the order of `signals`."""
         return tuple(self._specs.values())
 
     @property
@@ -154,7 +154,7 @@ class SimulationResult:
             raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
 
     def _column(self, name: object) -> tuple[str, int] | None:
-        """Return signal and component index of a table column, or None."""
+        """Return the signal and the component's index for a table column; None for other names."""
         signal = str(name).partition(".")[0]
         if signal not in self._specs or name not in self._specs[signal].columns:
             return None
@@ -222,7 +222,7 @@ class SimulationResult:
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
     def write_parquet(self, path: str | Path) -> None:
-        """Write `to_dataframe`, with names, units and descriptions as metadata.
+        """Write `to_dataframe` to a file, with names, units and descriptions as metadata.
 
         Equal data give equal bytes.
         """
@@ -236,14 +236,14 @@ class SimulationResult:
         write_table(path, table, aside=aside, metadata=metadata, row_group_size=2**16)
 
     def write_part(self, folder: Path, first_row: int) -> None:
-        """Write these rows as one part of a longer log, in the format of `write_parquet`.
+        """Write this result as one part of a longer log, in the format of `write_parquet`.
 
         The folder is a valid table at any time: a part is complete or absent. The same rows
         written again replace the part.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
-            first_row: index of the first of these rows in the whole log.
+            first_row: index of this result's first row in the whole log.
         """
         part = part_of_log(folder, first_row)
         if len(self.t) or not part.exists():
@@ -255,7 +255,7 @@ class SimulationResult:
         """Read a file, or a folder of parts, from `write_parquet` or `simulate`.
 
         Raises:
-            DrakeTeleopError: if it is absent or has another format.
+            DrakeTeleopError: if the log is absent or has another format.
         """
         on_disk = cls.scan_parquet(path)
         return cls(on_disk.t, {name: on_disk[name] for name in on_disk}, on_disk.specs)
@@ -264,13 +264,13 @@ class SimulationResult:
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
         """Open a log that may exceed the memory.
 
-        Only the times are read now. Each access to a signal reads it from the disk.
+        Only the times are read now. Each access to a signal reads the signal from the disk.
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.
 
         Raises:
-            DrakeTeleopError: if it is absent or has another format.
+            DrakeTeleopError: if the log is absent or has another format.
         """
         import polars as pl
 
@@ -386,7 +386,7 @@ def _reduce_curve(
 
 
 def _components_text(spec: Signal) -> str:
-    """Return text such as "f_x, f_y, f_z [N], tau_x [N m]"."""
+    """Return names and units of a signal's components: "f_x, f_y, f_z [N], tau_x [N m]"."""
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
@@ -402,7 +402,7 @@ def _log_parts(path: Path) -> list[Path]:
 
 
 def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
-    """Return (N, k) columns of a Parquet file."""
+    """Read columns of a Parquet file into an array (N, k)."""
     import polars as pl
 
     refuse_fork()

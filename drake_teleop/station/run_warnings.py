@@ -5,7 +5,7 @@ saturated      the wrist sensor is saturated
 fault          invalid numbers in the loop, see `drake_teleop.common.blocks`
 unreachable    the inverse kinematics have no solution
 clipped        a joint speed or motor torque, or the displayed force or torque, is at its limit
-leaf           the deflection is outside the validity of its model
+leaf           the deflection of the leaf is outside the validity of its model
 safe state     an end of the channel receives no packets for longer than the channel's timeout
 behind         a pose or joint lags its command by more than delay and bandwidth explain
 reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
@@ -42,30 +42,30 @@ Spans = list[tuple[float, float]]
 
 _MIN_DURATION_S = 0.2
 """Shortest reported duration [s]; a normal motion may cause shorter ones."""
-# Shorter gaps are closed [s].
+# Gaps between time spans that are shorter are closed [s].
 _MAX_GAP_S = 0.05
-# Tolerance for rounding at a limit.
+# Share of a limit from which the limit counts as reached (rounding).
 _LIMIT_SHARE = 1 - 1e-9
-# Smallest reported lag: command [m], its orientation [rad], joint [rad] (3 mm at 1 m).
+# Smallest reported lag: command [m], orientation of the command [rad], joint [rad] (3 mm at 1 m).
 _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad(0.2)
-# Settling time of a ledger's command with sufficient energy [s].
+# Settling time of the command of `ledger` with sufficient energy [s].
 _SETTLING_TIME_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
-# Smallest reported amplitude: hand and command [m], their orientation [rad], joint [rad].
+# Smallest reported amplitude: position [m] and orientation [rad] of hand and command, joint [rad].
 _MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
 _MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
 _REVERSAL_WINDOW_S = 0.25
-"""A reversal within this time of a command's reversal is explained by it [s]."""
-# Reversals of an oscillation, and longest time between two of them [s].
+"""Largest time between a reversal of the command and the reversal that it explains [s]."""
+# Smallest number of reversals of an oscillation, and longest time between two of them [s].
 _MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
-# Time constants of the position loop until the error is 0.3 %.
+# Number of time constants of the position loop until the error is 0.3 %.
 _SETTLING_TIME_CONSTANTS = 6.0
-# Further times are only counted.
+# Largest number of time spans that a warning lists; further ones are counted.
 _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence for each condition of the table above that occurred, with times.
+    """Return one sentence, with times, for each condition of the module's table that occurred.
 
     Args:
         result: result of a run; checks whose signals were not recorded are skipped.
@@ -83,7 +83,10 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:
-    """Return spans of at least `least` [s] with `happened` (N,); gaps below 50 ms are closed."""
+    """Return the time spans (start, stop) during which `happened` (N,) is true.
+
+    Gaps below 50 ms are closed; then spans shorter than `least` [s] are dropped.
+    """
     spans: Spans = []
     for start, stop in contact_spans(t, happened):
         if spans and start - spans[-1][1] < _MAX_GAP_S:
@@ -99,9 +102,9 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     Both stay inside the range of the commands in `window`.
 
     Args:
-        t: (N,) evenly spaced [s].
-        command, actual: (N, k) in one unit.
-        window: time before now whose commands count [s].
+        t: (N,) evenly spaced times [s].
+        command, actual: (N, k) commanded and actual motion in one unit.
+        window: length of the range before each time [s].
     """
     rows = max(round(window / (t[1] - t[0])), 1) + 1 if len(t) > 1 else 1
     above = actual - _running_maximum(command, rows)
@@ -110,7 +113,7 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
 
 
 def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
-    """Return indices of local extremes that differ by more than `swing` from the previous one."""
+    """Return indices of local extremes of x (N,) that differ by more than `swing` from the last."""
     slope = np.diff(x)
     near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
     found: list[int] = []
@@ -130,16 +133,16 @@ def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
 def oscillates(
     t: Array, command: Array, actual: Array, swing: float, near: float = _REVERSAL_WINDOW_S
 ) -> Flags:
-    """Return (N,) whether the actual motion oscillates while the commanded one does not.
+    """Return (N,) booleans: True while the actual motion oscillates and the command does not.
 
     An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
-    of the command explains one reversal of the motion within `near`.
+    of the command explains one reversal of the motion within the time `near`.
 
     Args:
-        t: (N,) [s].
-        command, actual: (N, k) in one unit.
+        t: (N,) times [s].
+        command, actual: (N, k) commanded and actual motion in one unit.
         swing: smallest amplitude, in that unit.
-        near: [s].
+        near: largest time between the two reversals [s].
     """
     asked = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
     oscillating = np.zeros(len(t), dtype=bool)
@@ -156,7 +159,7 @@ def oscillates(
 
 
 def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
-    """Yield slave faults, and operator-side faults that no slave fault explains."""
+    """Yield faults and their time spans; a fault at the hand counts while the slave has none."""
     t = result.t
     slave = hand = np.zeros(len(t))
     if "fault" in result:
@@ -274,7 +277,7 @@ def _check_reserve(result: SimulationResult, scenario: Scenario) -> Iterator[tup
 def _pose_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
-    """Return command, motion, smallest lag, unit and its scale, for position and rotation."""
+    """Return command, motion, smallest lag, display unit and factor, for position and rotation."""
     rotations = _rotation(command, command), _rotation(actual, command)
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
@@ -336,9 +339,9 @@ def _pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Fl
 
 
 def _rotation(pose: Array, reference: Array) -> Array:
-    """Return (N, 4) twice the quaternion: its small changes equal the rotation [rad].
+    """Return (N, 4) twice the quaternions of poses: small changes equal the rotation [rad].
 
-    The sign is that of the first pose of `reference`.
+    The quaternions take the sign of the first pose of `reference`.
     """
     q: Array = pose[:, :4]
     return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]

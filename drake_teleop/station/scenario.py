@@ -129,7 +129,7 @@ class Scenario:
 
     @property
     def surroundings(self) -> Environment | None:
-        """All objects to touch as one `Environment`, or None."""
+        """All objects that the tool can touch as one `Environment`; None if there are none."""
         things = self._objects
         if not things:
             return None
@@ -137,7 +137,7 @@ class Scenario:
 
     @property
     def leaf(self) -> SheetSpring | None:
-        """The sheet spring, from `sheet_spring` or `environment`."""
+        """Sheet spring from `sheet_spring` or `environment`; None if there is none."""
         return next((thing for thing in self._objects if isinstance(thing, SheetSpring)), None)
 
     @property
@@ -146,16 +146,16 @@ class Scenario:
         return [*own, *self.environment]
 
     def without_environment(self) -> "Scenario":
-        """Return a copy without objects to touch."""
+        """Return a copy of the scenario without objects to touch."""
         return dataclasses.replace(self, sheet_spring=None, slot=None, environment=[])
 
     @property
     def is_direct(self) -> bool:
-        """Whether master and slave are connected by wires only."""
+        """True if master and slave are connected by wires only."""
         return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
-        """Check all values.
+        """Check the values of all fields.
 
         Raises:
             DrakeTeleopError: with `where` and the field.
@@ -220,7 +220,7 @@ def LoadScenario(name_or_path: str | Path) -> Scenario:
 
 
 def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
-    """Return the unchecked data of a scenario file, and the file's name for messages.
+    """Read a scenario file; return the unchecked data, and the file's name for messages.
 
     Raises:
         DrakeTeleopError: if there is no such scenario, or as `read_yaml`.
@@ -240,7 +240,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
-    """Return the scenario of parsed YAML data; `where` is the place for messages.
+    """Convert parsed YAML data to a scenario; `where` is the place for messages.
 
     Raises:
         DrakeTeleopError: with the invalid field.
@@ -257,7 +257,7 @@ def ScenarioFromData(data: Any, where: str) -> Scenario:
 
 
 def replace(scenario: Scenario, **changes: object) -> Scenario:
-    """Return a copy with changed fields; `a__b` is field b of block a.
+    """Return a copy of a scenario with changed fields; `a__b` is field b of block a.
 
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5

@@ -51,12 +51,12 @@ and sections are those of the paper; (E) marks an estimate of ours, where the pa
 
 
 def commented(scenario: Scenario) -> str:
-    """Return the scenario as YAML with every field and its meaning."""
+    """Return the scenario as YAML text; a comment explains each field."""
     return _HEAD + "\n".join(_block_lines(scenario)) + "\n"
 
 
 def _all_texts(value: Any) -> list[str]:
-    """Return all texts in a scenario, which an incorrect YAML writer would change."""
+    """Return all strings of a scenario, to check that YAML preserves them."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
@@ -70,7 +70,8 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
     """Write every field of a scenario to a YAML file, for `LoadScenario`.
 
     Raises:
-        DrakeTeleopError: if the file would be read as another scenario, or cannot be written.
+        DrakeTeleopError: if reading the file would not give the same scenario, or the file
+            cannot be written.
     """
     text, where = commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
@@ -82,7 +83,7 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
 
 
 def reference() -> str:
-    """Return Markdown with a table per block: field, default, range and meaning."""
+    """Return the reference in Markdown: a table per block with field, default, range, meaning."""
     return _REFERENCE + "".join(_sections(Scenario(), ""))
 
 
@@ -121,7 +122,7 @@ def _block_lines(config: Any) -> list[str]:
 
 
 def _inner_lines(entry: FieldInfo) -> list[str]:
-    """Return the lines of inner blocks; blocks that are not set are commented out."""
+    """Return the YAML lines of inner blocks; blocks that are not set are commented out."""
     if entry.default:
         return _named_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]

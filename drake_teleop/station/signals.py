@@ -32,7 +32,7 @@ def _joint_names(joints: int) -> str:
 
 _STATE, _STATE_UNITS = _state(6)
 _JOINTS = _joint_names(6)
-# Their number of components follows the number of joints, as that of the states does.
+# Signals with one component per joint.
 _JOINT_SIGNALS = ("joint_position", "joint_torque", "joint_command")
 
 
@@ -112,7 +112,7 @@ SIGNALS = {
 
 
 def signal_of(name: str, size: int) -> Signal:
-    """Return the description of a signal for a port with `size` components.
+    """Return the description of the signal `name` for a port with `size` components.
 
     For prismatic joints, read m instead of rad and N instead of N m.
     """

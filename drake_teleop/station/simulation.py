@@ -1,4 +1,4 @@
-"""Simulation of a station with named signals as result."""
+"""Simulation of a station; the result contains the named signals."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def simulate(
     Args:
         diagram: station from `MakeTeleopStation`.
         simulation: duration, settling time, integrator and seed.
-        progress: whether to show a bar after one second; or a function of the completed fraction.
+        progress: True shows a progress bar after one second; or a function of the completed
+            fraction.
         log: folder for the log, which is written during the run in parts of some seconds, so that
             memory does not grow (`SimulationResult.scan_parquet`). After Ctrl-C or an error it
             contains all samples; a killed process loses the last part. An old log is replaced.
@@ -94,7 +95,7 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Check the rows recorded since row `rows`; return the new number of rows.
+    """Check the log's rows from index `rows` on for faults; return the new number of rows.
 
     Raises:
         DrakeTeleopError: for the first fault.
@@ -115,7 +116,7 @@ def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
 
 
 def columns(station: Diagram) -> dict[str, slice]:
-    """Return the log's rows of each signal, by name."""
+    """Return for each signal, by name, the slice of its rows in the station's log."""
     ports = [station.get_output_port(index) for index in range(station.num_output_ports())]
     ends = np.cumsum([port.size() for port in ports])
     return {p.get_name(): slice(e - p.size(), e) for p, e in zip(ports, ends, strict=True)}
@@ -143,13 +144,13 @@ class LogOnDisk:
         self.follow(simulator)
 
     def follow(self, simulator: Simulator) -> None:
-        """Continue with another simulator; call `take` for the previous one before."""
+        """Continue with the log of another simulator; call `take` for the previous one before."""
         self._simulator = simulator
         sink = simulator.get_system().GetSubsystemByName(LOG)
         self._sink = sink.FindMutableLog(simulator.get_mutable_context())
 
     def waiting(self) -> int:
-        """Return the number of rows in memory."""
+        """Return the number of rows that are in memory only."""
         return int(self._sink.num_samples())
 
     def take(self) -> None:
@@ -164,7 +165,7 @@ class LogOnDisk:
         self._rows += len(part.t)
 
     def keep(self) -> None:
-        """Write the rows but keep them: the next `take` rewrites this part with more rows."""
+        """Write the rows in memory but keep them; the next `take` rewrites and extends it."""
         self._write(self._read())
 
     def _write(self, part: SimulationResult) -> None:
@@ -200,7 +201,7 @@ def advance(simulator: Simulator, time: float) -> None:
 
 
 def read_log(simulator: Simulator, start: float) -> SimulationResult:
-    """Return the recorded signals from time `start` [s] on, with t = 0 there."""
+    """Return the recorded signals from time `start` [s] on; `start` becomes t = 0."""
     diagram = simulator.get_system()
     log = diagram.GetSubsystemByName(LOG).FindLog(simulator.get_context())
     t = log.sample_times() - start

@@ -1,4 +1,4 @@
-"""The slave side: arm with inverse kinematics, wrist sensor and load elimination."""
+"""Slave side of the station: arm with inverse kinematics, wrist sensor and load elimination."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def MakeSlaveSide(
         - pose_command: (7,) X_WS, setpoint; or leader_joints: (n,) [rad] (leader arm in joint mode)
         output_ports:
         - wrench_B: (6,) F_E_B, wrench to render, in the master's base [N, N m]; NaN during a fault
-        - load_wrench_B: (6,) its part from weight and inertia of the load
+        - load_wrench_B: (6,) part of wrench_B from weight and inertia of the load
         - pose_slave: (7,) actual X_WS of the present joint angles (over a network)
         - saturated: (1,) 1 while the wrench is invalid; also a signal
         - contact: (1,) 1 in contact; also a signal (with contact detection)
@@ -71,14 +71,14 @@ def MakeSlaveSide(
         - load_state (if the load is monitored), true_contact_wrench_W (with surroundings),
           sheet_state (with a sheet spring), pose_of_NAME (of each moving body of the
           surroundings): signals
-        - sample, scaled_contact_and_fault: several of these in one port, for the log
+        - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
     Args:
         scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
 
     Raises:
-        DrakeTeleopError: for an invalid value, an unreachable start, scales that need a load
-            estimate without one, or contact detection without noise floor.
+        DrakeTeleopError: for an invalid value, an unreachable start, scales that require a load
+            estimate if there is none, or contact detection without noise floor.
     """
     check_scenario(scenario)
     _check_load_is_known(scenario, load_estimate)
@@ -148,7 +148,7 @@ def MakeSlaveSide(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build the slave without master: its joints follow an excitation trajectory (section IV).
+    """Build the slave side without master: the joints follow an excitation trajectory (section IV).
 
     The arm starts at the trajectory's start; `trajectory` runs once after the settling time.
     Output ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
@@ -183,7 +183,7 @@ def _add_slave_blocks(
     load_covariance: Array | None = None,
     q_start: Array | None = None,
 ) -> _SlaveBlocks:
-    """Add the blocks that every slave has; the joint command stays unconnected."""
+    """Add the blocks that both slave sides have; the joint command stays unconnected."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start = slave.arm, slave.plant, slave.start
@@ -261,9 +261,9 @@ def _add_slave_blocks(
 
 
 def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
-    """Return servo samples per event.
+    """Return the number of samples of the joint servo per event of the simulation.
 
-    It is 1 if only the plant itself predicts its motion (contact by Drake, position interface).
+    The number is 1 with contact by Drake, other moving bodies, or a position interface.
     """
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.beyond or contact.plant_size or interface is not None:
@@ -272,7 +272,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Reject friction that stops a joint within one step [s] of the plant (numerical instability).
+    """Reject dry friction that stops a joint within one step [s] (numerical instability).
 
     A Runge-Kutta step is stable for (slope of friction / inertia) * step up to 2.5.
 

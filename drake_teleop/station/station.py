@@ -1,4 +1,4 @@
-"""The teleoperation system of the paper's Fig. 4 as one Drake Diagram.
+"""Teleoperation system of the paper's Fig. 4 as one Drake Diagram.
 
     operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
           master side        <->      channel       <->          slave side
@@ -42,14 +42,14 @@ def MakeTeleopStation(
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an
             identification. Optional if the estimator runs online or sigma = gamma; without an
             estimate there is no `contact_wrench_S`.
-        load_covariance: (16, 16) of the estimate: start value of a monitored load
+        load_covariance: (16, 16) covariance of the estimate: start value of a monitored load
             (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
             least squares is too small.
-        noise_floor: of the eliminated wrench in free motion, at the estimator's rate, for contact
-            detection: `LoadIdentification.noise_floor`.
+        noise_floor: noise of the eliminated wrench in free motion, at the estimator's rate, for
+            contact detection: `LoadIdentification.noise_floor`.
         master: custom system with the ports of `MakeMasterSide(scenario)`.
-        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; it ignores the three
-            arguments above.
+        slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; it ignores
+            load_estimate, load_covariance and noise_floor.
 
     Raises:
         DrakeTeleopError: for an invalid value, or a custom side without a required port.
@@ -91,10 +91,10 @@ def MakeTeleopStation(
         ):
             if channel.HasInputPort(name):
                 wire(builder, source, name, channel, name)
-        # Optional for a custom slave: then the whole wrench counts as contact.
+        # Optional for a custom slave: without this port the whole wrench counts as contact.
         if channel.HasInputPort("load_wrench_B") and slave.HasOutputPort("load_wrench_B"):
             wire(builder, slave, "load_wrench_B", channel, "load_wrench_B")
-    if master.HasInputPort("slave_state"):  # an operator with a task sees the tool
+    if master.HasInputPort("slave_state"):  # for the view of the tool by an operator with a task
         wire(builder, slave, "slave_state", master, "slave_state")
     for name in ("clutch", "intended_pose", "intended_twist"):
         if master.HasInputPort(name):
@@ -103,7 +103,7 @@ def MakeTeleopStation(
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build a station of the slave alone on a trajectory: see `MakeSlaveOnTrajectory`."""
+    """Build a station with only the slave, on a trajectory: see `MakeSlaveOnTrajectory`."""
     check_scenario(scenario)
     expect(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
@@ -112,7 +112,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 
 
 def GetBlock(station: Diagram, name: str) -> System:
-    """Return the block with this name ("force_scaling", "slave_plant", ...) from any side."""
+    """Return the block `name` ("force_scaling", "slave_plant", ...) from any side."""
     sides = [side for side in station.GetSystems() if isinstance(side, Diagram)]
     (side,) = (side for side in sides if side.HasSubsystemNamed(name))
     return side.GetSubsystemByName(name)

@@ -54,7 +54,7 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures above for one run.
+    """Return the measures of the module's table for one run.
 
     Args:
         result: result with the signal task_state.
@@ -80,7 +80,7 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
     hand, twist = result["hand_wrench_E"][span], result["twist_master"][span]
     power = np.abs(np.sum(hand * twist, axis=1))
     noticed, touching = state[span, FELT] > 0.0, force[span] > 0.0
-    # The log may start after the task.
+    # The log may start after the start of the task.
     taken = float(t[ended]) + scenario.simulation.settle - task.t_start
     success = done and not _failed_criterion(result, scenario, task, ended)
     measures_of_success = {
@@ -101,9 +101,9 @@ def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, flo
 
 
 def task_failure(result: SimulationResult, scenario: Scenario) -> str:
-    """Return the reason for failure: timeout, given up, or not achieved; "" after success.
+    """Return the reason why the task failed (timeout, given up, not achieved); "" after success.
 
-    Times are those of the log. The scenario must have a task.
+    Times in the text are those of the log. The scenario must have a task.
     """
     task, state, ended = scenario.operator.task, result["task_state"], _end_sample(result)
     assert task is not None
@@ -151,7 +151,7 @@ def contact_force(result: SimulationResult) -> Array:
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from first contact to its detection [s]; nan if there is none."""
+    """Return the time from the first contact to its detection [s]; nan if either is missing."""
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))
@@ -169,7 +169,7 @@ def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    """Return the violated success criterion as text, or ""."""
+    """Return the violated success criterion as text; "" if there is none."""
     force = contact_force(result)
     if isinstance(task, Press):
         held = float(_held_force(result.t, force, task, ended).mean())

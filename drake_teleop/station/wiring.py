@@ -1,4 +1,4 @@
-"""Export, connection and recording of ports, with one error for missing ports."""
+"""Export, connection and recording of ports; a missing port gives one kind of error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMBINED_PORTS = {
 
 
 def export(builder: DiagramBuilder, block: System, *names: str, **renamed: str) -> None:
-    """Export output ports of a block under their own names, or as `exported="its port"`."""
+    """Export output ports of a block under their own names, or as `new_name="port"`."""
     for name, port in (dict(zip(names, names, strict=True)) | renamed).items():
         builder.ExportOutput(block.GetOutputPort(port), name)
 
@@ -47,9 +47,9 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 
 
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
-    """Export and record every port that is a signal, in the order of `SIGNALS`, then poses.
+    """Export and record signals in the order of `SIGNALS`, then poses; build the diagram.
 
-    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from there.
+    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from this port.
     """
     outputs = {
         port.get_name(): port
@@ -64,7 +64,7 @@ def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz:
         part: port for port, parts in COMBINED_PORTS.items() if port in outputs for part in parts
     }
     ports = [outputs[name] for name in dict.fromkeys(wide.get(name, name) for name in signals)]
-    # One wide log: at 8 kHz each system with own events costs time at every step.
+    # One log for all ports: at 8 kHz each system with events costs time at every step.
     row = builder.AddNamedSystem("log_input", Multiplexer([port.size() for port in ports]))
     for index, port in enumerate(ports):
         builder.Connect(port, row.get_input_port(index))

@@ -63,7 +63,7 @@ PHANTOM, LEADER = "phantom_premium_15", "leader"
 @settings
 @dataclass
 class JointFriction:
-    """Friction of the six joints: coulomb * tanh(velocity / 0.01 rad/s) + viscous * velocity."""
+    """Friction torque of the Phantom's joints: coulomb * tanh(v / 0.01 rad/s) + viscous * v."""
 
     coulomb: list[float] = quantity(
         [0.01, 0.01, 0.01, 0.001, 0.001, 0.001], "N m", 0.0, 1.0, "main axes P, wrist E"
@@ -76,7 +76,7 @@ class JointFriction:
 @settings
 @dataclass
 class DeviceFigures:
-    """Data sheet of a device, see `task_space`; x of its base points to the operator, z up."""
+    """Data sheet of a device in task space; x of its base frame points to the operator, z up."""
 
     apparent_mass: float = quantity(0.1, "kg", 1e-3, 20.0, "apparent mass at the grip")
     inertia: float = quantity(1e-4, "kg m^2", 1e-7, 0.1, "inertia about every axis")
@@ -186,7 +186,7 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the device with the hand's passive mass [kg] and inertia about E [kg m^2].
+        """Return the device with the hand's passive mass [kg] and inertia about E [kg m^2] added.
 
         Raises:
             DrakeTeleopError: as `Leader.device`.
@@ -211,11 +211,11 @@ class Master:
 
     @property
     def leads_joints(self) -> bool:
-        """Whether a leader arm commands the joints of the slave."""
+        """True if the master is a leader arm that commands the slave's joints."""
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError for a leader in joint mode; `what` names the caller."""
+        """Raise a DrakeTeleopError if a leader commands joints; `what` names the caller."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",
@@ -224,19 +224,19 @@ class Master:
             )
 
     def steps(self) -> NDArray[np.float64]:
-        """Return (6,) encoder steps of the axes [m, rad]; 0 for exact reading."""
+        """Return the encoder steps (6,) of the device's axes [m, rad]; 0 for an exact reading."""
         if self.model in (PHANTOM, LEADER):
             return np.zeros(6)
         figures = self._figures()
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def own_period(self, hand_hz: float) -> float | None:
-        """Return the sampling period of a device slower than `hand_hz` [s], else None."""
+        """Return the sampling period [s] of a device that is slower than `hand_hz`, else None."""
         rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
     def without_coulomb_friction(self) -> "Master":
-        """Return a linear copy: no Coulomb friction, no encoder steps."""
+        """Return a copy with a linear device: no Coulomb friction, no encoder steps."""
         if self.model == PHANTOM:
             friction = dataclasses.replace(self.friction, coulomb=[0.0] * 6)
             return dataclasses.replace(self, friction=friction)
@@ -248,7 +248,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """Return a copy whose file path is relative to `folder`."""
+        """Return a copy in which the leader's relative file paths are resolved from `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -300,8 +300,5 @@ _MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """Return the defaults for a scenario's `master.figures`, from its model.
-
-    The check of the loaded block rejects unknown names.
-    """
+    """Return the default data sheet of the device that a `master` block names, or None."""
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

@@ -21,10 +21,10 @@ _MAX_FRICTION_STEP = 2.0
 
 @njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
-    """Apply `step` and update pose and twist, in one compiled call.
+    """Advance the device by one `step`, then update pose and twist, in one compiled call.
 
-    Stores the display's memory (`display`, `drive[6:]`) beside the joint positions. With invalid
-    forces the device does not move.
+    Write joint positions and the force display's memory, `drive[6:]`, into `display` (27,). With
+    invalid forces the device does not move.
     """
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
@@ -37,7 +37,7 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Check that one step per period is stable for the device at the joints q.
+    """Check that one step per period [s] is stable for the device at the joint positions q.
 
     Raises:
         DrakeTeleopError: if the period is too long for haptic devices or for the friction.
@@ -61,27 +61,27 @@ def check_period(
 
 
 class MasterDevice(LeafSystem):
-    """Device with the hand's passive mass, advanced once per period.
+    """Haptic device with the hand's passive mass, advanced once per period.
 
-    One classical Runge-Kutta step of the nonlinear dynamics (gravity, Coriolis, friction, stiff
-    damped end stops) with held inputs.
+    Each period is one classical Runge-Kutta step of the nonlinear dynamics (gravity, Coriolis,
+    friction, stiff damped end stops) with held inputs.
 
     .. pydrake_system::
 
         name: MasterDevice
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
-        - drive: from the force display: joint torques (6) [N m; N], memory of the display
+        - drive: (27,) from the force display: motor torques (6) [N m; N], the display's memory
         output_ports:
         - state: (12,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - for_display: joint positions (6) [rad], memory of the force display
+        - for_display: (27,) joint positions (6) [rad; m], the display's memory
 
     Args:
-        period: [s], at most 1 ms.
-        device: includes the hand's mass; the operator carries the hand's weight.
-        q_initial: (6,) joints at the start [rad; in task space m, rad], at rest.
+        period: sampling period [s], at most 1 ms.
+        device: model with the hand's mass; the operator carries the hand's weight.
+        q_initial: (6,) joint positions at the start, at rest [rad; in task space m, rad].
 
     Raises:
         DrakeTeleopError: if the period is too long for the device or its friction, or the start
@@ -133,7 +133,7 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Add "master_device" and "force_display" of a device or leader arm, and connect them.
+    """Add and connect the blocks "master_device" and "force_display" of a device or leader arm.
 
     Returns:
         Both blocks; the hand's wrench and the command remain to be connected.

@@ -35,7 +35,7 @@ def jacobian_into(q, device, J):
 
 @njit(cache=True)
 def gravity_torque_into(q, device, out):
-    """Write the joint forces (6,) that compensate the device's weight."""
+    """Write the joint torques or forces (6,) that compensate the device's weight into `out`."""
     if device[IN_TASK_SPACE] != 0.0:
         out[:6] = 0.0
     else:
@@ -44,7 +44,7 @@ def gravity_torque_into(q, device, out):
 
 @njit(cache=True)
 def pose_into(q, device, pose):
-    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz]."""
+    """Write the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] into `pose`."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.pose_into(q, pose)
     else:
@@ -53,7 +53,7 @@ def pose_into(q, device, pose):
 
 @njit(cache=True)
 def twist_into(q, v, device, J, twist):
-    """Write [v; omega] of E in B (6,) = J v; `J` (6, 6) is scratch."""
+    """Write the twist [v; omega] of E in B (6,) = J v; the Jacobian `J` (6, 6) is scratch."""
     jacobian_into(q, device, J)
     for i in range(6):
         twist[i] = 0.0
@@ -67,8 +67,8 @@ def step(state, hand_wrench, motor, device, period, work, stages):
 
     Args:
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        motor: (6,) torques (or forces) at the joints.
-        device: (NUMBERS,), see `numbers`.
+        motor: (6,) motor torques (or forces) at the joints.
+        device: (NUMBERS,) device parameters, see `numbers`.
         work, stages: (2, 6, 6) and (3, 12) scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
@@ -94,7 +94,7 @@ def step(state, hand_wrench, motor, device, period, work, stages):
 
 
 class DisplayDevice:
-    """Device of any kind with parameters `numbers` (NUMBERS,)."""
+    """Base class of haptic devices; `numbers` (NUMBERS,) contains the parameters."""
 
     numbers: NDArray[np.float64]
 
@@ -105,17 +105,17 @@ class DisplayDevice:
 
     @property
     def peak_torque(self) -> NDArray[np.float64]:
-        """(3,) largest displayed torques about the rotational axes [N m]."""
+        """Largest displayed torques (3,) about the rotational axes [N m]."""
         return self.numbers[PEAK_TORQUE]
 
 
 @dataclass(frozen=True)
 class HapticDevice(DisplayDevice):
-    """Device with the hand's passive mass.
+    """Haptic device (Phantom or in task space) with the hand's passive mass.
 
     Attributes:
-        numbers: (NUMBERS,), see `numbers`.
-        name: for messages.
+        numbers: (NUMBERS,) device parameters, see `numbers`.
+        name: device name for messages.
     """
 
     numbers: NDArray[np.float64]
@@ -125,39 +125,39 @@ class HapticDevice(DisplayDevice):
 
     @property
     def friction_field(self) -> str:
-        """Scenario field of the friction."""
+        """Name of the scenario field that contains the friction."""
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (6,) axes for the force display at the joints q (6,): q itself."""
+        """Return the axes (6,) for the force display: the joint positions q (6,) unchanged."""
         return q
 
     @property
     def is_phantom(self) -> bool:
-        """Whether the kinematics are the Phantom's, otherwise those of `task_space`."""
+        """True for the Phantom's kinematics, False for those of `task_space`."""
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joints (6,) with E at X_BE (7,); raise if it is out of reach."""
+        """Return the joint positions (6,) for the pose X_BE (7,); raise if it is out of reach."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
 
     def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return X_BE (7,) at the joints q (6,)."""
+        """Return the pose X_BE (7,) at the joint positions q (6,)."""
         pose = np.empty(7)
         pose_into(q, self.numbers, pose)
         return pose
 
     def check_limits(self, q: NDArray[np.float64]) -> None:
-        """Raise a DrakeTeleopError if a joint of q (6,) is outside its limits."""
+        """Raise a DrakeTeleopError if a joint position of q (6,) is outside its limits."""
         if self.is_phantom:
             phantom.check_limits(q)
         else:
             task_space.check_limits(q, self.numbers)
 
     def at_an_end(self, q: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return (N,) whether an end stop is active at the joints q (N, 6)."""
+        """Return (N,) booleans: True where an end stop is active at q (N, 6)."""
         if self.is_phantom:
             return phantom.at_an_end(q)
         return task_space.at_an_end(q, self.numbers)
@@ -169,7 +169,7 @@ class HapticDevice(DisplayDevice):
         return J
 
     def mass_matrix(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the mass matrix (6, 6), with the hand."""
+        """Return the mass matrix (6, 6), including the hand, at the joint positions q (6,)."""
         if self.is_phantom:
             return phantom.mass_matrix(q, self.numbers[HAND_MASS], self.numbers[HAND_INERTIA])
         M = np.empty((6, 6))
@@ -177,9 +177,9 @@ class HapticDevice(DisplayDevice):
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """Return the matrix (6, 6) of joint forces against dq/dt at q (6,).
+        """Return the damping matrix D (6, 6), joint forces -D dq/dt, at the joint positions q (6,).
 
-        `creeping` includes the slope of Coulomb friction at standstill.
+        `creeping` adds the slope of Coulomb friction at standstill.
         """
         if self.is_phantom:
             slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED

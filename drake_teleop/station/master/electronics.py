@@ -1,7 +1,7 @@
 """Encoders with finite steps, and the sampling rate of a device.
 
-Encoder steps count from the start and affect only the station's readings. A device slower than
-`rates.hand_hz` holds its reading and its force; `force_to_master` is the held force.
+Encoders count steps from the start and affect only the pose that the station reads. A device slower
+than `rates.hand_hz` holds this pose and the force; `force_to_master` is the held force.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def read_pose_into(q, q_start, steps, device, pose):
-    """Write X_BE (7,) for q (6,) rounded to whole `steps` (6,) from `q_start` (6,)."""
+    """Write the pose X_BE (7,) for q (6,) rounded to whole `steps` (6,) from `q_start` (6,)."""
     read = np.empty(6)
     for i in range(6):
         away = q[i] - q_start[i]
@@ -26,13 +26,13 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Pose as read by encoders that count `steps` (6,) [m, rad] from `q_start` (6,); 0 is exact.
+    """Stylus pose read by encoders with `steps` (6,) [m, rad] from `q_start` (6,); 0: exact.
 
     .. pydrake_system::
 
         name: Encoders
         input_ports:
-        - master_state: (12,) of the device
+        - master_state: (12,) state of the device
         output_ports:
         - pose_read: (7,) X_BE
     """
@@ -62,7 +62,7 @@ class SampleHold(LeafSystem):
         input_ports:
         - value: (n,)
         output_ports:
-        - held: (n,) at the last sample
+        - held: (n,) value at the last sample
     """
 
     __slots__ = ONE_DICT

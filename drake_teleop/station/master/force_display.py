@@ -22,9 +22,10 @@ from drake_teleop.station.passivity.safe_state import (
     master_limits_into,
 )
 
-# From the device: joint positions, and memory of the last period: last valid positions, displayed
-# wrench and fault, whether the wrench was changed after a fault, time since the last fault [s],
-# watch. To the device: motor torques in place of the positions, and the new memory.
+# Vector from the device: joint positions, and memory of the last period: last valid positions,
+# displayed wrench and fault, 1 if a fault changed the wrench, time since the last fault [s], memory
+# of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
+# new memory.
 _slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
 _POSITIONS, _LAST_POSITIONS, _DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
 _FAULT, _CHANGED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
@@ -37,12 +38,11 @@ _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING = map(
 
 @njit(cache=True)
 def _peak_wrench(numbers):
-    """Return (2,) peak force and largest motor torque; torque is limited per motor elsewhere."""
     return np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the display's input before the first period, for joint positions q (6,)."""
+    """Return the display's input (27,) for the first period, at the joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -51,10 +51,10 @@ def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDA
 
 @njit(cache=True)
 def limit_wrench_into(wrench, numbers, J, displayed):
-    """Write the part of `wrench` (6,) [f; tau] at E, in B, within the device's limits.
+    """Write the part of `wrench` that is within the device's limits into `displayed` (6,).
 
-    The force is scaled to the peak force, the torque to the peak torque of each wrist motor; both
-    keep their directions. A wrench that is not finite gives zero.
+    Both are [f; tau] at E, in B. The force is scaled to the peak force, the torque to the peak
+    torque of each wrist motor; both keep their directions. A wrench that is not finite gives zero.
     """
     for k in range(6):
         if not math.isfinite(wrench[k]):
@@ -76,7 +76,7 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Write J_M^T F + gravity compensation (6,) for F `displayed` (6,), J (6, 6) at q."""
+    """Write J_M^T F + gravity compensation (6,) for the wrench F, `displayed`; J is J_M at q."""
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -85,12 +85,12 @@ def motor_torque_into(displayed, q, numbers, J, torque):
 
 @njit(cache=True, borrows=True)
 def display_into(wrench, device, numbers, period, J, drive):
-    """Advance the display by one period; see `ForceDisplay` for its safe state.
+    """Advance the force display by one period; see `ForceDisplay` for its safe state.
 
     Args:
         wrench: (6,) F_E_B to render.
-        device: (27,) of `MasterDevice`.
-        numbers: (NUMBERS,) of the device.
+        device: (27,) port `for_display` of `MasterDevice`.
+        numbers: (NUMBERS,) device parameters.
         J: (6, 6) scratch.
         drive: (27,) output for `MasterDevice`, with the displayed wrench and a `Fault`.
     """
@@ -112,7 +112,7 @@ def display_into(wrench, device, numbers, period, J, drive):
 
 @njit(cache=True)
 def _fade(device, numbers, period, drive):
-    """Fade out during a fault, and cross-fade to the command afterwards.
+    """Fade the displayed wrench out during a fault, and cross-fade to the command afterwards.
 
     Arguments as for `display_into`; `drive` contains command and fault, and is changed.
     """
@@ -135,27 +135,27 @@ def _fade(device, numbers, period, drive):
 
 
 class ForceDisplay(LeafSystem):
-    """Convert the wrench to render into motor torques of the master.
+    """Block that converts the wrench to render into motor torques of the master.
 
     Safe state: with an invalid command or invalid joint positions, the displayed wrench fades to
     zero in 50 ms; gravity compensation uses the last valid positions. Afterwards the wrench returns
-    as after silence in a channel (`station.passivity.safe_state`). The device's state contains the
-    memory, because events of this block would cost time.
+    as after silence in a channel (`station.passivity.safe_state`). The device's state contains this
+    block's memory, because events of this block would cost time.
 
     .. pydrake_system::
 
         name: ForceDisplay
         input_ports:
         - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
-        - for_display: from the device: joint positions (6) [rad], memory
+        - for_display: (27,) from the device: joint positions (6) [rad], this block's memory
         output_ports:
-        - drive: for the device: J_M^T F + gravity compensation (6) [N m], memory
-        - force_to_master: (6,) F, displayed within the device's limits [N, N m]
+        - drive: (27,) for the device: J_M^T F + gravity compensation (6) [N m], memory
+        - force_to_master: (6,) wrench F, displayed within the device's limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two in one vector, for a log
+        - displayed_and_fault: (7,) the last two ports in one vector, for a log
 
     Args:
-        period: of the device [s].
+        period: sampling period of the device [s].
         device: device with `numbers`.
     """
 

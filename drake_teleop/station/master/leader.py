@@ -4,8 +4,8 @@
 
 The dynamics are those of `slave.arm`. The hand holds the arm at E, the point of `hand_frame`, whose
 axes equal those of B at home. The operator carries the hand's weight; the motors carry the share
-`weight_carried` of the arm's weight. For `force_display` the axes of the device are those of E; it
-commands the wrench F in the order of `task_space`, and this module applies J^T.
+`weight_carried` of the arm's weight. `force_display` treats the axes of E as the axes of the
+device. It commands the wrench F in the order of `task_space`, and this module applies J^T.
 """
 
 from __future__ import annotations
@@ -51,28 +51,28 @@ Array = NDArray[np.float64]
     _TORQUE_LIMIT,
     _WEIGHT_SHARE,
 ) = range(8)
-# Coulomb friction is tanh(speed / this), so a joint creeps below it.
-FRICTION_SPEED = 0.02  # rad/s or m/s, E
-# Natural frequency of the critically damped end stops with the joint's inertia, E.
+# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower joint creeps.
+FRICTION_SPEED = 0.02  # rad/s or m/s, estimate
+# Natural frequency of the critically damped end stops with the joint's inertia, estimate.
 _STOP_HZ = 12.0
 
 
 @njit(cache=True)
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
-    """Write the forward dynamics of leader and hand.
+    """Write the joint accelerations (forward dynamics) of leader and hand into `vdot`.
 
     Args:
-        arm: `ArmModel.table` with the hand's mass, to E in B.
-        joints: (8, n) of the joints, see `LeaderDevice`.
-        q, v: (n,) [rad, rad/s].
-        applied: (6,) [f; tau] on E, in B: of the hand, minus the hand's weight.
-        motor: (n,) [N m].
+        arm: `ArmModel.table` of the chain from B to E, with the hand's mass.
+        joints: (8, n) joint parameters, see `LeaderDevice`.
+        q, v: (n,) joint positions and speeds [rad, rad/s].
+        applied: (6,) wrench [f; tau] on E, in B: the hand's wrench minus the hand's weight.
+        motor: (n,) motor torques [N m].
         vdot: (n,) output.
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
     forward_kinematics(arm, q, R_BE, p_BE)
-    put(wrench, 0, applied, 0, 6)  # about the origin of B
+    put(wrench, 0, applied, 0, 6)  # becomes the wrench about the origin of B
     moment = cross(three(p_BE, 0), three(applied, 0))
     for i in range(3):
         wrench[3 + i] += moment[i]
@@ -90,7 +90,7 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 @njit(cache=True)
 def _pose_and_twist(arm, q, v, pose, twist):
-    """Write X_BE (quaternion sign as before in `pose`), and [v; omega] of E in B."""
+    """Write X_BE (quaternion sign as before in `pose`) and the twist [v; omega] of E in B."""
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
@@ -110,7 +110,10 @@ def _pose_and_twist(arm, q, v, pose, twist):
 
 @njit(cache=True)
 def motors_into(bare, arm, joints, q, F, torque):
-    """Write J^T F plus weight compensation (n,), within torque limits, for F (6,) at E."""
+    """Write the motor torques J^T F plus weight compensation (n,), within the torque limits.
+
+    F (6,) is the wrench at E; `bare` is the arm's table without the hand.
+    """
     n = q.shape[0]
     J, still = np.empty((6, n)), np.zeros(n)
     inverse_dynamics(bare, q, still, still, torque)
@@ -130,13 +133,13 @@ def step_leader(
     """Advance `state` (2 n,) by one Runge-Kutta step with held inputs; update pose and twist.
 
     Args:
-        bare, arm: tables without and with the hand.
-        joints: (8, n).
-        hand_weight: [N], carried by the operator.
-        state, pose, twist, display: see the ports of `LeaderArm`; changed.
-        hand_wrench: (6,) of the hand on E, in B.
-        drive: of the force display: F [f; tau_z, tau_y, tau_x] (6), memory.
-        period: [s].
+        bare, arm: `ArmModel.table` without and with the hand.
+        joints: (8, n) joint parameters, see `LeaderDevice`.
+        hand_weight: weight of the hand [N], carried by the operator.
+        state, pose, twist, display: see the ports of `LeaderArm`; updated.
+        hand_wrench: (6,) wrench of the hand on E, in B.
+        drive: from the force display: wrench F [f; tau_z, tau_y, tau_x] (6), memory.
+        period: step [s].
     """
     n = joints.shape[1]
     put(display, 6, drive, 6, drive.shape[0] - 6)
@@ -190,13 +193,13 @@ class LeaderDevice(DisplayDevice):
     """Leader arm with the hand's passive mass; methods as for `HapticDevice`.
 
     Attributes:
-        arm: dynamics in B to E, with the hand's mass.
+        arm: dynamics of the chain from B to E, with the hand's mass.
         bare: dynamics without the hand, for weight compensation.
         joints: (8, n) Coulomb friction [N m], damping in addition to the model's [N m s/rad], lower
             and upper limits [rad], stiffness and damping of the end stops, torque limits [N m],
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
-        numbers: (NUMBERS,) for the force display.
+        numbers: (NUMBERS,) parameters for the force display.
         name: for messages.
     """
 
@@ -217,15 +220,15 @@ class LeaderDevice(DisplayDevice):
 
     @property
     def constants(self) -> tuple[Array, Array, Array]:
-        """Tables of the arm without and with the hand, and parameters of the joints."""
+        """Tables of the arm without and with the hand, and `joints`, for compiled functions."""
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
-        """Return (6,) axes for the force display: the position of E, then zeros."""
+        """Return the axes (6,) for the force display: position of E (3), three unused zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return the joints (n,) with E at X_BE (7,), from home; raise if it is out of reach."""
+        """Return joint positions (n,) for X_BE (7,), searched from home; raise if out of reach."""
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -239,13 +242,13 @@ class LeaderDevice(DisplayDevice):
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """Return X_BE (7,) at the joints q (n,)."""
+        """Return the pose X_BE (7,) at the joint positions q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
 
     def check_limits(self, q: Array) -> None:
-        """Raise a DrakeTeleopError if a joint of q (n,) is outside its limits."""
+        """Raise a DrakeTeleopError if a joint position of q (n,) is outside its limits."""
         for k in np.flatnonzero((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])):
             raise DrakeTeleopError(
                 f"joint {self.arm.joint_names[k]} would be at {q[k]:.3g}, its limits are"
@@ -255,7 +258,7 @@ class LeaderDevice(DisplayDevice):
             )
 
     def at_an_end(self, q: Array) -> NDArray[np.bool_]:
-        """Return (N,) whether an end stop is active at the joints q (N, n)."""
+        """Return (N,) booleans: True where an end stop is active at q (N, n)."""
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
@@ -269,7 +272,7 @@ class LeaderDevice(DisplayDevice):
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
-        """Return the damping matrix (n, n); `creeping` adds Coulomb friction."""
+        """Return the damping matrix (n, n); `creeping` adds Coulomb friction at standstill."""
         own = self.joints[_VISCOUS] + self.arm.table[:-1, DAMPING]
         return np.diag(own + creeping * self.joints[_COULOMB] / FRICTION_SPEED)
 
@@ -277,7 +280,7 @@ class LeaderDevice(DisplayDevice):
 def joint_parameters(
     arm: ArmModel, home: Array, coulomb: Array, viscous: Array, limit: Array, carried: float
 ) -> Array:
-    """Return (8, n) for `LeaderDevice.joints`; end stops scale with the inertia at home.
+    """Return the array (8, n) `LeaderDevice.joints`; end stops scale with the inertia at home.
 
     `viscous` (n,) adds to the model's damping; `carried` is the compensated share of the weight.
     """
@@ -287,24 +290,24 @@ def joint_parameters(
 
 
 class LeaderArm(LeafSystem):
-    """Leader with the hand's passive mass, advanced once per period.
+    """Leader arm with the hand's passive mass, advanced once per period.
 
     .. pydrake_system::
 
         name: LeaderArm
         input_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand at E, in B [N, N m]
-        - drive: from `LeaderDisplay`: the wrench F (6), memory
+        - drive: (27,) from `LeaderDisplay`: wrench F (6) to display, the display's memory
         output_ports:
         - state: (2 n,) [q; qdot] [rad, rad/s]
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
-        - for_display: position of E and zeros (6), memory of the force display
+        - for_display: (27,) position of E (3), three unused zeros, the display's memory
 
     Args:
-        period: [s].
-        device: includes the hand's mass.
-        q_initial: (n,) joints at the start, at rest.
+        period: sampling period [s].
+        device: model with the hand's mass.
+        q_initial: (n,) joint positions at the start, at rest.
     """
 
     __slots__ = ONE_DICT
@@ -355,9 +358,9 @@ class LeaderDisplay(ForceDisplay):
         - state: (2 n,) of `LeaderArm`
         output_ports:
         - drive: for `LeaderArm`
-        - force_to_master: (6,) F, displayed within the limits [N, N m]
+        - force_to_master: (6,) wrench F, displayed within the limits [N, N m]
         - fault_at_hand: a `Fault`
-        - displayed_and_fault: the last two in one vector, for a log
+        - displayed_and_fault: (7,) the last two ports in one vector, for a log
     """
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""A leader arm from a model file, in the formats of the slave's arm."""
+"""Leader arm from a model file, in the file formats of the slave's arm."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -74,7 +74,7 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Check the fields without reading the file.
+        """Check the fields without reading the model file.
 
         Raises:
             DrakeTeleopError: with `where` and the field.
@@ -93,7 +93,7 @@ class Leader:
                 )
 
     def found_from(self, folder: Path) -> "Leader":
-        """Return a copy with absolute paths, relative to `folder`."""
+        """Return a copy in which relative paths are resolved from `folder`, as absolute paths."""
         return dataclasses.replace(
             self,
             file=str((folder / self.file).resolve()) if self.file else "",
@@ -101,10 +101,10 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Add the arm to a plant, with its base at the origin of B; X_Table is the pose of B.
+        """Add the leader to a plant, with its base at the origin of B; X_Table is the pose of B.
 
         Raises:
-            DrakeTeleopError: if it cannot be read, see `ParseModel`.
+            DrakeTeleopError: if the model cannot be read, see `ParseModel`.
         """
         X_BBase = RigidTransform(RollPitchYaw(self.base_rotation), np.zeros(3))
         X_WBase = X_BBase if X_Table is None else X_Table @ X_BBase
@@ -112,7 +112,7 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """Return the arm with the hand's passive mass; E is at p_BE = `position` (3,) [m] at home.
+        """Return the leader with the hand's mass added; at home E is at p_BE = `position` (3,) [m].
 
         Raises:
             DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
@@ -146,7 +146,7 @@ class Leader:
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
     def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        """Return (n,) values of a list with one value per joint, one for all, or none."""
+        """Return values (n,) from a list field with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(

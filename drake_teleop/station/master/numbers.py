@@ -6,16 +6,16 @@ from drake_teleop.station.passivity.memory import Slots
 
 NUMBERS = 31  #: length of the vector
 _slots = Slots(NUMBERS)
-HAND_MASS = _slots.number()  #: of the hand on the grip [kg]
-HAND_INERTIA = _slots.number()  #: about every axis through E [kg m^2]
-COULOMB = _slots.vector(6)  #: friction, of the device's axes [N or N m]
-VISCOUS = _slots.vector(6)  #: damping, likewise [N s/m or N m s/rad]
-PEAK_FORCE = _slots.number()  #: of the wrench that is displayed [N]
-PEAK_TORQUE = _slots.vector(3)  #: of the three turning axes [N m]; 0: not actuated
+HAND_MASS = _slots.number()  #: mass of the hand on the grip [kg]
+HAND_INERTIA = _slots.number()  #: inertia of the hand about every axis through E [kg m^2]
+COULOMB = _slots.vector(6)  #: Coulomb friction of the device's axes [N or N m]
+VISCOUS = _slots.vector(6)  #: damping of these axes [N s/m or N m s/rad]
+PEAK_FORCE = _slots.number()  #: largest displayed force [N]
+PEAK_TORQUE = _slots.vector(3)  #: largest torque about the three rotational axes [N m]; 0: none
 IN_TASK_SPACE = _slots.number()  #: 1 for a device of `task_space`, 0 for the Phantom
-# Only in task space:
+# Only for a device in task space:
 MASS = _slots.number()  #: apparent mass at the grip [kg]
-INERTIA = _slots.number()  #: likewise, about every axis [kg m^2]
-CENTRE = _slots.vector(3)  #: of the workspace, p_B [m]
-HALF_SIZE = _slots.vector(3)  #: of the workspace [m]
+INERTIA = _slots.number()  #: apparent inertia at the grip about every axis [kg m^2]
+CENTRE = _slots.vector(3)  #: centre of the workspace, p_B [m]
+HALF_SIZE = _slots.vector(3)  #: half edges of the workspace [m]
 TURN = _slots.vector(3)  #: largest yaw, pitch and roll [rad]

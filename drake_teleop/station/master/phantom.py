@@ -8,7 +8,7 @@ downward vertical towards x_B (absolute: q2 rotates only the inner link); wrist 
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
 
-Sources: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer; E: estimate.
+Sources: P: Cavusoglu, Feygin, Tendick 2002, as in mahilab/Phantom; D: manufacturer.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ INERTIA_DF = (7.11e-4, 0.629e-4, 6.246e-4)
 INERTIA_BASE_YY = 11.87e-4
 TRANSMISSION = (13.3, 11.2, 11.2)  # P
 MOTOR_INERTIA = 1.08e-6  # kg m^2, P
-WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at the gimbal point, E
-WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, E
+WRIST_MASS = 0.15  # kg, three links, each with its centre of mass at E, estimate
+WRIST_INERTIA = 5e-5  # kg m^2, each wrist link, about every axis, estimate
 
 #: Joint limits [rad]: main axes P, wrist (297, 260, 335 degrees in all) D.
 JOINT_LOWER = np.radians([-90.0, -124.0, -29.0, -148.5, -130.0, -167.5])
@@ -51,9 +51,9 @@ WRIST_TORQUE_LIMIT = np.array([0.515, 0.515, 0.170])  # N m, peak at q4, q5, q6,
 #: Posture with R_BE = identity, in the middle of the workspace.
 HOME = np.zeros(6)
 
-# Coulomb friction is tanh(velocity / this), so the device creeps below it.
-FRICTION_SPEED = 0.01  # rad/s, E
-# End stops: spring and damper that never pull, E: 7 kN/m at the tip.
+# Coulomb friction is proportional to tanh(velocity / FRICTION_SPEED): a slower device creeps.
+FRICTION_SPEED = 0.01  # rad/s, estimate
+# End stops: spring and damper that never pull, estimate: 7 kN/m at the tip.
 _STOP_STIFFNESS, _STOP_DAMPING = 300.0, 1.5  # N m/rad, N m s/rad, main axes
 _WRIST_STOP_STIFFNESS, _WRIST_STOP_DAMPING = 5.0, 0.01
 
@@ -85,7 +85,7 @@ _GRAVITY_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 @njit(cache=True)
 def _main_mass_matrix_into(q, M):
-    """Write the mass matrix of the three main axes into M (6, 6); the rest is zero."""
+    """Write the mass matrix of the three main axes into M (6, 6); the other entries are zero."""
     M[:, :] = 0.0
     M[0, 0] = (
         _YAW_CONSTANT
@@ -159,7 +159,7 @@ def gravity_torque_into(q, out):
 
 @njit(cache=True)
 def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
-    """Subtract C(q, v) v of the whole device from `torque` (6,)."""
+    """Subtract the Coriolis torque C(q, v) v of device, wrist and hand from `torque` (6,)."""
     # Main axes: Christoffel symbols of their closed-form M.
     coupling = _COUPLING * math.cos(q[1] - q[2])
     yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
@@ -227,9 +227,9 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     """Write the joint accelerations (6,) of device and hand into `vdot`.
 
     Args:
-        q, v, motor_torque: (6,) of the joints.
+        q, v, motor_torque: (6,) joint positions, speeds and motor torques.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        device: (NUMBERS,), see `numbers`.
+        device: (NUMBERS,) device parameters, see `numbers`.
         work: (2, 6, 6) scratch.
     """
     J, M = work[0], work[1]
@@ -247,7 +247,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz], with a sign continuous in q."""
+    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
     s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
     s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
@@ -291,7 +291,7 @@ def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
+    """Return the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
     pose = np.empty(7)
     pose_into(q, pose)
     return pose
@@ -326,7 +326,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return joint angles of the serial tree in `phantom.sdf` for q (..., 6).
+    """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6).
 
     The tree's third joint is relative to the inner link; the device's q3 is absolute.
     """
@@ -336,14 +336,14 @@ def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) whether an end stop of a joint or the five-bar is active at q (N, 6)."""
+    """Return (N,) booleans: True where a joint or the five-bar is at an end stop, for q (N, 6)."""
     folded = q[:, 1] - q[:, 2]
     beyond = ((q < JOINT_LOWER) | (q > JOINT_UPPER)).any(axis=1)
     return beyond | (folded < FIVE_BAR_RANGE[0]) | (folded > FIVE_BAR_RANGE[1])
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
-    """Raise a DrakeTeleopError for the first of six joint angles [rad] out of its range."""
+    """Raise a DrakeTeleopError for the first of six joint angles [rad] that is out of range."""
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:

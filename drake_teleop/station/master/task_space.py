@@ -1,4 +1,4 @@
-"""A haptic device by its data sheet, as seen at the grip.
+"""Haptic device defined by its data sheet: dynamics of the grip in task space.
 
     q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 
@@ -31,9 +31,9 @@ from drake_teleop.station.master.numbers import (
     VISCOUS,
 )
 
-# Coulomb friction is tanh(speed / this), so the device creeps below it.
-FRICTION_SPEED, FRICTION_ANGULAR_SPEED = 0.002, 0.01  # m/s, rad/s, E
-# End stops: spring and damper that never pull, E.
+# Coulomb friction is proportional to tanh(speed / FRICTION_SPEED): a slower device creeps.
+FRICTION_SPEED, FRICTION_ANGULAR_SPEED = 0.002, 0.01  # m/s, rad/s, estimate
+# End stops: spring and damper that never pull, estimate.
 _STOP_STIFFNESS, _STOP_DAMPING = 5000.0, 20.0  # N/m, N s/m
 _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/rad
 
@@ -71,7 +71,7 @@ def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
 
 @njit(cache=True)
 def _stop_force(beyond, rate, stiffness, damping):
-    """Return the force of an end stop at penetration `beyond` (either sign); it never pulls."""
+    """Return the force of an end stop at penetration `beyond` (either sign); a stop never pulls."""
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
     if beyond < 0.0:
@@ -86,7 +86,7 @@ def _penetration(x, half):
 
 @njit(cache=True)
 def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
-    """Write accelerations of device and hand; arguments as `phantom.acceleration_into`."""
+    """Write the accelerations (6,) of device and hand; arguments as `phantom.acceleration_into`."""
     J = work[0]
     jacobian_into(q, J)
     mass = device[MASS] + device[HAND_MASS]
@@ -126,7 +126,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write X_BE (7,) [qw, qx, qy, qz, px, py, pz], with a sign continuous in q."""
+    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
@@ -142,7 +142,7 @@ def pose_into(q, pose):
 def damping_matrix(
     q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
 ) -> NDArray[np.float64]:
-    """Return (6, 6) joint forces against dq/dt, as `HapticDevice.damping_matrix`."""
+    """Return the damping matrix (6, 6) at the axes q, as `HapticDevice.damping_matrix`."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
@@ -153,7 +153,7 @@ def damping_matrix(
 def inverse_kinematics(
     pose: NDArray[np.float64], device: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the axes q (6,) with the grip at X_BE (7,); raise outside the workspace."""
+    """Return the axis positions q (6,) for the pose X_BE (7,); raise outside the workspace."""
     turned = RollPitchYaw(RotationMatrix(Quaternion(pose[:4] / np.linalg.norm(pose[:4]))))
     turns = [turned.yaw_angle(), turned.pitch_angle(), turned.roll_angle()]
     q = np.concatenate([pose[4:7], turns])
@@ -164,20 +164,23 @@ def inverse_kinematics(
 def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    """Return (..., 6) axes of q outside the workspace by more than a margin [m, rad]."""
+    """Return (..., 6) booleans: True where q exceeds the workspace by over `margin` [m, rad]."""
     centre = np.append(device[CENTRE], np.zeros(3))
     return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
 
 
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return (N,) whether an end stop is active at q (N, 6); fixed rotations have none."""
+    """Return (N,) booleans: True where an end stop is active at q (N, 6).
+
+    Fixed rotations have none.
+    """
     return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1
     )
 
 
 def check_limits(q: NDArray[np.float64], device: NDArray[np.float64]) -> None:
-    """Raise a DrakeTeleopError if the axes q (6,) are outside the workspace."""
+    """Raise a DrakeTeleopError if the axis positions q (6,) are outside the workspace."""
     if _outside_workspace(q, device, 1e-9).any():
         low, high = device[CENTRE] - device[HALF_SIZE], device[CENTRE] + device[HALF_SIZE]
         axes = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(low, high, strict=True))

@@ -59,10 +59,10 @@ class Training:
 
     Args:
         R_WB: (3, 3) orientation of the master's base in the world.
-        translation_scale: tool over hand.
-        force_gain: rendered over true contact force, gamma * force_scale.
+        translation_scale: displacement of the tool over displacement of the hand.
+        force_gain: rendered force over true contact force, gamma * force_scale.
         forward, backward: mean one-way delays [s].
-        seed: of the operator's noise.
+        seed: random seed of the operator's noise.
     """
 
     R_WB: Array
@@ -74,7 +74,7 @@ class Training:
 
 
 def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
-    """Return (23,) operator parameters for `decide`."""
+    """Return the operator's parameters (23,) for `decide`."""
     there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
@@ -92,7 +92,7 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
 
 
 def pack_task(task: Task) -> Array:
-    """Return (15,) task parameters for `decide`."""
+    """Return the task's parameters (15,) for `decide`."""
     packed = np.zeros(_TASK)
     packed[[_KIND, _T_START, _TIMEOUT]] = KINDS.index(type(task)), task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
@@ -116,27 +116,31 @@ PHASE, DONE, FELT, LIMIT, TRUST, STATE = 0, 1, 2, 3, 4, 5
 WAITING, MOVING, FEELING, STOPPING, PRESSING, SEEKING, OVER = range(7)
 """Phases: before the start; move by vision; careful approach until contact; stop; force control;
 search for the slot; finished or given up."""
-# Memory: steps; earliest time of the next submovement; time since the aim is met, else -1;
-# estimated contact stiffness; force and move of the last press; number of searches; plan.
+# Memory: number of steps; earliest time of the next submovement; time at which the aim was met,
+# else -1; estimated contact stiffness; force and displacement of the last press; number of
+# searches; plan.
 _STEP, _NEXT_TIME, _MET_SINCE, _STIFFNESS, _LAST_FORCE, _LAST_MOVE, _SEARCHES = range(7)
 MEMORY = PLAN + PLAN_SIZE
 
 _FIXATION_STEPS = 50  # steps of a fixation, 0.25 s
-_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, E
-_APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, E
-_MAX_PENETRATION_M = 0.03  # perceived, without contact; beyond it the task is given up, E
-_MIN_TRUST = 0.1  # with vision only, E
-# Contact stiffness [N/m], E.
+_EFFECT_DELAY_S = 0.05  # s, from the end of a submovement to its effect, estimate
+_APPROACH_UPDATE_S = 0.3  # s, update interval of the careful approach, estimate
+# Perceived depth without contact beyond which the operator gives up, estimate.
+_MAX_PENETRATION_M = 0.03
+_MIN_TRUST = 0.1  # trust with vision only, estimate
+# Contact stiffness that the operator assumes [N/m], estimate.
 _INITIAL_STIFFNESS, _MIN_STIFFNESS, _MAX_STIFFNESS = 2000.0, 200.0, 50000.0
-_MAX_PRESS_M = 0.003  # m, longest force correction, at the tool, E
-_STUCK_SHARE = 0.5  # share of the push force above which the peg is stuck, E
-_YIELD_STIFFNESS, _MAX_YIELD_M = 5000.0, 0.0015  # N/m and m: compliance to lateral force, E
-_SPIRAL_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963  # m, times sqrt(number of searches), E; rad
-_FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, E
+_MAX_PRESS_M = 0.003  # m, longest correction of the force, at the tool, estimate
+_STUCK_SHARE = 0.5  # share of the push force above which the peg is stuck, estimate
+# Compliance to lateral force [N/m], largest yield [m], estimates.
+_YIELD_STIFFNESS, _MAX_YIELD_M = 5000.0, 0.0015
+# Spiral of the search: radius [m] over sqrt(number of searches), estimate; golden angle [rad].
+_SPIRAL_M, _GOLDEN_ANGLE = 0.5e-3, 2.399963
+_FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floor, estimate
 
 
 def initial_memory() -> Array:
-    """Return the memory at the start."""
+    """Return the memory (MEMORY,) at the start, for `decide`."""
     memory = np.zeros(MEMORY)
     memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
@@ -144,7 +148,7 @@ def initial_memory() -> Array:
 
 @njit(cache=True)
 def _to_hand(person, vector_W, out):
-    """Convert a displacement or velocity of the tool in W to one of the hand in B."""
+    """Convert a displacement or velocity of the tool, in W, to the hand's, in B."""
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
@@ -158,7 +162,7 @@ def _random_number(person, step, draw):
 
 @njit(cache=True)
 def look_into(person, step, displacement_W, seen_W):
-    """Write the perceived displacement (3,); the error is constant during a fixation."""
+    """Write the seen displacement `seen_W` (3,) [m]; its error is constant during a fixation."""
     for i in range(3):
         noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
         seen_W[i] = displacement_W[i] + noise
@@ -169,7 +173,7 @@ def _submovement(person, memory, step, time, error_W):
     change = np.empty(3)
     _to_hand(person, error_W, change)
     length = math.sqrt(change[0] ** 2 + change[1] ** 2 + change[2] ** 2)
-    # A minimum-jerk movement of this length has this peak acceleration.
+    # The peak acceleration of a minimum-jerk movement determines its shortest duration.
     duration = math.sqrt(10.0 / math.sqrt(3.0) * length / person[_ACCELERATION])
     duration = max(duration, person[_MIN_DURATION])
     for i in range(3):
@@ -180,7 +184,7 @@ def _submovement(person, memory, step, time, error_W):
 
 @njit(cache=True)
 def _pressed_force(task, person, felt):
-    """Return the contact force against the axis at the tool from the excess force [N]."""
+    """Return the contact force on the tool against the axis [N], from the excess force `felt`."""
     along = 0.0
     for i in range(3):
         axis_B = 0.0
@@ -192,7 +196,7 @@ def _pressed_force(task, person, felt):
 
 @njit(cache=True)
 def _is_met(memory, time, good, still_good):
-    """Return whether an aim is met, with hysteresis; store the time since when."""
+    """Return whether an aim is met: since `good` was true, until `still_good` is false."""
     if memory[_MET_SINCE] < 0.0 and good:
         memory[_MET_SINCE] = time
     elif not still_good:
@@ -216,19 +220,19 @@ def decide(task, person, time, seen_W, felt, state, memory):
     """Update the operator's decisions by one step; inputs are not checked.
 
     Args:
-        task: of `pack_task`.
-        person: of `pack_person`.
+        task: from `pack_task`.
+        person: from `pack_person`.
         time: now [s].
         seen_W: (3,) perceived displacement of the tool from its start, in W [m].
-        felt: (5,) of `perceive_into`, delayed by the reaction time.
-        state: (5,) phase, 1 done or -1 given up, 1 while contact is detected, threshold [N], trust;
-            updated.
-        memory: (MEMORY,) of `initial_memory`, updated.
+        felt: (5,) output of `perceive_into`, delayed by the reaction time.
+        state: (5,) phase; 1 done or -1 given up; 1 while contact is detected; detection threshold
+            [N]; trust (0.1 to 1) in detecting contact; updated.
+        memory: (MEMORY,) from `initial_memory`, updated.
     """
     step = int(memory[_STEP])
     memory[_STEP] += 1.0
     state[FELT], state[LIMIT] = felt[NOTICED], felt[THRESHOLD]
-    # Smallest detectable contact force at the tool over the harmless one.
+    # Ratio of the smallest detectable to the largest harmless contact force at the tool.
     unnoticed = math.inf
     if person[_FORCE_GAIN] > 0.0:
         unnoticed = felt[THRESHOLD] / (person[_FORCE_GAIN] * person[_GENTLE_FORCE])
@@ -256,7 +260,7 @@ def decide(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _seen_target(task, person, out):
-    """Write the perceived target from the tool's start, in W, with depth and aim errors."""
+    """Write the perceived target (3,), minus the standoff, from the tool's start, in W [m]."""
     depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
@@ -297,7 +301,7 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 
 @njit(cache=True)
 def _approach(task, person, time, seen_W, felt, state, memory):
-    """Approach along the axis, with a speed proportional to trust, until contact is detected."""
+    """Approach along the axis, at a speed proportional to trust, until contact is detected."""
     if task[_KIND] == INSERT:
         if state[FELT] > 0.0 and _is_stuck(task, person, felt):
             plan_stop(memory, time)
@@ -323,14 +327,17 @@ def _approach(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_force(task, person, felt, memory):
-    """Return the perceived force against the axis, with one error per judgement."""
+    """Return the perceived contact force against the axis [N], with one error per judgement."""
     error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
     return (1.0 + error) * _pressed_force(task, person, felt)
 
 
 @njit(cache=True)
 def _press_displacement(task, memory, force):
-    """Return the displacement for the set force, from a stiffness learned from its effect."""
+    """Return the displacement towards the set force along the axis [m].
+
+    The contact stiffness is learned from the effect of the last displacement.
+    """
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
@@ -356,7 +363,7 @@ def _control_force(task, person, step, time, felt, state, memory):
 
 @njit(cache=True)
 def _sideways_into(task, person, felt, out):
-    """Write the contact force across the axis (3,), in W, and return its size [N]."""
+    """Write the contact force lateral to the task's axis (3,), in W [N]; return its magnitude."""
     along, size = _pressed_force(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
@@ -369,7 +376,7 @@ def _sideways_into(task, person, felt, out):
 
 @njit(cache=True)
 def _is_stuck(task, person, felt):
-    """Return whether the contact force exceeds that of sliding in the slot."""
+    """Return whether the axial or lateral contact force is too large for a sliding peg."""
     limit = _STUCK_SHARE * task[_FORCE]
     sideways = _sideways_into(task, person, felt, np.empty(3))
     return _pressed_force(task, person, felt) >= limit or sideways >= limit
@@ -377,7 +384,7 @@ def _is_stuck(task, person, felt):
 
 @njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
-    """Push with the set force, yield sideways, and search on a spiral without sideways force."""
+    """Push with the set force; yield to a lateral force, or search on a spiral without one."""
     force = _perceived_force(task, person, felt, memory)
     if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
         _enter_phase(state, memory, FEELING, time)

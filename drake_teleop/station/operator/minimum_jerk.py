@@ -12,12 +12,12 @@ from drake_teleop.common.compiled import njit
 
 PLAN, PLAN_SIZE = 7, 20
 """Start of the plan in the operator's memory, and its size."""
-STOP = 0.15  # s, stopping time of the hand, E
+STOP = 0.15  # s, stopping time of the hand, estimate
 
 
 @njit(cache=True)
 def plan_at(plan, time, i):
-    """Return position, speed and acceleration of axis i; speed is constant after the plan."""
+    """Return position, speed and acceleration of axis i; after the plan the speed is constant."""
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
     c = plan[2 + 6 * i : 8 + 6 * i]
@@ -32,7 +32,7 @@ def plan_at(plan, time, i):
 
 @njit(cache=True)
 def add_plan_into(memory, time, pose, twist):
-    """Add the plan at `time` to an intended pose (7,) and twist (6,)."""
+    """Add the plan's displacement and velocity at `time` to an intended pose and twist."""
     plan = memory[PLAN : PLAN + PLAN_SIZE]
     for i in range(3):
         x, v, _ = plan_at(plan, time, i)
@@ -42,9 +42,10 @@ def add_plan_into(memory, time, pose, twist):
 
 @njit(cache=True)
 def plan_move(memory, time, length, change, end_speed):
-    """Plan a minimum-jerk motion from the present one by `change` (3,) in `length` [s].
+    """Plan a minimum-jerk motion by the displacement `change` (3,) in the time `length` [s].
 
-    It ends without acceleration and with the velocity `end_speed` (3,).
+    It continues the present motion and ends without acceleration, with the velocity `end_speed`
+    (3,).
     """
     plan, h = memory[PLAN : PLAN + PLAN_SIZE], length
     for i in range(3):
@@ -60,7 +61,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop within `STOP` seconds."""
+    """Plan a stop of the hand within `STOP` seconds."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

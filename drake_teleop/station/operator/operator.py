@@ -33,19 +33,19 @@ from drake_teleop.station.operator.perception import Perception, perceive_into
 from drake_teleop.station.operator.task import Insert, Movement, Press, Reach, Task, Touch
 from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
 
-_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, E
-_MAX_TORQUE_NM = 2.0  # N m, E
+_MAX_FORCE_N = 60.0  # N, largest controlled force of a hand on a stylus, estimate
+_MAX_TORQUE_NM = 2.0  # N m, estimate
 
 
 @dataclass(frozen=True)
 class HandImpedance:
-    """Impedance between intended and actual pose of the hand; all values E (estimates).
+    """Impedance between intended and actual pose of the hand; all values are estimates.
 
     Translational values are common in the haptics literature. The radius of gyration is 30 mm; the
     rotational damping ratio is about 0.7.
     """
 
-    mass: float  # kg, moves with the stylus
+    mass: float  # kg, passive mass that moves with the stylus
     damping: float  # N s/m
     stiffness: float  # N/m
     inertia: float  # kg m^2, about every axis through E, moves with the stylus
@@ -64,7 +64,7 @@ GRIPS = {
 @settings
 @dataclass
 class MinimumJerk:
-    """Move by an offset on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
+    """Displacement on the minimum-jerk profile 10 u^3 - 15 u^4 + 6 u^5."""
 
     t_start: float = quantity(0.0, "s", 0.0, 1e6, "start of the move")
     duration: float = quantity(1.0, "s", 1e-3, 1e6, "duration of the move")
@@ -113,10 +113,10 @@ class OperatorConfig:
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
-    """Return the segments as an array (n, 12) for compiled functions.
+    """Return the segments of the intent as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
-    (3), rotation (3). A minimum-jerk move is a ramp without end, times sin(pi / 2).
+    (3), rotation (3). A minimum-jerk move has no ramp out and the factor sin(pi / 2).
     """
     packed = np.zeros((len(segments), 12))
     for row, segment in zip(packed, segments, strict=True):
@@ -134,7 +134,7 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _ramp(time, length):
-    """Return the minimum-jerk ramp from 0 at time 0 to 1 at `length`, and its rate."""
+    """Return the minimum-jerk ramp from 0 at time 0 to 1 at `length` [s], and its rate."""
     u = time / length
     if u <= 0.0:
         return 0.0, 0.0
@@ -145,10 +145,10 @@ def _ramp(time, length):
 
 @njit(cache=True)
 def intent_into(packed, start, t, pose, twist):
-    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) at time t.
+    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) at time t [s].
 
-    `packed` is of `pack_intent`, `start` (7,) is X_BE before the first segment. Translations add;
-    rotations apply in the order of the list, each about axes of B.
+    `packed` (n, 12) is from `pack_intent`, `start` (7,) is X_BE before the first segment.
+    Translations add; rotations apply in the order of the list, each about axes of B.
     """
     orientation = (start[0], start[1], start[2], start[3])
     omega = (0.0, 0.0, 0.0)
@@ -177,7 +177,7 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion; return whether pose and twist (6,) are valid."""
+    """Write a pose (7,) with unit quaternion; return True if pose and twist (6,) are valid."""
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -210,8 +210,8 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
-        intent_pose, pose: (7,) X_BE.
-        intent_twist, twist: (6,) [v; omega] of E in B.
+        intent_pose, pose: (7,) intended and actual pose X_BE.
+        intent_twist, twist: (6,) intended and actual twist [v; omega] of E in B.
     """
     wanted = (intent_pose[0], intent_pose[1], intent_pose[2], intent_pose[3])
     error = logarithm(multiply(wanted, conjugate((pose[0], pose[1], pose[2], pose[3]))))
@@ -226,7 +226,7 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 @njit(cache=True)
 def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
-    """Write the intended motion: the intent's segments plus the task's plan.
+    """Write the intended pose (7,) and twist (6,): the intent's segments plus the task's plan.
 
     `start` (7,) moves with the twist `moving` (6,). An empty `memory` means no task.
     """
@@ -253,11 +253,11 @@ def _look_feel_decide(
     """Update perception and decision by one step; inputs are not checked.
 
     Args:
-        task, person, senses: of `pack_task`, `pack_person`, `Perception.parameters`.
-        arm: the slave's table.
-        tip: (6,) the tool's tip in S, and its start in W [m].
-        hand_wrench, twist: (6,) of the hand on the stylus and of the stylus, in B.
-        slave_q: (n,) [rad].
+        task, person, senses: from `pack_task`, `pack_person`, `Perception.parameters`.
+        arm: `ArmModel.table` of the slave.
+        tip: (6,) position of the tool's tip in S, and at the start in W [m].
+        hand_wrench, twist: (6,) wrench of the hand on the stylus, twist of the stylus, in B.
+        slave_q: (n,) joint positions of the slave [rad].
         task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
         sights: (m, 3) ring buffer of delayed vision; updated.
         touches: (n, 5) ring buffer of delayed force perception; updated.
@@ -295,7 +295,7 @@ class Operator(LeafSystem):
         - pose_master: (7,) X_BE
         - twist_master: (6,) [v; omega] of E in B
         - intended_pose: (7,) X_BE that replaces the config's intent; may be left unconnected
-        - intended_twist: (6,) its twist [v; omega] of E in B; zero if unconnected
+        - intended_twist: (6,) [v; omega] of intended_pose, at E in B; zero if unconnected
         - slave_state: [q; v] of the slave, for the view of the tool (with a task)
         output_ports:
         - hand_wrench_E: (6,) F_E_B, [f; tau] of the hand on the stylus at E, in B [N, N m]
@@ -307,7 +307,7 @@ class Operator(LeafSystem):
         config: grip, intent and task.
         start: (7,) X_BE to which the intent is relative.
         training, arm, tip: required for a task: station properties, the slave's arm, and the
-            tool's tip in S and at the start in W (6,) [m].
+            position of the tool's tip in S and at the start in W (6,) [m].
 
     Raises:
         DrakeTeleopError: during simulation, if the intended motion is not finite.
@@ -328,7 +328,7 @@ class Operator(LeafSystem):
         self._impedance = np.array(
             [hand.stiffness, hand.damping, hand.rotational_stiffness, hand.rotational_damping]
         )
-        # Segments, their reference pose and its twist.
+        # Segments, their reference pose and the twist of the reference.
         self._intent = (pack_intent(config.intent), np.array(start, dtype=float), np.zeros(6))
         self._intent_pose, self._intent_twist = np.empty(7), np.empty(6)
         self._commanded_pose = np.empty(7)
@@ -358,7 +358,6 @@ class Operator(LeafSystem):
         arm: ArmModel,
         tip: NDArray[np.float64],
     ) -> DependencyTicket:
-        """Declare ports, states and event of the task; return the plan's ticket."""
         senses = config.perception
         nothing_felt = np.array([0.0, 0.0, 0.0, senses.absolute_threshold, 0.0])
         self._sights = _ring_buffer(senses.vision_delay + training.backward, np.zeros(3))

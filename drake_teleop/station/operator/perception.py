@@ -1,8 +1,8 @@
 """Contact detection by the operator, from the perceived force.
 
-The stylus exerts u on the skin: the reaction to the hand's wrench minus the inertial force of the
-hand. u and the hand's velocity v pass a low-pass. The expected force (internal model: Shadmehr and
-Mussa-Ivaldi, J. Neurosci. 14, 1994) is
+The stylus exerts the force u on the skin: the reaction to the hand's wrench minus the inertial
+force of the hand. u and the hand's velocity v pass a low-pass. The expected force (internal model:
+Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994) is
 
     u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
 
@@ -25,15 +25,15 @@ from drake_teleop.common.numeric import checked, checked_rows
 
 Array = NDArray[np.float64]
 
-# Random walks of [m, b, c, u_0 (3)] per second, and initial standard deviations; all E.
+# Standard deviations of [m, b, c, u_0 (3)]: random walk per sqrt(s), and initial; all estimates.
 _WALK = np.array([0.001, 0.01, 0.002, 0.005, 0.005, 0.005])
 _INITIAL_STD = np.array([0.5, 2.0, 0.1, 0.5, 0.5, 0.5])
-_NOISE_DENSITY = 0.007  # N / sqrt(Hz), measurement noise of the filter: 0.1 N at 200 Hz, E
-_FRICTION_SPEED = 0.01  # m/s, v_0, about that of the device's friction
+_NOISE_DENSITY = 0.007  # N / sqrt(Hz), filter's measurement noise: 0.1 N at 200 Hz, estimate
+_FRICTION_SPEED = 0.01  # m/s, v_0, about the value of the device's friction
 _NUM_PARAMETERS = 6
 
-# Memory: filtered u and v, and those a sample ago (12), held |u_expected|, count, estimate
-# [m, b, c, u_0 (3)], and its covariance.
+# Memory: filtered u and v, now and one sample ago (12), held |u_expected|, number of samples,
+# estimate [m, b, c, u_0 (3)], covariance of the estimate.
 _HELD, _COUNT, _THETA = 12, 13, 14
 _P = _THETA + _NUM_PARAMETERS
 MEMORY_SIZE = _P + _NUM_PARAMETERS**2
@@ -59,14 +59,14 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of the perceived position of a slot, lateral")
 
     def parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], decay and smoothing per step."""
+        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per step."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
 
 
 def initial_memory() -> Array:
-    """Return the memory at the start."""
+    """Return the memory (MEMORY_SIZE,) of the force perception at the start."""
     memory = np.zeros(MEMORY_SIZE)
     memory[_P:] = np.diag(_INITIAL_STD**2).ravel()
     return memory
@@ -77,12 +77,12 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
     """Update the force perception by one step; inputs are not checked.
 
     Args:
-        memory: (MEMORY_SIZE,) of `initial_memory`, updated.
-        parameters: (4,) of `Perception.parameters`.
+        memory: (MEMORY_SIZE,) from `initial_memory`, updated.
+        parameters: (4,) from `Perception.parameters`.
         dt: time since the last step [s].
         hand_mass: mass of the hand, whose inertial force is not perceived [kg].
-        hand_force: (3,) of the hand on the stylus [N].
-        velocity: (3,) of the stylus, same axes [m/s].
+        hand_force: (3,) force of the hand on the stylus [N].
+        velocity: (3,) velocity of the stylus, in the same axes [m/s].
         attentive: if false, update only the expectation and detect no contact.
         out: (5,) output: excess force on the hand (3) [N], threshold [N], 1 if detected.
     """
@@ -96,7 +96,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
         memory[i] += smooth * (-hand_force[i] - memory[i])
         memory[3 + i] += smooth * (velocity[i] - memory[3 + i])
     memory[_COUNT] += 1.0
-    # Midway between two samples, where the velocity difference gives the acceleration.
+    # Values midway between two samples, where the velocity difference gives the acceleration.
     speed = _FRICTION_SPEED * _FRICTION_SPEED
     for i in range(3):
         speed += 0.25 * (memory[3 + i] + memory[9 + i]) ** 2
@@ -126,7 +126,7 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
 
 @njit(cache=True)
 def _update_expectation(theta, P, rows, excess, dt):
-    """Update the Kalman filter of a random walk, row by row."""
+    """Update the Kalman filter of the expected force, row by row."""
     gain = np.empty(_NUM_PARAMETERS)
     for j in range(_NUM_PARAMETERS):
         P[j, j] += _WALK[j] * _WALK[j] * dt
@@ -160,15 +160,15 @@ def perceive(
     hand_mass: float,
     attentive: float = 0.3,
 ) -> Array:
-    """Return the contact detection for a record, without reaction time.
+    """Return the contact detection for a recorded motion, without reaction time.
 
     Args:
         t: (N,) evenly spaced times [s].
-        hand_force, velocity: (N, 3) of hand and stylus, in the same axes, as in the signals
-            `hand_wrench_E` and `twist_master`.
+        hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
+            same axes, as in the signals `hand_wrench_E` and `twist_master`.
         perception: parameters.
-        hand_mass: that moves with the stylus [kg].
-        attentive: start of detection [s]; before, only the expectation is updated.
+        hand_mass: mass of the hand that moves with the stylus [kg].
+        attentive: start time of detection [s]; before, only the expectation is updated.
 
     Returns:
         (N, 5) excess of the force on the hand (3) [N], threshold [N], 1 while contact is detected.

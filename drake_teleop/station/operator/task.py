@@ -26,7 +26,7 @@ class _Task:
 @settings
 @dataclass
 class Reach(_Task):
-    """Move the tool's tip into a sphere in free space and keep it there (Fitts)."""
+    """Task: move the tool's tip into a sphere in free space and keep it there (Fitts)."""
 
     width: float = quantity(0.01, "m", 5e-4, 0.5, "diameter of the target")
     dwell: float = quantity(0.3, "s", 0.0, 10.0, "time in the target")
@@ -35,7 +35,7 @@ class Reach(_Task):
 @settings
 @dataclass
 class Touch(_Task):
-    """Approach a surface at the target, detect contact, and stop."""
+    """Task: approach a surface at the target, detect contact, and stop."""
 
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
@@ -46,7 +46,7 @@ class Touch(_Task):
 @settings
 @dataclass
 class Press(_Task):
-    """Approach a surface at the target and press on it with a set force."""
+    """Task: approach a surface at the target and press on it with a set force."""
 
     standoff: float = quantity(
         0.015, "m", 0.0, 0.5, "distance from the target at which the careful approach starts"
@@ -59,7 +59,7 @@ class Press(_Task):
 @settings
 @dataclass
 class Insert(_Task):
-    """Insert the tool into a slot whose mouth is the target, and push it to the floor."""
+    """Task: insert the tool into a slot whose mouth is the target, and push it to the floor."""
 
     timeout: float = quantity(20.0, "s", 0.1, 3600.0, "after which the operator gives up")
     standoff: float = quantity(
@@ -106,7 +106,7 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Check that the target is farther than its tolerance or standoff.
+    """Check that the target is farther from the tool's start than its tolerance or standoff.
 
     Raises:
         DrakeTeleopError: with `where` and the field.

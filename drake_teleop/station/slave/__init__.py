@@ -1,1 +1,1 @@
-"""The slave side: the arm, its inverse kinematics, joint control and wrist sensor."""
+"""Slave side: the arm, its inverse kinematics, joint control, plant and tool."""

@@ -54,18 +54,19 @@ class ArmModel:
     L_0 is the world. Welded bodies belong to their link; bodies beyond S belong to the load.
 
     Attributes:
-        joint_names: from the base outwards.
+        joint_names: names from the base outwards.
         table: (n+1, 26), a row for each joint and a last row for S, fixed to L_n. Columns: 0-8
-            rotation from the joint's frame to the previous link's, by rows; 9-11 its origin there
-            [m]; 12-21 phi [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] of the link about the origin
-            of L_j, in L_j (last row: of the load, in S); 22 rotor inertia [kg m^2]; 23 damping [N m
-            s/rad]; 24 dry friction [N m], for `forward_dynamics` only; 25 is 1 for a prismatic
-            joint. Last row, 22-24: gravity [m/s^2].
-        lower: (n,) joint limits [rad].
-        upper: (n,) joint limits [rad].
-        velocity_limit: (n,) [rad/s], inf if unknown.
-        acceleration_limit: (n,) [rad/s^2], inf if unknown.
-        effort_limit: (n,) [N m], inf if unknown.
+            rotation from the joint's frame to the previous link's, by rows; 9-11 origin of the
+            joint's frame in the previous link's [m]; 12-21 phi [m, m c (3), Ixx, Ixy, Ixz, Iyy,
+            Iyz, Izz] of the link about the origin of L_j, in L_j (last row: of the load, in S);
+            22 rotor inertia [kg m^2]; 23 damping [N m s/rad]; 24 dry friction [N m], for
+            `forward_dynamics` only; 25 is 1 for a prismatic joint. Last row, 22-24: gravity
+            [m/s^2].
+        lower: (n,) lower joint limits [rad].
+        upper: (n,) upper joint limits [rad].
+        velocity_limit: (n,) speed limits [rad/s], inf if unknown.
+        acceleration_limit: (n,) acceleration limits [rad/s^2], inf if unknown.
+        effort_limit: (n,) torque limits [N m], inf if unknown.
         position_index: (n,) indices in the plant's positions.
         velocity_index: (n,) indices in the plant's velocities.
     """
@@ -87,16 +88,16 @@ class ArmModel:
 
     @property
     def phi_load(self) -> Array:
-        """Copy of `load`."""
+        """Copy (10,) of the load's inertial parameters `load`."""
         return self.load.copy()
 
     @property
     def load(self) -> Array:
-        """View (10,) of the load's phi about the origin of S, in S."""
+        """Inertial parameters phi (10,) of the load about So, in S; a view of `table`."""
         return self.table[-1, PHI:ROTOR]
 
     def with_load(self, phi: Array) -> ArmModel:
-        """Return a copy of the arm with the load `phi` (10,)."""
+        """Return a copy of the arm with the load's inertial parameters `phi` (10,)."""
         table = self.table.copy()
         table[-1, PHI:ROTOR] = phi
         return replace(self, table=table)
@@ -104,7 +105,7 @@ class ArmModel:
 
 @njit(cache=True, inline="always")
 def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, float, float]:
-    """Move the pose in x from the previous link to this one; return p_PL_W."""
+    """Replace the pose of the previous link in x by that of link `row`; return p_PL_W."""
     joint = table[row]
     p_PL_P = three(joint, TRANSLATION)
     if joint[SLIDES] != 0.0:
@@ -123,7 +124,7 @@ def _advance_pose(table: Array, row: int, q: float, x: Array) -> tuple[float, fl
 
 @njit(cache=True, inline="always")
 def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: Array) -> None:
-    """Move the state x from the previous link to this one."""
+    """Replace the state of the previous link in x by that of link `row`."""
     r = _advance_pose(table, row, q, x)
     omega, alpha, z = three(x, 3), three(x, 6), (x[14], x[17], x[20])
     add_into(x, 0, plus_cross(cross(alpha, r), omega, cross(omega, r)))
@@ -135,7 +136,7 @@ def _advance_state(table: Array, row: int, q: float, qd: float, qdd: float, x: A
 
 
 def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
-    """Return a = s + g (N, 3) in S for specific forces s (N, 3) at q (N, n)."""
+    """Return the accelerations a = s + g (N, 3) of So, for specific forces s in S, at q (N, n)."""
     out = np.empty_like(s)
     for k in range(len(s)):
         acceleration_into(arm.table, q[k], s[k], out[k])
@@ -144,7 +145,7 @@ def accelerations(arm: ArmModel, q: Array, s: Array) -> Array:
 
 @njit(cache=True)
 def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
-    """Write one row of `accelerations` to out (3,)."""
+    """Write a = s + g (3,) of `accelerations` for one sample to `out`."""
     R_WS, p_WS = np.empty((3, 3)), np.empty(3)
     forward_kinematics(table, q, R_WS, p_WS)
     g = table[table.shape[0] - 1, GRAVITY : GRAVITY + 3]
@@ -154,7 +155,7 @@ def acceleration_into(table: Array, q: Array, s: Array, out: Array) -> None:
 
 @njit(cache=True, inline="always")
 def _set_world_at_rest(table: Array, x: Array) -> None:
-    """Set x to the world frame at rest: s = -g, identity pose."""
+    """Set x to the state of the world frame at rest: s = -g, identity pose."""
     x[:] = 0.0
     for k in range(3):
         x[k] = -table[table.shape[0] - 1, GRAVITY + k]
@@ -184,7 +185,7 @@ def jacobian(table: Array, q: Array, J_out: Array) -> None:
 
 @njit(cache=True)
 def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
-    """Write `jacobian`, and the pose of S to x (21,): p_WS [m] in 9-11, R_WS in 12-20."""
+    """Write `jacobian` to J_out, and the pose of S to x (21,): p_WS [m] in 9-11, R_WS in 12-20."""
     n = table.shape[0] - 1
     x[:] = 0.0
     x[12] = x[16] = x[20] = 1.0
@@ -209,7 +210,7 @@ def jacobian_and_pose(table: Array, q: Array, J_out: Array, x: Array) -> None:
 def sensor_motion(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> None:
     """Write the motion that an ideal sensor at S measures to out (21,).
 
-    It has s [m/s^2], omega_WS and alpha_WS in S, then p_WS [m] and R_WS by rows.
+    The output is s [m/s^2], omega_WS and alpha_WS in S, then p_WS [m] and R_WS by rows.
     """
     n = table.shape[0] - 1
     _set_world_at_rest(table, out)
@@ -236,7 +237,7 @@ def link_motions(table: Array, q: Array, v: Array, vdot: Array, out: Array) -> N
 
 @njit(cache=True, inline="always")
 def _link_wrench(table: Array, row: int, x: Array, link: Array) -> None:
-    """Fill link[row]: z axis and origin of L, inertial force and moment about Wo, Eqs. (1)-(2)."""
+    """Write a link's z axis, origin, inertial force and moment about Wo, Eqs. (1)-(2)."""
     phi, wrench, R_WL, p_WL = table[row, PHI:], link[row], nine(x, 12), three(x, 9)
     R_LW, m, h, inertia = transposed(R_WL), phi[0], three(phi, 1), symmetric(phi, 4)
     s, omega, alpha = apply(R_LW, three(x, 0)), apply(R_LW, three(x, 3)), apply(R_LW, three(x, 6))
@@ -300,7 +301,7 @@ def holding_torque(arm: ArmModel, q: Array) -> Array:
 
 @njit(cache=True, inline="always")
 def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None:
-    """Add a link's inertia about Wo, in W, in the order of phi."""
+    """Add a link's inertial parameters about Wo, in W, to `inertia`, in the order of phi."""
     phi, p = table[row, PHI:], three(x, 9)
     m, h, about_Lo = phi[0], apply(nine(x, 12), three(phi, 1)), symmetric(phi, 4)
     inertia[0] += m
@@ -321,7 +322,7 @@ def _composite_inertia(table: Array, row: int, x: Array, inertia: Array) -> None
 
 @njit(cache=True)
 def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
-    """Compute the lower half of M (n, n) by composite rigid bodies; overwrite `link`.
+    """Write the lower half of the mass matrix M (n, n) by composite rigid bodies; overwrite `link`.
 
     Featherstone, Rigid Body Dynamics Algorithms (2008), section 6.2.
     """
@@ -352,7 +353,7 @@ def _mass_matrix(table: Array, link: Array, inertia: Array, M: Array) -> None:
 
 @njit(cache=True)
 def solve_spd(M: Array, x: Array) -> None:
-    """Replace x by M^-1 x (Cholesky); rounds differently from `vectors.solve`."""
+    """Replace x by M^-1 x (Cholesky method); the rounding differs from that of `vectors.solve`."""
     n = x.shape[0]
     for j in range(n):
         for k in range(j):
@@ -374,7 +375,7 @@ def solve_spd(M: Array, x: Array) -> None:
 def forward_dynamics(
     table: Array, q: Array, v: Array, tau: Array, wrench_W: Array, vdot_out: Array
 ) -> None:
-    """Write accelerations: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
+    """Write joint accelerations vdot: M(q) vdot = tau + tau_friction(v) + J^T F - h(q, v).
 
     F (6,) is the wrench on the load, about the world's origin, in W [N, N m].
     """
@@ -404,7 +405,7 @@ def forward_dynamics(
 
 @njit(cache=True)
 def pose_into(arm, q, pose):
-    """Write X_WS (7,) [qw qx qy qz px py pz] of the arm table at q (n,) [rad]."""
+    """Write the pose X_WS (7,) [qw qx qy qz px py pz] of an arm table at q (n,) [rad]."""
     R, p = np.empty((3, 3)), np.empty(3)
     forward_kinematics(arm, q, R, p)
     orientation = quaternion_of(R)
@@ -415,7 +416,7 @@ def pose_into(arm, q, pose):
 
 
 class ForwardKinematics(LeafSystem):
-    """Pose of the slave's sensor frame.
+    """Block that converts joint positions to the pose of the slave's sensor frame.
 
     .. pydrake_system::
 

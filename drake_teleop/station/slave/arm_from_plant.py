@@ -48,13 +48,13 @@ def ArmModelFromPlant(
     model_instance: ModelInstanceIndex,
     sensor_frame_name: str = "sensor",
 ) -> ArmModel:
-    """Return the chain from the world to a sensor frame of a finalized plant.
+    """Return the chain from the world to the sensor frame of a finalized plant.
 
     Joints beyond the sensor frame are held at their default positions.
 
     Raises:
-        DrakeTeleopError: if the frame is missing, or its path is not a chain of welds, revolute and
-            prismatic joints without branches that move.
+        DrakeTeleopError: if the frame is missing, or the path to it is not a chain of welds,
+            revolute and prismatic joints without branches that move.
     """
     if not plant.HasFrameNamed(sensor_frame_name, model_instance):
         raise DrakeTeleopError(
@@ -174,7 +174,7 @@ def _table_row(
 
 
 def _phi_of_body(M_BBo_B: SpatialInertia, X_LB: RigidTransform) -> Array:
-    """Return phi (10,) of a body about the origin of L, in L."""
+    """Return the inertial parameters phi (10,) of a body about the origin of L, in L."""
     M_BBo_L = M_BBo_B.ReExpress(X_LB.rotation())
     M_BLo_L = M_BBo_L.Shift(np.negative(X_LB.translation()))
     I_BLo_L = M_BLo_L.CalcRotationalInertia().CopyToFullMatrix3()
@@ -197,7 +197,7 @@ def _effort_limit(plant: MultibodyPlant, joint: Joint) -> float:
 def with_all_limits(
     arm: ArmModel, where: str, acceleration: tuple[float, ...] = (), hint: str = ""
 ) -> tuple[ArmModel, list[str]]:
-    """Return the arm with every limit set, and one text per assumption.
+    """Return the arm with defaults for missing limits, and one text per assumption.
 
     `acceleration` has 1 or n limits [rad/s^2] instead of the model's; `hint` is appended to the
     assumption about accelerations.
@@ -270,5 +270,5 @@ def with_all_limits(
 
 
 def _is_specified(limits: Array) -> NDArray[np.bool_]:
-    """Return True for specified limits; exporters write 0 for unknown ones."""
+    """Return (n,) booleans: True for specified limits; exporters write 0 for unknown ones."""
     return np.isfinite(limits) & (limits > 0)

@@ -1,7 +1,7 @@
 """Contact wrench from Drake's contact results, for contacts outside the compiled law.
 
 Examples are meshes, cylinders and hydroelastic contact. The plant stops at each sample of the
-sensor, which takes longer.
+sensor, which slows the simulation.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def contact_wrench_W(
 ) -> NDArray[np.float64]:
     """Return the wrench (6,) of all contacts on the tool, about the world's origin, in W [N, N m].
 
-    `bodies` are the indices of the tool, `shapes` its collision shapes.
+    `bodies` contains indices of the tool's bodies, `shapes` identifiers of its collision shapes.
     """
     wrench_W = np.zeros(6)
     for k in range(results.num_point_pair_contacts()):
@@ -47,13 +47,13 @@ def contact_wrench_W(
 
 
 class DrakeContact(LeafSystem):
-    """True contact wrench for the log, see `contact_wrench_W`.
+    """Block that outputs the true contact wrench for the log, see `contact_wrench_W`.
 
     .. pydrake_system::
 
         name: DrakeContact
         input_ports:
-        - contact_results: the plant's
+        - contact_results: contact results of the plant
         output_ports:
         - true_contact_wrench_W: on the tool, [f; tau] about the world's origin, in W
     """
@@ -75,7 +75,7 @@ Array = NDArray[np.float64]
 
 
 class ContactTwin:
-    """Second copy of the plant, for contact between the states of the simulated one."""
+    """Copy of the plant that computes contact at states other than the simulated plant's."""
 
     def __init__(self, config: Slave, environment: Environment | None, q_start: Array) -> None:
         builder = DiagramBuilder()
@@ -87,8 +87,8 @@ class ContactTwin:
     def wrench_W(self, x: Array, state: Array) -> Array:
         """Return the contact wrench (6,) on the tool, about the world's origin, in W.
 
-        x is [q, leaf deflection, v, its rate]; `state` is the plant's [q; v], empty without other
-        moving bodies.
+        x is [q, leaf deflection, v, deflection rate]; `state` is the plant's [q; v], empty without
+        other moving bodies.
         """
         plant, context, contact = self._slave.plant, self._context, self._slave.contact
         half = len(x) // 2

@@ -28,9 +28,9 @@ _Q_HOME_REFERENCE = np.array([0.0, -0.5, -1.8, 0.0, -0.9, np.pi])
 def tool_down(
     arm: ArmModel, position: NDArray[np.float64], R_WS: RotationMatrix = R_WS_HOME
 ) -> tuple[NDArray[np.float64], IkStatus]:
-    """Return joint positions (n,) [rad] with S at `position` [m, in W], and their status.
+    """Return joint positions (n,) [rad] for S at `position` [m, in W] and `R_WS`, with `IkStatus`.
 
-    Without a closed form, it avoids joint limits where possible.
+    Without a closed form, the search avoids joint limits where possible.
     """
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
@@ -45,7 +45,7 @@ def tool_down(
 
 
 def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
-    """Return joint positions (n,) [rad] with S at `position` [m, in W], z_S down."""
+    """Return joint positions (n,) [rad] with S at `position` [m, in W], z_S down, or raise."""
     q, status = tool_down(arm, np.array(position))
     if has_closed_form(arm):
         remedy = "move it nearer to (0.55, 0, 0.45)"
@@ -61,7 +61,7 @@ def home_position(arm: ArmModel, position: list[float]) -> NDArray[np.float64]:
 
 
 def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
-    """Return the start posture (n,) [rad], or raise DrakeTeleopError."""
+    """Return the configured start posture (n,) [rad], or raise DrakeTeleopError."""
     if not slave.home:
         return home_position(arm, slave.position)
     if len(slave.home) != arm.num_joints:
@@ -82,7 +82,7 @@ def start_posture(slave: Slave, arm: ArmModel) -> NDArray[np.float64]:
 
 
 def check_strength(arm: ArmModel, q: NDArray[np.float64]) -> None:
-    """Raise DrakeTeleopError for a joint without inertia or with too weak a motor."""
+    """Raise DrakeTeleopError for a joint without inertia or with a motor too weak to hold q."""
     if not np.linalg.eigvalsh(mass_matrix(arm, q))[0] > _MIN_INERTIA:
         raise DrakeTeleopError(
             "the mass matrix is singular: the links have too little inertia",

@@ -34,12 +34,12 @@ FLANGE = 0.085
 
 # Distance from the first axis [m], or sin q5, below which the arm is singular.
 _SINGULAR_THRESHOLD = 1e-9
-# Tolerance of a limit [rad]; the angle is clipped to it.
+# Tolerance of a joint limit [rad]; the angle is clipped to the limit.
 _LIMIT_TOLERANCE_RAD = 1e-9
 
 
 class IkStatus(IntEnum):
-    """Result of an inverse kinematics.
+    """Status of an inverse kinematics; the reference is the posture where the search starts.
 
     The numeric method returns the nearest pose found. It reports WRIST_SINGULAR for nearly coplanar
     last three axes and SHOULDER_SINGULAR at other singularities.
@@ -48,9 +48,9 @@ class IkStatus(IntEnum):
     OK = 0
     """The pose is met."""
     WRIST_SINGULAR = 1
-    """The pose is met; axes 4 and 6 are aligned, q4 is kept and q6 completes the rotation."""
+    """The pose is met; axes 4 and 6 are aligned: q4 is kept and q6 completes the rotation."""
     SHOULDER_SINGULAR = 2
-    """The pose is met; the wrist centre is on the first axis and q1 is kept."""
+    """The pose is met; the wrist centre is on the first axis: q1 is kept."""
     OUT_OF_REACH = 3
     """The orientation is met; the wrist centre moves towards the shoulder into reach."""
     JOINT_LIMIT = 4
@@ -70,7 +70,7 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 @njit(cache=True)
 def _branches(R: Array, p: Array, q1_kept: float, q4_kept: float, clamp: bool, q: Array) -> int:
-    """Fill q (8, 6) as `inverse_kinematics`; ``clamp`` moves the wrist centre into reach."""
+    """Write all solutions to q (8, 6), see `inverse_kinematics`; `clamp` enforces the reach."""
     status = _OK
     x = p[0] - FLANGE * R[0, 2]
     y = p[1] - FLANGE * R[1, 2]
@@ -146,7 +146,6 @@ def _wrap_to_limits(angle: float, near: float, lower: float, upper: float) -> fl
 def _nearest_branch(
     R: Array, p: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Compute `nearest_branch` into q (6,); return an `IkStatus`."""
     if not np.isfinite(reference.sum()):
         q[:] = np.nan
         return _BAD_POSE
@@ -180,7 +179,7 @@ def _nearest_branch(
 def solve_pose_command(
     pose: Array, reference: Array, lower: Array, upper: Array, max_step: float, q: Array
 ) -> int:
-    """Write `nearest_branch` of pose (7,) [qw, qx, qy, qz, px, py, pz] to q (6,).
+    """Solve `nearest_branch` for a pose (7,) [qw, qx, qy, qz, px, py, pz]; write q (6,).
 
     The quaternion has any nonzero length. Returns the `IkStatus` as a plain integer.
     """
@@ -195,7 +194,7 @@ def solve_pose_command(
 
 
 def inverse_kinematics(R_WS: Array, p_WS: Array) -> Array:
-    """Return all solutions, ignoring joint limits.
+    """Return all joint positions for a pose, ignoring joint limits.
 
     An undetermined joint is 0: q1 with the wrist centre on the first axis, q4 with axes 4 and 6
     aligned.
@@ -217,16 +216,16 @@ def nearest_branch(
     upper: Array,
     max_step: float = np.inf,
 ) -> tuple[Array, IkStatus]:
-    """Return the solution within the limits nearest to a reference [rad], and its status.
+    """Return the solution within the limits nearest to a reference [rad], and the `IkStatus`.
 
     For a finite reference the result is finite and within the limits. Out of reach, the wrist
     centre moves towards the shoulder onto the boundary. A singular joint keeps its reference.
-    Without an admissible branch the reference is returned.
+    Without an admissible branch the reference, clipped to the limits, is returned.
 
     Args:
-        R_WS: (3, 3).
-        p_WS: (3,) [m].
-        q_reference: (6,) [rad], normally the current positions.
+        R_WS: (3, 3) orientation of S.
+        p_WS: (3,) position of S [m].
+        q_reference: (6,) joint positions [rad], normally the current ones.
         lower, upper: (6,) joint limits [rad].
         max_step: largest distance of a joint from the reference [rad].
     """
@@ -238,7 +237,7 @@ def nearest_branch(
 
 
 def has_closed_form(arm: ArmModel) -> bool:
-    """Return True if this closed form inverts two poses of the arm."""
+    """Return whether the closed form reproduces two test postures of the arm."""
     if arm.num_joints != 6 or arm.table[:, SLIDES].any():
         return False
     R_WS, p_WS, endless = np.empty((3, 3)), np.empty(3), np.full(6, np.inf)
@@ -251,7 +250,7 @@ def has_closed_form(arm: ArmModel) -> bool:
 
 
 class InverseKinematics(LeafSystem):
-    """Stateless conversion of a commanded pose to joint positions.
+    """Block that converts a commanded pose to joint positions in closed form, without state.
 
     At a joint limit the arm waits instead of changing its configuration, see `MAX_STEP`.
 

@@ -1,4 +1,4 @@
-"""Sources of joint commands by name, and the monitor of joint limits and inverse kinematics."""
+"""Sources of joint commands, by name, and the monitor of joint limits and inverse kinematics."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ IK_METHODS: dict[str, Callable[[ArmModel, Array, float], LeafSystem]] = {
     "closed_form": lambda arm, q_start, period: InverseKinematics(arm.lower, arm.upper),
     "numeric": NumericInverseKinematics,
 }
-"""Constructors by name, called with the arm, its start (n,) [rad] and the period [s]; the systems
-have the ports of `InverseKinematics`."""
+"""Constructors of blocks by name, called with the arm, the start posture (n,) [rad] and the period
+[s]; the blocks have the ports of `InverseKinematics`."""
 
 # Tolerance as a share of the range: a joint commanded to its limit overshoots slightly, and the
 # mechanical stops of commercial arms are farther out.
@@ -37,7 +37,11 @@ _RANGE_TOLERANCE = 0.01
 
 
 def ik_method_name(name: str, arm: ArmModel) -> str:
-    """Return the key in `IK_METHODS` for `name`; raise DrakeTeleopError without a closed form."""
+    """Return the key in `IK_METHODS` for the setting `name`, for this arm.
+
+    Raises:
+        DrakeTeleopError: if `name` is "closed_form" and the arm has no closed form.
+    """
     if name == AUTOMATIC:
         return "closed_form" if has_closed_form(arm) else "numeric"
     if name == "closed_form" and not has_closed_form(arm):
@@ -50,7 +54,7 @@ def ik_method_name(name: str, arm: ArmModel) -> str:
 
 
 class JointFollower(LeafSystem):
-    """Limits of position and speed for the leader's joints; invalid input holds the command.
+    """Block that limits position and speed of the leader's joints; invalid input keeps the command.
 
     .. pydrake_system::
 
@@ -94,7 +98,7 @@ class JointFollower(LeafSystem):
 
 
 class JointTrajectory(LeafSystem):
-    """One period of an excitation trajectory from `start` [s], at rest before and after.
+    """Block that plays one period of an excitation trajectory from `start` [s], else rests.
 
     .. pydrake_system::
 
@@ -116,19 +120,19 @@ class JointTrajectory(LeafSystem):
 
 
 class SlaveMonitor(LeafSystem):
-    """Periodic check that joints stay within their range plus 1 % of it.
+    """Block that checks periodically that joints stay within their range plus 1 % of it.
 
     .. pydrake_system::
 
         name: SlaveMonitor
         input_ports:
         - slave_state: [q; v] of the arm [rad, rad/s]
-        - ik_status: of the inverse kinematics (optional)
+        - ik_status: status of the inverse kinematics (optional)
         output_ports:
         - ik_status: last value, for the log
 
     Raises:
-        DrakeTeleopError: from the simulation, when a joint is outside or not finite.
+        DrakeTeleopError: during simulation, if a joint is outside this range or not finite.
     """
 
     __slots__ = ONE_DICT

@@ -60,7 +60,7 @@ class JointControlConfig:
 
     @property
     def lag(self) -> float:
-        """Approximate delay of a steady motion [s]."""
+        """Approximate delay of the joints behind a steadily moving command [s]."""
         interface = self.position_interface
         if interface is not None:
             return interface.lookahead + interface.dead_time + 1 / interface.command_hz
@@ -85,7 +85,7 @@ class JointControlConfig:
             interface.check(f"{where}.interface", rate)
 
     def check_computed_torque(self, what: str) -> None:
-        """Raise DrakeTeleopError, with subject `what`, if the servo is not computed torque."""
+        """Raise DrakeTeleopError if the servo is not computed torque; `what` names the caller."""
         if self.servo != COMPUTED_TORQUE:
             raise DrakeTeleopError(
                 f"{what} does not support the servo {self.servo}",
@@ -101,8 +101,9 @@ def joint_control_torque(
 ):  # fmt: skip
     """Write tau = ID(q, v, kv (clip(kp (q_command - q)) - v)) (n,), within the torque limits.
 
-    `state` is [q; v], `scratch` (3 n,); gains in 1/s. Invalid encoders: torque for rest at the
-    command. Invalid command: the last torque.
+    ID is the inverse dynamics; `state` is [q; v], `scratch` (3 n,); gains in 1/s. If encoder
+    readings are invalid, the torque compensates gravity at the commanded posture. If the command
+    is invalid, the last torque is kept.
     """
     if not sound(command):
         return
@@ -122,7 +123,7 @@ def joint_control_torque(
 
 
 def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, float, Array, Array]:
-    """Return gains and limits for `joint_control_torque`."""
+    """Return gains kp, kv and limits of speed and torque for `joint_control_torque`."""
     return (
         2 * np.pi * config.position_bandwidth_hz,
         2 * np.pi * config.velocity_bandwidth_hz,
@@ -132,16 +133,17 @@ def servo_numbers(arm: ArmModel, config: JointControlConfig) -> tuple[float, flo
 
 
 class JointControl(LeafSystem):
-    """Sampled joint position controller.
+    """Sampled joint position controller (computed torque).
 
-    With invalid encoders the motors compensate gravity and the arm drifts without brakes.
+    While encoder readings are invalid, the motors only compensate gravity; an arm that has no
+    brakes drifts.
 
     .. pydrake_system::
 
         name: JointControl
         input_ports:
         - joint_command: (n,) [rad]
-        - slave_state: [q; v] of the arm [rad, rad/s]
+        - slave_state: (2 n,) [q; v] of the arm [rad, rad/s]
         output_ports:
         - joint_torque: (n,) [N m], held between samples
 
@@ -180,7 +182,7 @@ class JointControl(LeafSystem):
 def MakeJointControl(
     arm: ArmModel, config: JointControlConfig, period: float, q_start: Array
 ) -> LeafSystem:
-    """Return the block for the servo of `config`; arguments as for `JointControl`."""
+    """Return the block of the configured servo; arguments as for `JointControl`."""
     interface = config.position_interface
     if interface is None:
         return JointControl(arm, config, period, q_start)
@@ -188,12 +190,12 @@ def MakeJointControl(
 
 
 def default_interface(block: Mapping[str, Any] | None) -> PositionInterface | None:
-    """Return the default `interface` of the servo that a `joint_control` block names."""
+    """Return the default `interface` of the servo that a `joint_control` block names, or None."""
     return copy.deepcopy(INTERFACES.get(str((block or {}).get("servo"))))
 
 
 def mass_matrix(arm: ArmModel, q: Array) -> Array:
-    """Return M(q) (n, n) with rotors and tool, by inverse dynamics of unit accelerations."""
+    """Return the mass matrix M(q) (n, n) with rotors and tool, from unit joint accelerations."""
     zeros, weight = np.zeros(len(q)), holding_torque(arm, q)
     columns = np.empty((len(q), len(q)))
     for unit, column in zip(np.eye(len(q)), columns, strict=True):
@@ -203,9 +205,10 @@ def mass_matrix(arm: ArmModel, q: Array) -> Array:
 
 
 def operational_inertia(arm: ArmModel, q: Array) -> Array:
-    """Return Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W; q is not singular.
+    """Return the inertia Lambda = (J M^-1 J^T)^-1 (6, 6) at So, translation first, in W.
 
-    Khatib, A unified approach for motion and force control of robot manipulators (1987).
+    q must not be singular. Khatib, A unified approach for motion and force control of robot
+    manipulators (1987).
     """
     n = arm.num_joints
     still, J = np.zeros(n), np.empty((6, n))
@@ -220,12 +223,14 @@ def operational_inertia(arm: ArmModel, q: Array) -> Array:
 
 
 class ServoAtTool(NamedTuple):
-    """Servo with the wrench K (x_command - x) - D v; two values each, translation and rotation.
+    """Joint servo as a wrench at the tool: K (x_command - x) - D v.
+
+    Each attribute has two values, for translation and rotation.
 
     Attributes:
         stiffness: K [N/m, N m/rad].
         damping: D [N s/m, N m s/rad].
-        mass: of arm and tool [kg, kg m^2].
+        mass: mass and inertia of arm and tool [kg, kg m^2].
     """
 
     stiffness: list[float]
@@ -238,7 +243,7 @@ def servo_at_tool(arm: ArmModel, q: Array, config: JointControlConfig) -> ServoA
 
     Mass m and inertia J are the smallest common multiple of the largest eigenvalues of the two
     blocks of Lambda with diag(m, m, m, J, J, J) >= Lambda. They bound the kinetic energy. The joint
-    loops accelerate with kv (kp (x_command - x) - v), hence K and D.
+    loops accelerate with kv (kp (x_command - x) - v), which gives K and D.
 
     Raises:
         DrakeTeleopError: for a servo other than computed torque.

@@ -20,12 +20,12 @@ from drake_teleop.common.errors import DrakeTeleopError
 Array = NDArray[np.float64]
 
 FRICTION_SPEED = 2e-3
-"""v_0 [rad/s, m/s] (E)."""
+"""Speed v_0 of the friction law [rad/s, m/s], estimate."""
 
 
 @njit(cache=True)
 def dry_friction(coulomb: float, speed: float) -> float:
-    """Return the friction torque [N m] for `coulomb` [N m] at a speed [rad/s]."""
+    """Return the friction torque [N m] at a speed [rad/s]; `coulomb` is its limit [N m]."""
     return -coulomb * np.tanh(speed / FRICTION_SPEED)
 
 
@@ -38,7 +38,7 @@ def _friction_into(coulomb, index, state, force):
 
 
 def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
-    """Return the friction (n,) [N m] from 0, 1 or n values; raise DrakeTeleopError otherwise."""
+    """Return friction torques (n,) [N m] from 0, 1 or n values, else raise DrakeTeleopError."""
     n = len(joints)
     if len(values) not in (0, 1, n):
         raise DrakeTeleopError(
@@ -50,7 +50,7 @@ def friction_of_joints(values: list[float], joints: tuple[str, ...]) -> Array:
 
 
 class JointFriction(LeafSystem):
-    """Dry friction of the arm as generalized force on the plant.
+    """Block that applies the arm's dry friction as generalized force to the plant.
 
     .. pydrake_system::
 
@@ -58,7 +58,7 @@ class JointFriction(LeafSystem):
         input_ports:
         - slave_state: [q; v] of the arm [rad, rad/s]
         output_ports:
-        - generalized_force: of the whole plant [N m]
+        - generalized_force: force on the whole plant [N m]
 
     `index` contains the joints' indices in the plant's velocities.
     """
@@ -84,7 +84,7 @@ def AddJointFriction(
     coulomb: Array,
     index: NDArray[np.intp],
 ) -> None:
-    """Add "joint_friction" and connect it to the plant with the arm `instance`."""
+    """Add the block "joint_friction" of the arm `instance` and connect it to the plant."""
     friction = builder.AddNamedSystem(
         "joint_friction", JointFriction(coulomb, index, plant.num_velocities())
     )

@@ -26,7 +26,7 @@ _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 def remove_unusable_meshes(
     root: ElementTree.Element, files: ModelFiles, folder: Path
 ) -> dict[str, list[str]]:
-    """Remove shapes without a usable mesh; return the affected links by fault.
+    """Remove shapes without a usable mesh; return the names of the affected links by fault.
 
     STL files become convex hulls, because Drake does not read STL; other paths become absolute.
     A lost visual is reported only for links without shapes, a lost collision shape only for links
@@ -52,7 +52,7 @@ def remove_unusable_meshes(
 
 
 def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
-    """Return the fault of a shape's mesh; if none, make its path absolute."""
+    """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
@@ -77,7 +77,7 @@ def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> 
 
 
 def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
-    """Write the convex hull of an STL file as OBJ; return None if it is degenerate."""
+    """Write the convex hull of an STL file as OBJ; return None for a degenerate hull."""
     from scipy.spatial import ConvexHull, QhullError
 
     data = path.read_bytes()
@@ -117,7 +117,7 @@ def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
 
 
 def _in_body(frame: Frame, body: RigidBody, inboard: dict[BodyIndex, Joint]) -> RigidTransform:
-    """Return X_BodyFrame of a frame on the body, or on a body welded to it."""
+    """Return the pose X_BodyFrame of a frame on the body, or on a body welded to it."""
     pose, on = frame.GetFixedPoseInBodyFrame(), frame.body()
     while on.index() != body.index():
         weld = inboard[on.index()]

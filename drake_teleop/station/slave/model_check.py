@@ -25,7 +25,7 @@ _QUANTITY_TAGS |= {"drake:rotor_inertia", "drake:gear_ratio"}
 WORLD = "world"  # name in URDF and SDF
 _JOINTS = ("joint", "drake:joint")
 _MIN_LENGTH_M, _MAX_LENGTH_M = 0.01, 50.0  # lengths of an arm [m]
-_MAX_VALUE = 1e6  # of `_QUANTITY_TAGS` in SI units; limits may be larger
+_MAX_VALUE = 1e6  # largest number in `_QUANTITY_TAGS`, SI units; limits may be larger
 # Accepted violation of the triangle inequality, as a share of the largest moment.
 _INERTIA_TOLERANCE = 1e-3
 _NEGLIGIBLE_INERTIA = 1e-15  # kg m^2, accepted violation: less than a grain of dust
@@ -34,7 +34,7 @@ _NEGLIGIBLE_INERTIA = 1e-15  # kg m^2, accepted violation: less than a grain of 
 def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
     """Check tree, limits and masses of a URDF or SDF; correct inertias in place.
 
-    `sensor` is the arm's last link, or a link fixed to it, if the file is the arm's.
+    For an arm, `sensor` names the last link, or a link fixed to it.
 
     Returns:
         Assumptions: links without mass or inertia, corrections, and elements that Drake ignores.
@@ -86,7 +86,7 @@ def check_model(root: Element, where: str, sensor: str = "") -> list[str]:
 
 
 def check_tree(joints: Iterable[tuple[str, str, str]], where: str) -> dict[str, tuple[str, str]]:
-    """Check joints (name, parent, child); return parent and joint of each child.
+    """Check that joints (name, parent, child) form a tree; return each child's parent and joint.
 
     Raises:
         DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
@@ -181,7 +181,7 @@ def _check_limit(limit: Element, where: str) -> None:
 
 
 def _is_massless(link: Element, where: str, moves: bool) -> bool:
-    """Return True if a link with shapes, or moved by a joint, has no inertia."""
+    """Return whether a link that has shapes, or is moved by a joint, has no mass or inertia."""
     place = f"{where}: link {link.get('name', '')}"
     inertial = link.find("inertial")
     mass_element = None if inertial is None else inertial.find("mass")
@@ -202,7 +202,7 @@ def _is_massless(link: Element, where: str, moves: bool) -> bool:
 
 
 def _links_at_rest(root: Element, sensor: str) -> set[str]:
-    """Return the links that no joint up to the sensor moves."""
+    """Return the names of the links that no joint up to the sensor moves."""
     joints = {
         _joint_end(joint, "child"): (_joint_end(joint, "parent"), joint.get("type") != "fixed")
         for joint in (each for tag in _JOINTS for each in root.iter(tag))
@@ -224,7 +224,7 @@ def _links_at_rest(root: Element, sensor: str) -> set[str]:
 def _correct_inertia(link: Element, where: str, *, refused: bool) -> bool:
     """Correct an invalid inertia by equal additions to its diagonal; return True if changed.
 
-    If `refused`, a correction beyond rounding raises a DrakeTeleopError.
+    If `refused`, a correction larger than rounding raises a DrakeTeleopError.
     """
     element = link.find("inertial/inertia")
     if element is None:
@@ -255,7 +255,7 @@ def _entry(inertia: Element, name: str) -> str:
 
 
 def _moments(inertia: Element, where: str) -> NDArray[np.float64]:
-    """Return the principal moments (3,), ascending."""
+    """Return the principal moments of inertia (3,), ascending."""
     xx, xy, xz, yy, yz, zz = (_number(_entry(inertia, name), name, where) for name in _INERTIAS)
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     return np.asarray(np.linalg.eigvalsh(tensor), dtype=np.float64)
@@ -272,7 +272,7 @@ def _number(text: str, name: str, where: str) -> float:
 
 
 def check_size(arm: ArmModel, where: str) -> None:
-    """Raise DrakeTeleopError for an implausible length, or a mass far from its joint."""
+    """Raise DrakeTeleopError for an implausible arm length, or a mass far from its joint."""
     length = float(np.linalg.norm(arm.table[1:, TRANSLATION:PHI], axis=1).sum())
     remedy = "give lengths in m, and inertias in kg m^2"
     if 0.0 < length < _MIN_LENGTH_M or length > _MAX_LENGTH_M:

@@ -14,7 +14,7 @@ XACRO = "run it through xacro first, and give the URDF that comes out"
 
 
 def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
-    """Return XML roots by file: of the model, or of the models that directives add."""
+    """Return the XML root by file: of the model, or of the models that its directives add."""
     kind = path.suffix.lower()
     if kind == ".yaml":
         data = read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
@@ -30,7 +30,7 @@ def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
 
 
 def unsupported_joints(root: Element) -> dict[str, str]:
-    """Return properties that Drake ignores: dependent joints and links that float on a link."""
+    """Return, by joint or link, a property that Drake ignores: coupling, spring or free joint."""
     found: dict[str, str] = {}
     for joint in root.iter("joint"):
         if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
@@ -49,7 +49,7 @@ def unsupported_joints(root: Element) -> dict[str, str]:
 
 
 def floating_links(root: Element) -> list[str]:
-    """Return links that float in the world."""
+    """Return the names of links that float freely in the world."""
     joints = [joint for joint in root.iter("joint") if joint.get("type") == "floating"]
     ends = [(joint.find("parent"), joint.find("child")) for joint in joints]
     urdf = [c.get("link", "") for p, c in ends if p is not None and c is not None]
@@ -63,7 +63,7 @@ def _is_free(joint: Element | None) -> bool:
 
 
 def effort_limits(root: Element) -> dict[str, float]:
-    """Return torque limits of URDF joints; Drake drops them without a transmission."""
+    """Return torque limits by name of URDF joint; Drake drops limits without a transmission."""
     limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
     return {
         name: float(limit.get("effort", "0"))

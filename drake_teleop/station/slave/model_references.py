@@ -25,7 +25,7 @@ from drake_teleop.common.texts import read_yaml
 # Limits for all files together (repeated includes count again), and bytes of one text file.
 _MAX_FILES, _MAX_BYTES, _MAX_TEXT = 2000, 500_000_000, 50_000_000
 _MAX_NAME_LENGTH = 4096
-_MAX_DEPTH = 20  # of nested includes
+_MAX_DEPTH = 20  # largest depth of nested includes
 _BINARY = (".obj", ".glb", ".bin", ".stl", ".vtk", ".png", ".jpg", ".jpeg", ".ktx2", ".dae")
 _PACKAGE = "package.xml"
 _ATTRIBUTE = re.compile(r"(file|filename|uri|url|file(right|left|up|down|front|back))\Z")
@@ -36,7 +36,7 @@ _OBJ = re.compile(rb"^[ \t]*mtllib[ \t]+(.*)$", re.M)
 
 
 class ModelFiles:
-    """Files that a model may read; `packages` contains folders by package name."""
+    """Access to the files that a model may read; `packages` contains folders by package name."""
 
     def __init__(self, model: Path, package_paths: tuple[Path, ...]) -> None:
         self._model, self._folder = model, model.resolve().parent
@@ -62,7 +62,7 @@ class ModelFiles:
         self._bases = {""}
 
     def share_packages(self, known: PackageMap) -> None:
-        """Merge packages with Drake's map; remove the one that Drake downloads."""
+        """Merge `packages` with Drake's map; remove the package that Drake downloads."""
         known.Remove("drake_models")
         for name, folder in self.packages.items():
             if known.Contains(name):  # the model's package replaces Drake's
@@ -88,7 +88,8 @@ class ModelFiles:
         """Check a file and all files that it references, except meshes of the model's own links.
 
         Raises:
-            DrakeTeleopError: for a file outside, a cycle, or too many or too large files.
+            DrakeTeleopError: for a file outside the allowed folders, a cycle, or too many or too
+                large files.
         """
         folders = 0
         while folders < len(self._bases):  # MJCF folders also apply to files seen before
@@ -99,7 +100,7 @@ class ModelFiles:
         _check_size(*self._total, self._model)
 
     def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
-        """Return the number of files and bytes that reading a file takes."""
+        """Check a file; return the number of files and bytes that reading it takes."""
         real, where = path.resolve(), str(including[-1] if including else self._model)
         roots = (*self._roots, *self.packages.values())
         if not any(real.is_relative_to(root) for root in roots):
@@ -163,7 +164,7 @@ class ModelFiles:
 
 
 def _existing_paths(path: Path | None) -> list[Path]:
-    """Return the path if it exists, and as Drake normalizes it (a/../b is b)."""
+    """Return the path as given and as Drake normalizes it (a/../b is b), where they exist."""
     try:
         both = [] if path is None else [path, Path(os.path.normpath(path))]
         return [each for each in dict.fromkeys(both) if os.path.exists(each)]
@@ -181,7 +182,7 @@ def _check_size(files: int, size: int, path: Path) -> None:
 def read_xml(path: Path) -> Element:
     """Return the root of an XML file, with `drake:` prefixes unchanged.
 
-    Drake also reads malformed XML, which these checks cannot; here it is an error.
+    Drake also reads malformed XML, which these checks cannot; here malformed XML is an error.
     """
     builder, parser = TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
@@ -210,7 +211,7 @@ def _addresses_in_xml(root: Element, *, meshes: bool) -> Iterator[str]:
 
 
 def added_models(data: Any) -> Iterator[str]:
-    """Yield the addresses of the files that model directives add."""
+    """Yield the addresses of the files that model directives (YAML data) add."""
     directives = data.get("directives") if isinstance(data, dict) else None
     for each in directives if isinstance(directives, list) else []:
         for kind in ("add_model", "add_directives"):

@@ -1,4 +1,4 @@
-"""Reading of robot models: missing meshes, free bases, packages in other folders."""
+"""Reading of robot models, with remedies for missing meshes, free bases and external packages."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _SCENE = ("scene", "its package:// addresses in folders around it")
 
 @dataclass(frozen=True)
 class ParsedModel:
-    """Result of `ParseModel`; `folder` has converted meshes, which Drake reads later."""
+    """Arm from `ParseModel`; `folder` contains converted meshes, which Drake reads later."""
 
     instance: ModelInstanceIndex
     sensor_frame: Frame
@@ -66,7 +66,7 @@ class ParsedModel:
 
 @dataclass(frozen=True)
 class ParsedTool:
-    """Result of `ParseTool`; `body` is the body on the sensor frame."""
+    """Tool from `ParseTool`; `body` is the body welded to the sensor frame."""
 
     body: RigidBody
     assumptions: list[str]
@@ -80,14 +80,14 @@ def ParseModel(
     package_paths: tuple[Path, ...] = (),
     X_WBase: RigidTransform | None = None,
 ) -> ParsedModel:
-    """Parse an arm, in which only the joints up to S move, each with one actuator.
+    """Parse an arm into a plant; only the joints up to S move, each with one actuator.
 
     A free base is welded to the world at `X_WBase`. Other joints, such as a gripper's, are welded
     at their default positions. `package_paths` are folders of `package://` addresses.
 
     Raises:
-        DrakeTeleopError: if the file cannot be read, has no such frame, fails `check_model`, or
-            fixes the base although `X_WBase` is not the identity.
+        DrakeTeleopError: if the file cannot be read, has no frame `sensor_frame`, fails
+            `check_model`, or fixes the base although `X_WBase` is not the identity.
     """
     before = set(plant.GetJointIndices())
     read = _parse(plant, path, package_paths, sensor=sensor_frame)
@@ -130,7 +130,7 @@ def ParseModel(
 def ParseTool(
     plant: MultibodyPlant, path: Path, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Parse a tool with one root and weld it to S by the joint "sensor_weld"; hold its joints.
+    """Parse a tool with one root link, weld the root to S ("sensor_weld"), and weld other joints.
 
     Raises:
         DrakeTeleopError: if the file cannot be read or has another number of roots.
@@ -173,7 +173,7 @@ def ParseScene(plant: MultibodyPlant, path: Path) -> TemporaryDirectory[str]:
 
 
 class _ModelContent(NamedTuple):
-    """Content of a model file, and the roots of its XML files."""
+    """Parsed content of a model file."""
 
     instances: list[ModelInstanceIndex]
     roots: list[ElementTree.Element]
@@ -300,7 +300,7 @@ def _weld_other_joints(
 
 
 def _default_pose(joint: Joint) -> RigidTransform:
-    """Return the default X_FM of a joint; Drake provides it for few kinds."""
+    # Drake's `GetDefaultPose` covers few kinds of joints.
     q = joint.default_positions()
     if isinstance(joint, RevoluteJoint):
         return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
@@ -337,7 +337,7 @@ def _actuate(plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, f
 
 @contextmanager
 def translate_drake_errors(path: Path, expected: _Description = _ROBOT) -> Iterator[None]:
-    """Convert Drake's exceptions about a model to a DrakeTeleopError with its file."""
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file."""
     try:
         yield
     except DrakeTeleopError:
@@ -366,7 +366,7 @@ def _raise_logged_errors() -> Iterator[None]:
     log = logging.getLogger("drake")
     log.addFilter(keep)
     try:
-        with silent_stderr():  # the underlying parsers write to it
+        with silent_stderr():  # the parsers below Drake write to stderr
             yield
     finally:
         log.removeFilter(keep)
@@ -381,7 +381,7 @@ def _weld_base(
     X_WBase: RigidTransform | None,
     where: str,
 ) -> list[JointIndex]:
-    """Weld a free base to the world; return the joints to S, from the base outwards."""
+    """Weld a free base to the world; return the joints up to S, from the base outwards."""
 
     def name_of(body: RigidBody) -> str:
         is_world = body.index() == plant.world_body().index()

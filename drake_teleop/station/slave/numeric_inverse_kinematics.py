@@ -39,14 +39,14 @@ from drake_teleop.station.slave.inverse_kinematics import IkStatus
 Array = NDArray[np.float64]
 
 MET = 1e-8
-"""Tolerance of position [m] and orientation [rad] for a pose that is met."""
+"""Largest error of position [m] and orientation [rad] at which a pose counts as met."""
 
-# Error that is rounding only [m].
+# Largest error that is rounding only [m].
 _ROUNDING_ERROR_M = 1e-14
 SINGULAR = 5e-3
 """Singular value of the Jacobian below which motion is damped [m]."""
 STEPS = 10
-"""Maximum number of steps per command; two or three are typical."""
+"""Maximum number of Levenberg-Marquardt steps per command; two or three are typical."""
 # Minimum damping of a step [m^2], which keeps redundant joints at rest.
 _MIN_DAMPING = 1e-14
 # Initial damping divided by the squared error; `find_posture`: steps per start, and starts.
@@ -55,7 +55,7 @@ _INITIAL_DAMPING, _SEARCH_STEPS, _SEARCH_STARTS = 1e-3, 100, 100
 _ZERO_GRADIENT = 1e-3
 # Error below which out of reach and singular are indistinguishable [m].
 _REACH_TOLERANCE_M = 5e-6
-# The same for `find_posture`, whose search ends early [m].
+# The same tolerance for `find_posture`, which stops the search earlier [m].
 _SEARCH_TOLERANCE_M = 1e-3
 # Largest joint displacement to escape from a singularity [rad, m].
 _ESCAPE_STEP, _SEARCH_ESCAPE_STEP = 0.05, 0.3
@@ -69,7 +69,7 @@ _OK, _WRIST_SINGULAR, _SHOULDER_SINGULAR, _OUT_OF_REACH, _JOINT_LIMIT, _BAD_POSE
 
 @njit(cache=True)
 def _jacobian_and_error(table, L, pose, q, x, J, e):
-    """Compute J (6, n) and error e (6,) at q, rotations times L; return e^2."""
+    """Write Jacobian J (6, n) and pose error e (6,) at q, rotations times L; return |e|^2."""
     jacobian_and_pose(table, q, J, x)
     a = normalized((pose[0], pose[1], pose[2], pose[3]))
     R = np.empty((3, 3))
@@ -89,7 +89,7 @@ def _jacobian_and_error(table, L, pose, q, x, J, e):
 
 @njit(cache=True)
 def _normal_matrix(J, H):
-    """Set H to J^T J, or to J J^T if H has another size."""
+    """Write J^T J to H, or J J^T if H has that size."""
     n = H.shape[0]
     rows = n == J.shape[1]
     for i in range(n):
@@ -106,7 +106,7 @@ def _normal_matrix(J, H):
 
 @njit(cache=True)
 def _smallest_eigenvalue(H, u):
-    """Return the smallest eigenvalue of H (m, m), its vector in u (inverse iteration)."""
+    """Return the smallest eigenvalue of H; write its eigenvector to u (inverse iteration)."""
     m = H.shape[0]
     M = np.empty((m, m))
     for i in range(m):
@@ -134,9 +134,9 @@ def _is_held(q, lower, upper, i, push):
 
 @njit(cache=True)
 def _damped_step(H, g, damping, q, lower, upper, trial):
-    """Write the damped step from q, within the box, to trial (n,); return its largest component.
+    """Write q plus a damped step, within the limits, to trial (n,); return the largest component.
 
-    Joints at, or driven beyond, a limit are fixed there and the others solved again.
+    Joints that are at a limit, or would pass it, are fixed there and the others solved again.
     """
     n = q.shape[0]
     M, d, fixed, held = np.empty((n, n)), np.empty(n), np.zeros(n), np.empty(n, np.bool_)
@@ -166,7 +166,7 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 @njit(cache=True)
 def _singularity_status(L, J):
-    """Return WRIST_SINGULAR for nearly coplanar last axes, else SHOULDER_SINGULAR."""
+    """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
     a, b, c = three(J[3:, n - 3], 0), three(J[3:, n - 2], 0), three(J[3:, n - 1], 0)
     coplanar = abs(dot(a, cross(b, c))) < _COPLANAR_AXES * L**3
@@ -183,13 +183,13 @@ def follow_pose(
         table: `ArmModel.table`.
         L: `orientation_length` [m].
         pose: (7,) X_WS ``[qw, qx, qy, qz, px, py, pz]``, the quaternion of any nonzero length.
-        reference: (n,) normally the last command.
-        lower, upper: (n,) limits.
+        reference: (n,) joint positions, normally the last command.
+        lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
-        posture: (n,) target of a redundant arm.
-        pull: fraction of the way to the posture.
+        posture: (n,) joint positions that a redundant arm approaches.
+        pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
-        steps: maximum number.
+        steps: maximum number of steps.
 
     Returns:
         The `IkStatus` as a plain integer.
@@ -294,7 +294,7 @@ def follow_pose(
 
 
 def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, IkStatus]:
-    """Return joint positions (n,) that meet a pose (7,), and the status.
+    """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
 
     The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
     joints take the full rotation nearest to the reference. Without a solution, the nearest
@@ -339,10 +339,11 @@ def orientation_length(arm: ArmModel) -> float:
 def _follow_command(
     table, L, lower, upper, speed, posture, pull, pose, position, last, time, q
 ):  # fmt: skip
-    """Run `follow_pose` from the last command, within the elapsed time; return the `IkStatus`.
+    """Move from the last command towards the pose with `follow_pose`; return the `IkStatus`.
 
-    `speed` (n,) contains limits, `last` (n + 1,) the last command and its time [s]. An invalid
-    `position` (n,) of the encoders holds the last command.
+    `speed` (n,) contains speed limits, which apply to the elapsed time; `last` (n + 1,) is the last
+    command and its time [s]. If the encoder readings `position` (n,) are invalid, the last command
+    is held.
     """
     n = q.shape[0]
     put(q, 0, last, 0, n)
@@ -360,10 +361,10 @@ def _follow_command(
 
 
 class NumericInverseKinematics(LeafSystem):
-    """Conversion of a commanded pose to joint positions, for any serial arm.
+    """Block that converts a commanded pose to joint positions, for any serial arm.
 
     Joints continue from the last command, not from the measured position, so that a redundant arm
-    does not drift. Invalid encoders hold the command.
+    does not drift. If encoder readings are invalid, the last command is held.
 
     .. pydrake_system::
 
@@ -375,7 +376,7 @@ class NumericInverseKinematics(LeafSystem):
         - joint_command: (n,) [rad]
         - ik_status: an `IkStatus`
 
-    `q_start` is the first command, and the posture of a redundant arm.
+    `q_start` is the first command, and the posture that a redundant arm approaches.
     """
 
     __slots__ = ONE_DICT

@@ -1,4 +1,4 @@
-"""The slave's plant: arm, tool and environment."""
+"""Plant of the slave: arm, tool and environment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from drake_teleop.station.slave.slave_config import AddPayload, Slave
 from drake_teleop.station.slave.surroundings import AddEnvironment, Contact, ContactWith, no_contact
 from drake_teleop.station.slave.tool import AddTool, shapes_reach
 
-# Shapes within this distance of the farthest one share the contact, as two fingers do [m].
+# Shapes that end within this distance of the farthest end share the contact, as two fingers do [m].
 _SAME_REACH_M = 1e-3
 #: Name of the arm's model instance in every plant.
 ARM = "arm"
@@ -40,17 +40,17 @@ ARM = "arm"
 
 @dataclass(frozen=True)
 class SlavePlant:
-    """The plant, and data for the blocks around it.
+    """Plant of the slave, and data for the blocks around it.
 
     Attributes:
         plant: continuous MultibodyPlant, finalized.
-        instance: of the arm's joints.
-        tool: body on the sensor.
+        instance: model instance of the arm's joints.
+        tool: index of the tool's body on the sensor.
         arm: chain up to S, with all bodies beyond S as its load.
-        start: (n,) joint positions [rad].
-        X_WS_start: (7,) see `start_pose`.
+        start: (n,) joint positions at the start [rad].
+        X_WS_start: (7,) pose at the start, see `start_pose`.
         tip: (3,) p_STip, contact point of the tool [m].
-        assumptions: data missing in the models.
+        assumptions: texts about data missing in the models.
         environment: objects that the tool can touch, or None.
     """
 
@@ -69,15 +69,15 @@ class SlavePlant:
 
     @property
     def contact_pairs(self) -> NDArray[np.float64]:
-        """Pairs (k, 28) of the compiled contact law, see `Pairs`."""
+        """Pairs (k, 28) of shapes for the compiled contact law, see `Pairs`."""
         return self.contact.pairs
 
     @cached_property
     def physics(self) -> tuple[NDArray[np.float64], ...]:
         """Argument of `plant_rates`: arm table, view of its load, pairs, leaf, joints, wrenches.
 
-        The table is a copy with dry friction, and a grasp may change its load. Joint control uses
-        neither.
+        The table is a copy with dry friction; a grasp may change its load. Joint control uses
+        neither friction nor grasped load.
         """
         carried = self.arm.with_load(self.arm.phi_load)
         carried.table[:-1, FRICTION] = self.friction
@@ -86,41 +86,41 @@ class SlavePlant:
 
     @property
     def friction(self) -> NDArray[np.float64]:
-        """(n,) friction of the joints [N m]."""
+        """Dry friction (n,) of the joints [N m]."""
         return friction_of_joints(self.config.friction, self.arm.joint_names)
 
     @property
     def sheet(self) -> ModelInstanceIndex | None:
-        """Model instance of the leaf, or of another `moving_part`, if any."""
+        """Model instance of the leaf, or of another `moving_part`; None without one."""
         return self.contact.sheet
 
     @property
     def can_touch(self) -> bool:
-        """Whether the tool can touch anything."""
+        """True if the tool can touch an object."""
         return len(self.contact_pairs) > 0 or bool(self.contact.beyond)
 
     @property
     def sensed_sheet(self) -> ModelInstanceIndex | None:
-        """The sheet, if the compiled contact law moves it."""
+        """Model instance `sheet` if the compiled contact law moves the sheet, else None."""
         return None if self.contact.beyond else self.sheet
 
     @property
     def start_tip(self) -> NDArray[np.float64]:
-        """p_WTip (3,) at the start [m]."""
+        """Position p_WTip (3,) of the tool's contact point at the start [m]."""
         start = self.X_WS_start
         R_WS = RotationMatrix(Quaternion(start[:4] / np.linalg.norm(start[:4])))
         return start[4:] + R_WS.matrix() @ self.tip
 
 
 def start_pose(slave: Slave) -> NDArray[np.float64]:
-    """Return X_WS (7,) [qw qx qy qz px py pz] at the start: at `home`, or as configured."""
+    """Return the pose X_WS (7,) [qw qx qy qz px py pz] at the start, from `home` or `position`."""
     if slave.home:
         return NominalSlave(slave).X_WS_start
     return np.array([*R_WS_HOME.ToQuaternion().wxyz(), *slave.position])
 
 
 def NominalSlave(slave: Slave) -> SlavePlant:
-    """Return the slave without environment, from a cache; raises as `AddSlavePlant`."""
+    """Return the slave's plant without environment, from a cache; raises as `AddSlavePlant`."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
     return _nominal_slave(_HashableSlave(slave), written)
 
@@ -300,7 +300,7 @@ def _remove_shapes(
 
 
 def lowest_point(slave: Slave) -> NDArray[np.float64]:
-    """Return p_W (3,) [m] of the load's lowest hull corner at the start, or of the tip."""
+    """Return the lowest point p_W (3,) [m] at the start: a corner of the load, or the tip."""
     nominal = NominalSlave(slave)
     X_WS = nominal.X_WS_start
     R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
@@ -310,7 +310,7 @@ def lowest_point(slave: Slave) -> NDArray[np.float64]:
 
 
 def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
-    """Return corners (k, 3) in S [m] of each shape on the sensor, or of its box."""
+    """Return the corners (k, 3) in S [m] of the convex hull or box of each shape on the sensor."""
     plant, scene_graph = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.0)
     parsed = ParseSlave(plant, slave)
     finalize(plant)
@@ -332,7 +332,7 @@ def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:
 
 
 def _end_of_hulls(hulls: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return p_S (3,) in the middle of the shapes that reach farthest along z_S."""
+    """Return the point p_S (3,) in the middle of the shapes that reach farthest along z_S."""
     reach = max(float(hull[:, 2].max()) for hull in hulls)
     farthest = [hull[:, :2] for hull in hulls if hull[:, 2].max() > reach - _SAME_REACH_M]
     middles = [(hull.min(axis=0) + hull.max(axis=0)) / 2.0 for hull in farthest]
@@ -347,7 +347,7 @@ def _tip(
     instance = plant.get_body(parsed.tool).model_instance()
     if plant.HasFrameNamed("tip", instance):
         tip = plant.GetFrameByName("tip", instance)
-        if slave.tool is not None and tip.body().index() == parsed.tool:  # its frame is S
+        if slave.tool is not None and tip.body().index() == parsed.tool:  # the body frame is S
             return tip.GetFixedPoseInBodyFrame().translation()
         X_WS, X_WTip = (
             frame.CalcPoseInWorld(plant.CreateDefaultContext())
@@ -362,13 +362,13 @@ def _tip(
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """Joint names from the base outwards, and `ArmModel.table`."""
+    """Kinematics of an arm: joint names from the base outwards, and `ArmModel.table`."""
 
     joint_names: tuple[str, ...]
     table: Array
 
     def pose(self, q: Array) -> Array:
-        """Return X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
+        """Return the pose X_WS (7,) [qw qx qy qz px py pz] [m] at q (n,) [rad, m]."""
         R_WS, p_WS = np.empty((3, 3)), np.empty(3)
         forward_kinematics(self.table, q, R_WS, p_WS)
         return np.concatenate([quaternions(R_WS[None])[0], p_WS])

@@ -35,10 +35,10 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
     Args:
         arm: `ArmModel.table`.
-        pairs: (k, 28) `Pairs.known`.
-        joints: (m, 21) of `JointTable`.
+        pairs: (k, 28) pairs of shapes, `Pairs.known`.
+        joints: (m, 21) joints of moving bodies, `JointTable`.
         applied_W: (6,) additional [f; tau] about So, in W [N, N m].
-        q, v: (n,).
+        q, v: (n,) joint positions and speeds.
         sheet: (2,) deflection of the leaf and its rate [m, m/s].
         state: the plant's [q; v], unused without joints.
         wrench_W: (6,) output [N, N m].
@@ -81,7 +81,7 @@ def environment_wrench(arm, pairs, joints, applied_W, q, v, sheet, state, wrench
 
 @njit(cache=True)
 def _place_box(pair, bodies, placed):
-    """Return `placed` (28,): the pair with its box at its body's pose."""
+    """Write the pair, with its box at the pose of its body, to `placed` (28,), and return this."""
     body = bodies[int(pair[BODY])]
     put(placed, 0, pair, 0, WIDTH)
     turn = (body[0], body[1], body[2], body[3])
@@ -94,7 +94,7 @@ def _place_box(pair, bodies, placed):
 
 @njit(cache=True)
 def nearness(arm, pairs, watched, joints, q, sheet, state):
-    """Return `FAR`, `TOUCHING` or `WATCHED`, for (l, 40) `Pairs.watched`."""
+    """Return the tool's proximity `FAR`, `TOUCHING` or `WATCHED`; `watched` is `Pairs.watched`."""
     R_WS, p_WS, normal = np.empty((3, 3)), np.empty(3), np.empty(6)
     bodies, placed = np.empty((joints.shape[0], POSE_AND_TWIST)), np.empty(WIDTH)
     bodies_into(joints, state, bodies)
@@ -115,13 +115,13 @@ def nearness(arm, pairs, watched, joints, q, sheet, state):
 
 @njit(cache=True)
 def add_force(wrench_W, p_WC, force_W):
-    """Add a force (3,) at C [N] to a wrench (6,) about the world's origin, in W."""
+    """Add a force (3,) [N] at point C to a wrench (6,) about the world's origin, in W."""
     add_into(wrench_W, 0, force_W)
     add_into(wrench_W, 3, cross(p_WC, force_W))
 
 
 class ToolContact(LeafSystem):
-    """True contact wrench for the log, see `environment_wrench`.
+    """Block that outputs the true contact wrench for the log, see `environment_wrench`.
 
     .. pydrake_system::
 
@@ -163,7 +163,7 @@ class ToolContact(LeafSystem):
 
 @njit(cache=True)
 def assemble_state(state, around, x):
-    """Write x from [q; v] and [deflection, rate, the plant's state]."""
+    """Write the state x from the arm's [q; v] and `around` [deflection, rate, plant's state]."""
     n = state.shape[0] // 2
     put(x, 0, state, 0, n)
     put(x, n + 1, state, n, n)
@@ -173,10 +173,10 @@ def assemble_state(state, around, x):
 
 @njit(cache=True)
 def plant_rates(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative xdot (2 n + 2,) and the environment's wrench.
+    """Write the time derivative xdot (2 n + 2,) of x, and the environment's wrench.
 
     `physics` is `SlavePlant.physics`, `tau` (n,) the motor torques [N m]; `applied_W` and
-    `wrench_W` are those of `environment_wrench`.
+    `wrench_W` as for `environment_wrench`.
     """
     arm, _, pairs, _, joints, given = physics
     half = tau.shape[0] + 1
@@ -215,7 +215,7 @@ def _take_given_wrench(given, x, wrench_W):
 
 @njit(cache=True)
 def rates_under(physics, x, tau, applied_W, wrench_W, xdot):
-    """Write the time derivative of x under a given environment wrench."""
+    """Write the time derivative xdot of x under a given environment wrench."""
     arm, _, pairs, leaf, _, _ = physics
     half = tau.shape[0] + 1
     q, v = x[: half - 1], x[half : 2 * half - 1]

@@ -24,10 +24,10 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import put
 from drake_teleop.station.slave.arm import ArmModel, holding_torque, inverse_dynamics
 
-# Memory: periods since the last command, index of the oldest command in the queue; then target, r
-# and dr/dt (n each), and the queue.
+# Memory of the servo: periods since the last command, index of the oldest command in the queue;
+# then target, r and dr/dt (n each), and the queue of commands.
 _COUNT, _OLDEST = 0, 1
-# v^2 = 2 a d with 80 % of the largest acceleration.
+# Braking v^2 = 2 a d with 80 % of the largest acceleration.
 _BRAKING_FACTOR = 2 * 0.8
 
 
@@ -93,11 +93,11 @@ INTERFACES: dict[str, PositionInterface] = {
 
 @njit(cache=True)
 def _generate(command, interface, limits, memory, reference):
-    """Take the command (n,) [rad] if due, and advance r by one period.
+    """Take the command (n,) [rad] if due, and advance the reference r by one period.
 
     Args:
         interface: (6,) period [s], gain, lookahead, w, periods per command, length of the queue.
-        limits: (2, n) speed and acceleration.
+        limits: (2, n) speed and acceleration limits.
         memory: see `_COUNT`; updated.
         reference: (3, n) output: r and its two derivatives.
     """
@@ -130,10 +130,10 @@ def _generate(command, interface, limits, memory, reference):
 def position_servo_torque(
     arm, command, state, interface, limits, effort_limit, scratch, memory, torque
 ):  # fmt: skip
-    """Write the motors' torque (n,) for the next period, within `effort_limit` (n,) [N m].
+    """Write the motor torques (n,) for the next period, within `effort_limit` (n,) [N m].
 
-    `state` is [q; v], `scratch` (6, n), the others as for `_generate`. Invalid command: the last
-    one. Invalid encoders: gravity compensation.
+    `state` is [q; v], `scratch` (6, n), the others as for `_generate`. An invalid command is
+    replaced by the last one. If encoder readings are invalid, the torque compensates gravity.
     """
     n = torque.shape[0]
     _generate(command, interface, limits, memory, scratch)
@@ -154,7 +154,7 @@ def position_servo_torque(
 
 
 class PositionServo(LeafSystem):
-    """Position interface of an arm, in place of `JointControl`.
+    """Block with the position interface of an arm, in place of `JointControl`.
 
     .. pydrake_system::
 
@@ -165,7 +165,7 @@ class PositionServo(LeafSystem):
         output_ports:
         - joint_torque: (n,) [N m], held between samples
 
-    `period` is that of the drives [s], `q_start` the posture held before the first command.
+    `period` is the drives' period [s], `q_start` the posture held before the first command.
     """
 
     __slots__ = ONE_DICT

@@ -47,19 +47,19 @@ def samples_per_event(control_hz: float, hand_hz: float) -> int:
 
 @njit(cache=True)
 def torque_line(arm, command, state, sheet, servo, physics, samples, period, scratch, line):
-    """Write the torque of the next samples as a line in time.
+    """Write the torque over the next samples as a line in time.
 
     Args:
         arm: `ArmModel.table` of the controller.
-        command: (n,) [rad].
+        command: (n,) joint command [rad].
         state: (2 n,) [q; v].
-        sheet: (2,) of the leaf.
-        servo: `servo_numbers`.
+        sheet: (2,) deflection of the leaf and its rate.
+        servo: gains and limits from `servo_numbers`.
         physics: `SlavePlant.physics`.
-        samples: m.
+        samples: number m of samples.
         period: T [s].
         scratch: (3 n,).
-        line: (3 n,) torque [N m], its rate [N m/s], last sample [N m].
+        line: (3 n,) output: torque [N m], its rate [N m/s], last sample [N m].
     """
     n = command.shape[0]
     now, rate, torque = line[:n], line[n : 2 * n], line[2 * n :]
@@ -86,7 +86,7 @@ def torque_line(arm, command, state, sheet, servo, physics, samples, period, scr
         for i in range(2 * n + 2):
             x[i] += period * xdot[i]
     for i in range(n):
-        # Half the rise of the line; clip both ends to the torque limits.
+        # `away` is half the rise of the line; both ends are clipped to the torque limits.
         mean, away = now[i] / samples, 6.0 * rate[i] / samples**2
         start = min(max(mean - away, -servo[3][i]), servo[3][i])
         end = min(max(mean + away, -servo[3][i]), servo[3][i])
@@ -102,7 +102,7 @@ def _evaluate_line(state, time, torque):
 
 
 class SampledServo(LeafSystem):
-    """`JointControl` with several samples per event, see the module.
+    """Block as `JointControl`, with several servo samples per event, see the module.
 
     .. pydrake_system::
 
@@ -115,7 +115,7 @@ class SampledServo(LeafSystem):
         - joint_torque: (n,) now, on the line [N m]
         - torque_rate: (n,) slope of the line, held between events [N m/s]
 
-    `period` is that of the servo [s], `q_start` the posture held before the first sample.
+    `period` is the servo's period [s], `q_start` the posture held before the first sample.
     """
 
     __slots__ = ONE_DICT

@@ -1,6 +1,7 @@
 """Environment from a file: SDF, URDF or Drake model directives.
 
-Bodies may hang on joints with springs and damping. Free roots are welded to the world, or float.
+Bodies may be attached by joints with springs and damping. Free roots are welded to the world, or
+float.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -30,7 +31,7 @@ from drake_teleop.station.slave.surroundings import supports_pose
 #: Folders of converted meshes, kept while the process runs.
 _MESH_FOLDERS: list[TemporaryDirectory[str]] = []
 _RESERVED_NAMES = {"tool", "leaf", "block", "sensor", "tip", "stylus"}
-_MESH_RESOLUTION_M = 0.005  # m, of the mesh of the tool's ball
+_MESH_RESOLUTION_M = 0.005  # m, edge length of the mesh of the tool's ball
 
 
 @settings
@@ -61,7 +62,7 @@ class Scene(Environment):
 
     @property
     def path(self) -> Path:
-        """The given file, or the model of that name in the package."""
+        """Path of `file`, or of the shipped model with this name."""
         given, shipped = Path(self.file), models_dir() / self.file
         return shipped if not given.is_file() and shipped.is_file() else given
 
@@ -71,12 +72,12 @@ class Scene(Environment):
         return self.contact == "hydroelastic"
 
     def found_from(self, folder: Path) -> "Scene":
-        """Return a copy with the file resolved from a folder, if it exists there."""
+        """Return a copy with `file` resolved from `folder`, if it exists there."""
         path = (folder / self.file).resolve()
         return dataclasses.replace(self, file=str(path)) if path.is_file() else self
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Parse the file and place its free roots; raises DrakeTeleopError."""
+        """Add the file's bodies to a plant and place its free roots; raises DrakeTeleopError."""
         before, path = plant.num_bodies(), self.path
         folder = ParseScene(plant, path)
         if any(Path(folder.name).iterdir()):
@@ -134,5 +135,5 @@ class Scene(Environment):
 
 
 def is_hydroelastic(properties: ProximityProperties) -> bool:
-    """Return True if a shape has hydroelastic properties."""
+    """Return whether a shape has hydroelastic properties."""
     return bool(properties.HasProperty("hydroelastic", "compliance_type"))

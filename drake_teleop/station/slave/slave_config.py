@@ -75,7 +75,7 @@ class Slave:
 
     @property
     def path(self) -> Path:
-        """File of the arm."""
+        """Model file of the arm."""
         return Path(self.model) if self.model else models_dir() / "rx90.sdf"
 
     @property
@@ -85,7 +85,7 @@ class Slave:
 
     @property
     def X_WBase(self) -> RigidTransform:
-        """Pose of the base in the world."""
+        """Pose of the arm's base in the world."""
         return RigidTransform(RollPitchYaw(self.base_pose[3:]), self.base_pose[:3])
 
     def files(self) -> list[Path]:
@@ -110,7 +110,7 @@ class Slave:
             self.tool.check(f"{where}.tool")
 
     def found_from(self, folder: Path) -> "Slave":
-        """Return a copy with its files resolved from a folder."""
+        """Return a copy with relative file paths resolved from `folder`."""
 
         def found(name: str) -> str:
             return str((folder / name).resolve()) if name else ""

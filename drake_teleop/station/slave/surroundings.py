@@ -1,4 +1,4 @@
-"""Environment in the slave's plant: moving bodies, and the law that computes contact."""
+"""Environment in the slave's plant: moving bodies, and the choice of the contact law."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ _MIN_INERTIA = 1e-12  # kg or kg m^2, smallest valid eigenvalue of the mass matr
 
 
 class Touched(NamedTuple):
-    """Model instances of the environment, and the leaf's if there is one."""
+    """Model instances of an added environment, and the leaf's model instance or None."""
 
     instances: Collection[ModelInstanceIndex]
     sheet: ModelInstanceIndex | None
 
 
 class Contact(NamedTuple):
-    """Contact of the tool with the environment.
+    """Model of the contact between tool and environment.
 
     Attributes:
         pairs: (k, 28) `Pairs.known`; empty if `beyond` is set.
-        watched: (l, 40) `Pairs.watched`, left to Drake at close range.
-        joints: (m, 21) of `JointTable`, which move the boxes of `pairs`.
+        watched: (l, 40) `Pairs.watched`, pairs that Drake computes at close range.
+        joints: (m, 21) joints of `JointTable`, which move the boxes of `pairs`.
         plant_size: size of the plant's state, 0 without joints.
         beyond: reason for using Drake's contact results instead of the compiled law, or empty.
         bodies: indices of the tool's bodies.
-        shapes: identifiers of their shapes.
+        shapes: identifiers of the collision shapes of these bodies.
         leaf: (4,) mass [kg], stiffness [N/m], damping [N s/m] and gravity [m/s^2] of the leaf.
-        sheet: model instance of the leaf, or of another `moving_part`, if any.
+        sheet: model instance of the leaf, or of another `moving_part`; None without one.
         moving: other moving bodies, by name.
     """
 
@@ -74,12 +74,12 @@ class Contact(NamedTuple):
 
     @property
     def law(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pairs and joints for `environment_wrench`."""
+        """Arguments `pairs` and `joints` for `environment_wrench`."""
         return self.pairs, self.joints
 
 
 def no_contact() -> Contact:
-    """Return the `Contact` without environment."""
+    """Return the `Contact` of a tool without environment."""
     leaf = np.array([1.0, 0.0, 0.0, 0.0])
     pairs, joints = np.zeros((0, WIDTH)), np.zeros((0, JOINT_WIDTH))
     watched = np.zeros((0, WATCHED_WIDTH))
@@ -87,7 +87,7 @@ def no_contact() -> Contact:
 
 
 def AddEnvironment(plant: MultibodyPlant, environment: Environment) -> Touched:
-    """Add the environment to a plant with the tool, before finalizing."""
+    """Add the environment to a plant that contains the tool, before finalizing."""
     before, sheet = plant.num_model_instances(), None
     for part in environment.parts:
         if part.moving_part is not None:
@@ -105,7 +105,7 @@ def ContactWith(
     environment: Environment,
     touched: Touched,
 ) -> Contact:
-    """Return the contact of the tool with the environment, after finalizing the plant.
+    """Return the contact of the tool with the environment, in a finalized plant.
 
     `scene_graph` contains the shapes of tool and environment only.
 
@@ -116,7 +116,7 @@ def ContactWith(
     environment.PrepareContact(plant, scene_graph, tool)
     shapes = ToolShapes(plant, scene_graph, tool)
     contact = no_contact()._replace(
-        # Identifiers themselves would keep the plant alive.
+        # Integers, because Drake's identifiers would keep the plant alive.
         bodies=frozenset(int(index) for index in shapes),
         shapes=frozenset(shape.get_value() for own in shapes.values() for shape in own),
         sheet=touched.sheet,
@@ -181,7 +181,7 @@ def _unmodelled_contact(environment: Environment, contact: Contact) -> str:
 
 
 def MovingBodies(plant: MultibodyPlant, touched: Touched) -> dict[str, BodyIndex]:
-    """Return moving bodies except the leaf by unique name, in a finalized plant."""
+    """Return the moving bodies of a finalized plant, except the leaf, by unique name."""
     bodies = [
         plant.get_body(index)
         for instance in touched.instances
@@ -203,13 +203,13 @@ def _signal_name(name: str) -> str:
 
 
 def supports_pose(joint: Joint) -> bool:
-    """Return True if the joint's positions follow from a pose, see `positions_of`."""
+    """Return whether the joint's positions follow from a pose, see `positions_of`."""
     kinds = (RevoluteJoint, PrismaticJoint, QuaternionFloatingJoint)
     return joint.num_positions() == 0 or isinstance(joint, kinds)
 
 
 def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
-    """Return the joint positions for the pose X_FM of its child frame."""
+    """Return the joint positions for the pose X_FM of the joint's child frame."""
     if isinstance(joint, RevoluteJoint):
         turn = AngleAxis(X_FM.rotation().matrix())
         return np.array([turn.angle() * (turn.axis() @ joint.revolute_axis())])
@@ -220,7 +220,7 @@ def positions_of(joint: Joint, X_FM: RigidTransform) -> NDArray[np.float64]:
 
 
 class MovingPose(LeafSystem):
-    """Pose of a body.
+    """Block that outputs the pose of a moving body.
 
     .. pydrake_system::
 

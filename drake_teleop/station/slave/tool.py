@@ -1,4 +1,4 @@
-"""Tool on the wrist sensor: the paper's, from a file, or from a few numbers."""
+"""Tool on the wrist sensor: the paper's, from a model file, or from mass, inertia and shapes."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -31,12 +31,12 @@ class Ball:
 
     @property
     def shape(self) -> Shape:
-        """Shape for Drake."""
+        """Drake's shape of the ball."""
         return Sphere(self.radius)
 
     @property
     def pose(self) -> RigidTransform:
-        """Pose on the tool, in S."""
+        """Pose of the ball in S."""
         return RigidTransform(self.position)
 
 
@@ -51,7 +51,7 @@ class Block:
 
     @property
     def shape(self) -> Shape:
-        """Shape for Drake."""
+        """Drake's shape of the box."""
         return Box(*self.edges)
 
     @property
@@ -61,7 +61,7 @@ class Block:
 
     @property
     def pose(self) -> RigidTransform:
-        """Pose on the tool, in S."""
+        """Pose of the box in S."""
         return RigidTransform(RollPitchYaw(self.rpy), self.position)
 
 
@@ -84,11 +84,11 @@ class Tool:
 
     @property
     def path(self) -> Path:
-        """File of the tool, by default the paper's."""
+        """Model file of the tool, by default the paper's."""
         return Path(self.model) if self.model else models_dir() / "tool.sdf"
 
     def check(self, where: str) -> None:
-        """Raise DrakeTeleopError for file and mass, shapes without mass, or an invalid inertia."""
+        """Raise DrakeTeleopError for file plus mass, shapes without mass, or an invalid inertia."""
         if self.model and self.mass:
             raise DrakeTeleopError(
                 "both a file and a mass define the tool",
@@ -106,7 +106,7 @@ class Tool:
 
 
 def shapes_reach(tool: Tool) -> list[float] | None:
-    """Return p_STip (3,) [m] of the shape that reaches farthest along z_S, if any."""
+    """Return the end point p_STip (3,) [m] of the shape that reaches farthest along z_S, if any."""
     ends = [
         np.array(each.position) + np.array([0.0, 0.0, half])
         for each in tool.shapes
@@ -118,7 +118,7 @@ def shapes_reach(tool: Tool) -> list[float] | None:
 def AddTool(
     plant: MultibodyPlant, tool: Tool, sensor_frame: Frame, package_paths: tuple[Path, ...] = ()
 ) -> ParsedTool:
-    """Weld the tool to the sensor frame by the joint "sensor_weld"."""
+    """Add the tool to a plant and weld it to the sensor frame by the joint "sensor_weld"."""
     if tool.mass == 0.0:
         return ParseTool(plant, tool.path, sensor_frame, package_paths)
     body = plant.AddRigidBody("tool", plant.AddModelInstance("tool"), _inertia(tool))
@@ -133,7 +133,7 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
     surface = ProximityProperties()
     friction = CoulombFriction(_FRICTION, _FRICTION)
     AddContactMaterial(surface, _DISSIPATION, _STIFFNESS, friction)
-    if not tool.shapes:  # for the 3D replay
+    if not tool.shapes:  # a ball represents the tool in the 3D replay
         seen = RigidTransform(tool.com), Sphere(steel_ball_radius(tool.mass))
         plant.RegisterVisualGeometry(body, *seen, "tool", _COLOUR)
     for k, each in enumerate(tool.shapes):
