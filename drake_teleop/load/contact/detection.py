@@ -1,6 +1,6 @@
 """Contact detection in the eliminated wrench, sample by sample.
 
-Statistics of the normalised wrench z and of its innovations e (defined in `noise_floor`):
+Statistics of the normalised wrench z and of its innovations e (defined in `noise_floor`)::
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics

@@ -1,4 +1,4 @@
-"""Load that is eliminated while a known load is monitored, sample by sample.
+"""Load that is eliminated while a known load is monitored, sample by sample::
 
     settled     the known load explains the wrench and is used
     disturbed   contact, or the moment of a grasp; the known load is used
