@@ -1,8 +1,8 @@
 """Channel between master and slave: a network, both of its ends, and their block (long: one step).
 
 In every period both ends run one step of the passivity method (`station.passivity`). Their packets
-pass one line of the network each (`network`). The step works in world axes and in the master's
-power units, see `passivity.methods`.
+pass one line of the network (`network`) in each direction. The step works in world axes and in the
+master's power units, see `passivity.methods`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Network between master and slave; its own fields are those of `custom`."""
+    """Network between master and slave: a preset, or the fields below for `custom`."""
 
     network: str = choice(
         "custom", _NETWORKS, "a preset, or custom for the network of these fields"
@@ -77,7 +77,7 @@ class Channel(NetworkConfig):
     )
 
     def lines(self, where: str = "channel") -> tuple[NetworkConfig, NetworkConfig]:
-        """Return the two directions, forward (master to slave) and backward.
+        """Return the networks of both directions: forward (master to slave) and backward.
 
         Raises:
             DrakeTeleopError: if a preset is combined with other fields.
@@ -95,7 +95,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def silent_after(self, period: float) -> float:
-        """Return the silence [s] that starts the safe state, for packets each `period` [s]."""
+        """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -109,10 +109,10 @@ class Channel(NetworkConfig):
 _SIZE = 2 + 2 * (8 + 6 + MEMORY) + MASTER_WATCH + SLAVE_WATCH
 _places = Slots(_SIZE)
 _STEP = _places.number()  # number of the step
-_POSE_M = _places.vector(8)  # last finite command; 1 if the last one was not
+_POSE_M = _places.vector(8)  # last finite command (7); 1 if the newest command is not finite
 _POSE_S = _places.vector(8)  # pose of the slave, likewise
-_WRENCH_M = _places.vector(6)  # wrench rendered since then
-_WRENCH_S = _places.vector(6)  # the slave's wrench at that time
+_WRENCH_M = _places.vector(6)  # wrench rendered since the last step
+_WRENCH_S = _places.vector(6)  # slave's wrench at the last step
 _VALID_TIME = _places.number()  # time with valid wrenches [s]
 _WATCH_M, _WATCH_S = _places.vector(MASTER_WATCH), _places.vector(SLAVE_WATCH)
 MEMORY_M, MEMORY_S = _places.vector(MEMORY), _places.vector(MEMORY)
@@ -142,8 +142,8 @@ def initial_ends(
 
     Args:
         method: one of `METHODS`.
-        parameters: of the method.
-        start: (7,) X_WS of command and slave.
+        parameters: result of `methods.parameters`.
+        start: (7,) pose X_WS of the slave and of its command.
     """
     ends = np.zeros(_SIZE)
     ends[_POSE_M][:7] = ends[_POSE_S][:7] = start
@@ -178,20 +178,21 @@ def channel_step(
     ports,
     wrench_received,
 ):
-    """Run one step of both ends and of the lines between them.
+    """Run one step of both ends and of both directions of the network.
 
     Args:
         steps: result of `methods.steps_of(method)`.
         pose_command, wrench_B, load_B, hand_B, slave_pose, saturated, contact: inputs of
             `TeleopChannel`.
-        T, timeout: [s].
+        T: time between steps [s].
+        timeout: time without packets before the safe state [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
-        parameters: of the method.
-        forward_parameters, backward_parameters: of the lines.
-        forward, backward, ends: states of lines and ends, updated.
-        pose_received: (7,) written.
-        ports: (PORTS,) work updated, silence written.
-        wrench_received: (7,) F_E_B to render, and the contact flag of the newest packet, written.
+        parameters: result of `methods.parameters`.
+        forward_parameters, backward_parameters: results of `network.parameters`.
+        forward, backward, ends: states of both directions and of the ends, updated.
+        pose_received: (7,) written: slave's command X_WS.
+        ports: (PORTS,) port energies, updated; times without packets, written.
+        wrench_received: (7,) written: F_E_B to render, and contact flag of the newest packet.
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
@@ -273,15 +274,15 @@ def channel_step(
 
 @njit(cache=True)
 def _increment_into(pose, before, dx):
-    """Write the pose increment since the last step; 0 from or to a pose that is not finite.
+    """Write the pose increment since the last step; 0 if one of both poses is not finite.
 
     Args:
-        pose: (7,) now.
+        pose: (7,) present pose.
         before: (8,) last finite pose; 1 if the last pose was not finite. Updated.
-        dx: (6,) written.
+        dx: (6,) written: increment.
 
     Returns:
-        Whether the pose is finite.
+        True if the pose is finite.
     """
     valid = sound(pose)
     if valid:
@@ -295,7 +296,7 @@ def _increment_into(pose, before, dx):
 
 @njit(cache=True)
 def _to_world(wrench_B, frame, out):
-    """Write the wrench in W and in the master's power units."""
+    """Convert a wrench at the hand, in B, to W and the master's power units."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -307,7 +308,7 @@ def _to_world(wrench_B, frame, out):
 
 @njit(cache=True)
 def _to_master(wrench, frame, out):
-    """Write the inverse of `_to_world`."""
+    """Convert a wrench to the hand, the inverse of `_to_world`."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -332,29 +333,30 @@ class TeleopChannel(LeafSystem):
 
         name: TeleopChannel
         input_ports:
-        - pose_command: (7,) X_WS, after kinematic scaling
+        - pose_command: (7,) commanded pose X_WS, after kinematic scaling
         - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
-        - hand_wrench_E: (6,) of the hand on the stylus at E, in B [N, N m]
-        - pose_slave: (7,) X_WS, actual
+        - hand_wrench_E: (6,) wrench of the hand on the stylus at E, in B [N, N m]
+        - pose_slave: (7,) actual X_WS of the slave
         - saturated: (1,) 1 while the wrench is invalid
-        - contact: (1,) flag of the slave's contact detector; unconnected 0
-        - load_wrench_B: (6,) the load's part of wrench_B, for `ledger`; unconnected 0
+        - contact: (1,) flag of the slave's contact detector; 0 if unconnected
+        - load_wrench_B: (6,) the load's part of wrench_B, for `ledger`; 0 if unconnected
         output_ports:
         - pose_received: (7,) X_WS command of the slave
         - wrench_received: (6,) F_E_B to render at the hand [N, N m]
-        - ports: (8,) energy input of the hand by translation and rotation, and of the slave [J];
-          silence at master and slave [s]; input of the slave's wrench along the command [J]
+        - ports: (8,) energy input of the hand by translation and rotation, and of the slave's
+          wrench [J]; time without packets at master and slave [s]; energy input of the slave's
+          wrench along the command [J]
         - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
-        channel: the network.
-        passivity: the method.
+        channel: network and timeout.
+        passivity: passivity method.
         R_WB: (3, 3) alignment of the master's base with the world.
-        scales: (2,) slave over master, of translation and rotation.
-        force_scale: slave to master.
-        start: (7,) X_WS of the slave at the start.
-        period: between packets [s].
-        seed: of the network.
+        scales: (2,) scale of translation and rotation, slave over master.
+        force_scale: scale of force, slave to master.
+        start: (7,) pose X_WS of the slave at the start.
+        period: time between packets [s].
+        seed: of the network's random numbers.
     """
 
     __slots__ = ONE_DICT
@@ -439,14 +441,14 @@ class TeleopChannel(LeafSystem):
         slave: NDArray[np.float64],
         fills: float,
     ) -> None:
-        """Start in a running station, with no packets in transit and a constant slave command.
+        """Start in a running station, without packets in transit and with a constant slave command.
 
         Args:
-            context: of this block.
-            command: (7,) X_WS present command of the slave; the master's command must be the same.
-            slave: (7,) X_WS of the slave, actual.
-            fills: time with the clutch open [s]. The slave of `wave` keeps its command until then
-                and reflects the present wrench.
+            context: context of this block.
+            command: (7,) present command X_WS of the slave; the master's command must be equal.
+            slave: (7,) actual pose X_WS of the slave.
+            fills: time with open clutch [s]. During it the slave of `wave` keeps its command and
+                reflects the present wrench.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills
@@ -480,7 +482,7 @@ class TeleopChannel(LeafSystem):
         )
 
     def _step_result(self, context: Context) -> list[NDArray[np.float64]]:
-        """Return the state after the step, and the master's received values."""
+        """Return the state after the step, and the values received at the master."""
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""Simulated network: the newest packet at the receiver for every step; theory (T26), (T27).
+"""Simulated network; it returns the newest packet at each step (docs/theory.md, (T26), (T27)).
 
 * Delay: `jitter` j gives the standard deviation j D / sqrt(3) about the mean D: uniform from
   (1 - j) D to (1 + j) D; normal, at least 0; or (1 - j) D plus a gamma distribution of shape 3
@@ -6,7 +6,7 @@
   jitter reorders packets. Use a recorded trace for a queue that keeps the order.
 * Loss: Gilbert-Elliott chain in continuous time. `rate_hz` sends at even intervals.
 * Playout buffer: a packet is used at the earliest `playout` after it was sent. `redundant` packets
-  repeat earlier samples, so a sufficient `playout` makes a constant delay, bit by bit.
+  repeat earlier samples, so a sufficient `playout` makes the delay exactly constant.
 
 All random numbers are hashes of (seed, direction, step).
 """
@@ -75,7 +75,7 @@ class NetworkConfig:
         """Check every value except the trace, which `parameters` reads.
 
         Raises:
-            DrakeTeleopError: with `where` and the field.
+            DrakeTeleopError: with `where` and the invalid field.
         """
         check_ranges(self, where)
         if self.loss > self.burst_loss:
@@ -103,8 +103,8 @@ PRESETS: dict[str, NetworkConfig] = {
 lan: switched network, round trip 1 ms, most of it in the hosts. wan: 1500 km of fibre at 5 us/km
 (ITU-T G.114), doubled for detours and routers, 30 ms; loss at the bound of classes 0 to 4 of ITU-T
 Y.1541. internet: 5000 km, doubled likewise, 100 ms; best effort with loss in bursts.
-geostationary: up and down 240 to 279 ms (RFC 2488, section 2), with coding and ground 600 ms.
-lunar: 384 400 km are 1.28 s; with the ground stations 2.6 s.
+geostationary: up and down 240 to 279 ms (RFC 2488, section 2); round trip with coding and ground
+stations 600 ms. lunar: 384 400 km are 1.28 s; round trip with ground stations 2.6 s.
 """
 
 # Parameters of a line in one array: these, then the trace in steps, -1 for a lost packet.
@@ -127,8 +127,8 @@ def parameters(
     """Return the parameters of one direction for the compiled functions below.
 
     Args:
-        config: of this direction.
-        seed: of the scenario.
+        config: network of this direction.
+        seed: seed of the scenario.
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         least: smallest delay of a packet [steps].
@@ -167,7 +167,7 @@ def parameters(
 
 
 def mean_delay(config: NetworkConfig) -> float:
-    """Return the mean age of a used packet [s], without lost packets."""
+    """Return the mean age of packets at their use [s]; lost packets do not count."""
     if config.trace is None:
         return max(config.delay, config.playout)
     delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
@@ -184,7 +184,7 @@ def longest_delay(config: NetworkConfig) -> float:
 
 
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
-    """Return the delays (N,) in steps, for one packet a period; -1 for a lost packet."""
+    """Return a trace file's delays (N,) [steps], one packet a period; -1 for a lost packet."""
     # The table reader starts slowly and is needed only for a trace.
     from drake_teleop.logs.read.tables import read_table
 
@@ -219,7 +219,7 @@ def _uniform(p, k, draw):
 
 @njit(cache=True)
 def _delay_steps(p, k, draw):
-    """Return the delay of packet k in steps, -1 if the trace lost it. Uses three draws."""
+    """Return the delay of packet k [steps], -1 if the trace lost it; use draws `draw` to + 2."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
         return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
@@ -240,7 +240,7 @@ def _delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _advance_chain(p, k, bad):
-    """Return the chain's state at step k, and the delays of packet and copy in steps (-1: none).
+    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none).
 
     `bad` is the state one step before: 0 good, 1 bad; before step 0 the probability of bad.
     """
@@ -264,13 +264,13 @@ def initial_state(
     """Return the state of a line before step 0.
 
     Args:
-        p: the line's `parameters`.
+        p: result of `parameters`.
         neutral: (N,) values at the receiver before the first packet. The line carries the first N
             numbers of a packet.
 
     Returns:
-        Receiver (4 + N,) with the last packet, and the packets in transit. Step k writes only the
-        places of packet k there, so a repeated step writes the same.
+        State of the receiver (4 + N,) with its last packet, and the packets in transit. There, step
+        k writes only the places of packet k, so a repeated step writes the same.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -279,7 +279,7 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Send the packet (N,) of step k; steps count from 0 without gaps."""
+    """Send the packet (N,) of step k over the line `state`; steps count from 0 without gaps."""
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
     receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
@@ -299,11 +299,10 @@ def receive(p, state, k, packet):
 
     Args:
         p, state, k: as for `send`.
-        packet: (N,) written: the newest packet, changed by the policy `silence` without a new
-            packet.
+        packet: (N,) written: the newest packet. If it is not new, the policy `silence` changes it.
 
     Returns:
-        The step at which the newest packet was sent, or -1; whether it is new.
+        The step at which the newest packet was sent, or -1; True if this packet is new.
     """
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
@@ -326,7 +325,7 @@ def receive(p, state, k, packet):
 
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
-    """Apply the policy `NetworkConfig.silence` after `silent` seconds without a packet."""
+    """Apply the policy `NetworkConfig.silence` to a packet, `silent` seconds after it."""
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0
@@ -340,7 +339,7 @@ def _fill_silence(policy, silent, packet):
 def packet_delays(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the delays of each packet and its copy (steps, 2) [steps]; -1 for none.
+    """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive.
 
     Args:
         config, seed, direction, period: as for `parameters`.
@@ -375,7 +374,7 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """Return the longest time without a new packet in a minute after the first [s].
+    """Return the longest time without a new packet in a minute after the first packet [s].
 
     Args:
         config, direction, period: as for `parameters`. The seed is fixed, not the scenario's.

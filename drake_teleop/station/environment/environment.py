@@ -21,7 +21,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloa
 
 
 class Stand(NamedTuple):
-    """Box on the floor that a replay shows below an environment; [m], in W."""
+    """Box on the floor that a replay shows below an environment: sizes and position [m], in W."""
 
     along_x: float
     along_y: float
@@ -31,7 +31,7 @@ class Stand(NamedTuple):
 
 
 class Environment(ABC):
-    """Object to touch; a scenario may have several. Subclasses are dataclasses.
+    """Object that the tool can touch; a scenario may have several. Subclasses are dataclasses.
 
     Its bodies may be fixed or move, with any shape that Drake supports. The wrist sensor's own
     contact law is faster; it supports boxes and a single `moving_part`.
@@ -40,11 +40,11 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip at which friction is complete [m/s]; the smallest of all environments applies."""
+        """Slip speed of full friction [m/s]; the smallest of all environments applies."""
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add it as its own model instances to a plant with the tool, before Finalize."""
+        """Add the object as own model instances to a plant with the tool, before Finalize."""
 
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
@@ -53,7 +53,7 @@ class Environment(ABC):
         return
 
     def check(self, where: str) -> None:
-        """Check rules across fields.
+        """Check rules that concern several fields.
 
         Raises:
             DrakeTeleopError: with `where` and the field.
@@ -62,7 +62,7 @@ class Environment(ABC):
 
     @property
     def parts(self) -> tuple[Environment, ...]:
-        """Itself, or its parts."""
+        """Parts of a composite environment; else only this environment."""
         return (self,)
 
     @property
@@ -74,18 +74,18 @@ class Environment(ABC):
     def moving_part(self) -> tuple[float, float, float] | None:
         """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic joint.
 
-        Its position is 0 at rest. None without such a body.
+        The joint's position is 0 at rest. None if there is no such body.
         """
         return None
 
     @property
     def stand(self) -> Stand | None:
-        """Stand below it in a replay."""
+        """Stand below the environment in a replay, if any."""
         return None
 
 
 class Several(Environment):
-    """Several objects to touch."""
+    """Composite environment of several objects."""
 
     def __init__(self, parts: Iterable[Environment]) -> None:
         self._parts = tuple(parts)
@@ -122,7 +122,7 @@ def NewInstance(plant: MultibodyPlant, name: str) -> ModelInstanceIndex:
 
 
 def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) -> None:
-    """Add a free joint for a body with this initial pose, before Finalize."""
+    """Add a free joint for a body with the initial pose X_WBody, before Finalize."""
     name, world = f"{body.name()}_floats", plant.world_frame()
     joint = plant.AddJoint(QuaternionFloatingJoint(name, world, body.body_frame()))
     turn = X_WBody.rotation().ToQuaternion().wxyz()
@@ -130,14 +130,14 @@ def LetFloat(plant: MultibodyPlant, body: RigidBody, X_WBody: RigidTransform) ->
 
 
 def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
-    """Return the tool's body and the bodies welded to it, after Finalize."""
+    """Return the indices of the tool's body and the bodies welded to it, after Finalize."""
     return [body.index() for body in plant.GetBodiesWeldedTo(plant.get_body(tool))]
 
 
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """Return the shapes with contact properties of the tool and the bodies welded to it."""
+    """Return the shapes with contact properties for each body of the tool (see `BodiesOfTool`)."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [
@@ -155,7 +155,7 @@ def ExcludeContact(
     shapes: Iterable[GeometryId],
     bodies: Iterable[BodyIndex],
 ) -> None:
-    """Exclude contact between some shapes and those of some bodies."""
+    """Exclude contact between `shapes` and the shapes of `bodies`."""
     others = [
         shape
         for body in bodies

@@ -1,4 +1,4 @@
-"""Poses of moving bodies from the plant's state, compiled, for contact between its steps.
+"""Poses of moving bodies from the plant's state, compiled, for contact between plant steps.
 
 The bodies are connected to each other and the world by revolute, prismatic, free or fixed joints.
 From parent to child, with F on the parent P and M on the body B,
@@ -41,24 +41,24 @@ Array = NDArray[np.float64]
 
 _FIXED, _REVOLUTE, _PRISMATIC, _FREE = range(4)
 _PARENT, _KIND, _Q, _V, _AXIS, _F, _M = 0, 1, 2, 3, 4, 7, 14
-#: Columns of the table of joints.
+#: Number of columns of the table of joints.
 JOINT_WIDTH = 21
 #: Numbers of a body: q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3).
 POSE_AND_TWIST = 13
 
 
 def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Array, list[int]]:
-    """Return the joints between the bodies and the world, and the bodies of the rows.
+    """Return a table of the joints between the bodies and the world, and the body of each row.
 
     Args:
-        plant: finalized.
+        plant: finalized plant.
         bodies: bodies that are not anchored.
 
     Returns:
-        (m, 21) table, parents first: 0 row of the parent, or -1 if it is anchored; 1 the kind; 2
-        and 3 first index of positions and velocities in the state [q; v]; 4-6 axis; 7-13 and 14-20
-        X_PF, or X_WF, and X_MB, a quaternion and a position each. The index of the body of each
-        row; `bodies` and their parents.
+        Table (m, 21) with a joint in each row, parents first: 0 row of the parent, or -1 if it is
+        anchored; 1 type of joint; 2 and 3 first index of positions and velocities in the state
+        [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored parent) and 14-20 X_MB, a quaternion and a
+        position each. Body index of each row: `bodies` and their parents.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above: dict[int, tuple[int, int]] = {}
@@ -112,7 +112,7 @@ def _quaternion(x, i):
 
 @njit(cache=True)
 def bodies_into(joints, state, out):
-    """Write pose and twist (m, 13), see `POSE_AND_TWIST`, for the plant's state [q; v]."""
+    """Write the bodies' pose and twist (m, 13), see `POSE_AND_TWIST`, at the state [q; v]."""
     still = (0.0, 0.0, 0.0)
     for k in range(joints.shape[0]):
         row = joints[k]
@@ -155,7 +155,7 @@ def bodies_into(joints, state, out):
 
 @njit(cache=True)
 def _hermite(h, u, a, a_dot, b, b_dot):
-    """Return value and rate at the fraction u of h on a cubic from a to b."""
+    """Return value and rate of a cubic from a to b at the fraction u of the interval h [s]."""
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))
@@ -164,16 +164,16 @@ def _hermite(h, u, a, a_dot, b, b_dot):
 
 @njit(cache=True)
 def _quaternion_rate(spin, turn):
-    """Return the rate of a quaternion for an angular velocity."""
+    """Return the rate of the quaternion `turn` for the angular velocity `spin`."""
     return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
 
 
 @njit(cache=True)
 def interpolate_bodies(joints, h, u, start, end, out):
-    """Write the joints' state at the fraction u of a step of h [s] into `out`.
+    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`.
 
-    Positions are cubics, velocities their rates: third order, as the integrator. The rest of `out`
-    is unchanged.
+    Positions are cubic polynomials in time, velocities are their rates: third order, as the
+    integrator. The rest of `out` is unchanged.
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]

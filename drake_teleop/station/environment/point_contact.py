@@ -4,6 +4,8 @@ The wrist sensor samples between the steps of the plant, where Drake has no cont
 is that of Drake for continuous plants (Hunt and Crossley 1975; regularised Coulomb friction):
 
     f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
+
+with depth x, stiffness k, dissipation d, slip velocity v_t, slip speed v_s of full friction.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from drake_teleop.common.vectors import (
 
 Array = NDArray[np.float64]
 
-#: Columns of `Pairs.known`: stiffness; static and dynamic friction; row of the body.
+#: Columns of `Pairs.known`: stiffness; static and dynamic friction; row of the box's body.
 STIFFNESS, FRICTION, BODY = 22, slice(24, 26), 27
 #: Number of columns of `Pairs.known` and `Pairs.watched`.
 WIDTH, WATCHED_WIDTH = 28, 40
@@ -48,15 +50,15 @@ class Pairs(NamedTuple):
 
     Attributes:
         known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
-            3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest, or of the box in its body if
-            that moves, 16-18 half the box's edges, 19-21 direction of motion in W as a leaf (zero
-            if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and dynamic
-            friction, 26 slip at which it is complete [m/s], 27 the row of its body in a
+            3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
+            the body moves), 16-18 half the box's edges, 19-21 direction in which a leaf moves in W
+            (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and
+            dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the body in a
             `JointTable`, or -1.
         watched: (l, 40), bounding boxes of all other pairs, see `separation`. As above, with 0-2
-            the centre of the tool's box, 3 unused; 28-36 R_SBox of that by rows, 37-39 half its
-            edges.
-        unknown: reason for the first of the other pairs.
+            the centre of the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39
+            half its edges.
+        unknown: reason why the first of the other pairs is not in `known`.
     """
 
     known: Array
@@ -75,12 +77,12 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized; a leaf of the environment is at 0 by default.
-        inspector: of the scene graph.
-        tool: the tool's shapes, and the poses of their bodies in S.
-        environment: model instances that it may touch.
-        slip: at which friction is complete [m/s]; the plant's stiction tolerance.
-        moving: bodies of a `JointTable`, row by row.
+        plant: finalized plant; a leaf of the environment is at 0 by default.
+        inspector: inspector of the scene graph.
+        tool: shapes of the tool -> poses of their bodies in S.
+        environment: model instances that the tool may touch.
+        slip: slip speed v_s of full friction [m/s]; the plant's stiction tolerance.
+        moving: indices of the bodies of a `JointTable`, row by row.
 
     Raises:
         DrakeTeleopError: for an unbounded shape.
@@ -152,7 +154,7 @@ def _sphere_and_box(
 
 
 def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) -> Array:
-    """Return the body's velocity in W for a unit speed of its prismatic joint."""
+    """Return the body's velocity in W for a unit speed of its prismatic joint; 0 without one."""
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
     direction = np.zeros(3)
     for joint in map(plant.get_joint, plant.GetJointIndices()):
@@ -163,7 +165,7 @@ def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) 
 
 
 def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    """Return k, d, static and dynamic friction of a pair, as in Drake.
+    """Return stiffness, dissipation, static and dynamic friction of a pair, as in Drake.
 
     Springs are in series, dissipation is weighted by deformation, friction is the harmonic mean.
     """
@@ -189,9 +191,9 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
     Args:
         pair: (28,) row of `Pairs`.
-        p_WS: (3,) origin of the tool's frame in W [m].
-        R_WS: (3, 3) its rotation.
-        deflection: of the environment [m].
+        p_WS: (3,) origin of the sensor frame S in W [m].
+        R_WS: (3, 3) rotation of S.
+        deflection: deflection of the leaf [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
     """
@@ -235,15 +237,15 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
 
 @njit(cache=True)
 def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: float) -> float:
-    """Return a lower bound of the distance of two boxes [m], below 0 if they may touch.
+    """Return a lower bound of the distance between two boxes [m], below 0 if they may touch.
 
-    It is the largest gap along the edges of either (Gottschalk 1996, without the cross products).
+    It is the largest gap along an edge of either box (Gottschalk 1996, without the cross products).
 
     Args:
         pair: (40,) row of `Pairs.watched`, for the tool's box.
-        box: (28,) the same row with the present pose of the other box.
-        p_WS, R_WS: of the tool's frame in W.
-        deflection: of the environment [m].
+        box: (28,) this row with the present pose of the other box.
+        p_WS, R_WS: position and rotation of the sensor frame S in W.
+        deflection: deflection of the leaf [m].
     """
     R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
     between = plus(between, apply(R, three(pair, 0)))
@@ -266,7 +268,7 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
 
 @njit(cache=True)
 def _friction(static: float, dynamic: float, slip: float) -> float:
-    """Return the regularised coefficient at a slip in units of v_s (Drake's StribeckModel)."""
+    """Return the friction coefficient at a slip in units of v_s (Drake's StribeckModel)."""
     if slip < 1.0:
         return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
     if slip < 3.0:
@@ -277,13 +279,13 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 
 @njit(cache=True)
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
-    """Write the force on a sphere at depth `x` in its box.
+    """Write the contact force on a sphere at the depth `x` in its box.
 
     Args:
         pair: (28,) row of `Pairs`.
         x: depth [m].
-        normal: (3,) out of the box.
-        velocity: (3,) of the sphere at the point of contact, relative to the box [m/s].
+        normal: (3,) direction out of the box.
+        velocity: (3,) velocity of the sphere at the point of contact, relative to the box [m/s].
         force: (3,) written [N].
     """
     out = dot(velocity, normal)

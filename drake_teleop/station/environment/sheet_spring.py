@@ -47,23 +47,23 @@ class SheetSpring(Environment):
 
     @property
     def stiffness(self) -> float:
-        """k = 3 E I / L^3 [N/m] at the free end, I = b h^3 / 12 (Euler-Bernoulli)."""
+        """Stiffness at the free end, 3 E I / L^3 [N/m], with I = b h^3 / 12 (Euler-Bernoulli)."""
         second_moment = self.width * self.thickness**3 / 12
         return 3 * self.youngs_modulus * second_moment / self.length**3
 
     @property
     def effective_mass(self) -> float:
-        """33/140 of the leaf's mass [kg] (Rayleigh, static deflection shape)."""
+        """Mass of the mode, 33/140 of the leaf's mass [kg] (Rayleigh, static deflection shape)."""
         return 33 / 140 * self.density * self.length * self.width * self.thickness
 
     @property
     def damping(self) -> float:
-        """Viscous damping of the mode [N s/m]."""
+        """Viscous damping of the bending mode [N s/m]."""
         return 2 * self.damping_ratio * np.sqrt(self.stiffness * self.effective_mass)
 
     @property
     def largest_small_deflection(self) -> float:
-        """10 % of the length [m], the limit of the linear leaf model."""
+        """Limit of the linear leaf model, 10 % of the length [m]."""
         return 0.1 * self.length
 
     @property
@@ -79,7 +79,7 @@ class SheetSpring(Environment):
     def AddTo(self, plant: MultibodyPlant) -> None:
         """Add the leaf to a plant that is registered with a scene graph, before Finalize.
 
-        Its one degree of freedom, "bending", is the deflection of its end along z_W [m], 0 at rest.
+        The joint "bending" is the deflection of the leaf's end along z_W [m], 0 at rest.
         """
         tree = ElementTree.parse(models_dir() / "sheet_spring.sdf")
         # Drake fixes a body's mass when it parses it, so the mass is written into the text.

@@ -57,26 +57,26 @@ class Slot(Environment):
 
     @property
     def width(self) -> float:
-        """Distance of the walls [m]."""
+        """Distance between the walls [m]."""
         return 2 * PEG_RADIUS + self.clearance
 
     @property
     def slip(self) -> float:
-        """Slip at which friction is complete [m/s] (E).
+        """Slip speed at which friction is complete [m/s] (E: estimate).
 
-        A peg at rest creeps more slowly. A tenth of this value makes its simulation three times as
+        A peg at rest creeps more slowly. A tenth of this value makes the simulation three times as
         long.
         """
         return 1e-3
 
     @property
     def foot(self) -> float:
-        """z_W of the floor's lower face [m]."""
+        """Height z_W of the floor's lower face [m]."""
         return self.position[2] - self.depth - _FLOOR
 
     @property
     def X_WM(self) -> RigidTransform:
-        """Pose of the middle of the mouth, x along the slot, z up."""
+        """Pose X_WM of the middle of the slot's mouth; x is along the slot, z is up."""
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
 
     @property
@@ -104,30 +104,30 @@ class Slot(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Give the tool's balls the slot's material."""
+        """Assign the slot's contact material to the tool's balls."""
         source = plant.get_source_id()
         for ball in plant.GetCollisionGeometriesForBody(plant.get_body(tool)):
             scene_graph.AssignRole(source, ball, _material(self), RoleAssign.kReplace)
 
 
 def _material(slot: Slot) -> ProximityProperties:
-    """Return the material of either side: springs in series, equal dissipation and friction."""
+    """Return the contact material of both sides: equal springs in series give `stiffness`."""
     return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
 
 
 def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
-    """Return the boxes in M, by name."""
+    """Return pose in M and shape of each box of the slot, by name."""
     edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
     boxes = {}
     for name, side in (("left", 1.0), ("right", -1.0)):
 
         def block(inner: float, top: float, side: float = side) -> tuple[RigidTransform, Box]:
-            """Return a box from `inner` outwards, from `top` down to the floor."""
+            """Return a box from `inner` outwards and from the height `top` down to the floor."""
             across, height = edge + c + _SIDE - inner, depth + top
             middle = RigidTransform([0.0, side * (inner + across / 2), top - height / 2])
             return middle, Box(LENGTH, across, height)
 
-        # Its upper face is the chamfer; its thickness fills the gap of wall and top.
+        # The upper face of this box is the chamfer; its thickness fills the gap of wall and top.
         tilt, thick = RotationMatrix.MakeXRotation(side * np.pi / 4), c / np.sqrt(2)
         face = np.array([0.0, side * (edge + c / 2), -c / 2])
         into = RigidTransform(tilt, face - tilt.matrix()[:, 2] * thick / 2)

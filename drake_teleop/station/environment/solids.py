@@ -37,10 +37,10 @@ _BLOCK_COLOUR = np.array([0.30, 0.42, 0.58, 1.0])
 @settings
 @dataclass
 class Surface(Environment):
-    """Surface of the object alone; Drake combines it with that of the other object.
+    """Object with a contact surface; Drake combines it with the surface of the other object.
 
     Stiffnesses are springs in series, k1 k2 / (k1 + k2). Friction is the harmonic mean,
-    2 mu1 mu2 / (mu1 + mu2). The tool's ball has 4e5 N/m and 0.2.
+    2 mu1 mu2 / (mu1 + mu2). The tool's ball has stiffness 4e5 N/m and friction 0.2.
     """
 
     stiffness: float = quantity(
@@ -55,11 +55,11 @@ class Surface(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip at which friction is complete [m/s] (E)."""
+        """Slip speed of full friction [m/s] (E: estimate)."""
         return 1e-3
 
     def material(self) -> ProximityProperties:
-        """Return the properties for Drake's point contact."""
+        """Return the surface properties for Drake's point contact."""
         return ContactMaterial(self.stiffness, self.dissipation, self.friction)
 
 
@@ -77,7 +77,7 @@ class Box(Surface):
     size: list[float] = quantity([0.3, 0.3, 0.1], "m", 1e-3, 4.0, "lengths of its edges")
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the box, fixed in the world."""
+        """Add the box to the plant, fixed in the world."""
         X_WBox = RigidTransform(RollPitchYaw(self.rotation), self.position)
         AddFixedBox(plant, "box", X_WBox, self.size, self)
 
@@ -89,10 +89,10 @@ def AddFixedBox(
 
     Args:
         plant: not finalized.
-        name: of the body, and of the model instance (with a number if the name exists).
+        name: name of the body and of the model instance (with a number if the name exists).
         X_WBox: pose of the box.
         size: (3,) lengths of its edges [m].
-        surface: its surface.
+        surface: contact surface of the box.
     """
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
@@ -125,7 +125,7 @@ class Wall(Surface):
             )
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add a box behind the face, with z along the normal."""
+        """Add the wall as a box behind its face, with z along the normal."""
         R_WWall = RotationMatrix.MakeFromOneVector(np.array(self.normal), 2)
         X_WWall = RigidTransform(R_WWall, self.position)
         behind = RigidTransform([0.0, 0.0, -_THICKNESS / 2])
@@ -148,7 +148,7 @@ class Block(Surface):
     )
 
     def check(self, where: str) -> None:
-        """Check that the table carries the block."""
+        """Check that the table is not smaller than the block."""
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
                 "the table is smaller than the block",
@@ -164,7 +164,7 @@ class Block(Surface):
         return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the block at rest on its table; without a scene graph they have no shapes."""
+        """Add block and table to the plant; without a scene graph they have no shapes."""
         if min(self.table) > 0.0:
             below = np.array(self.position) - [0.0, 0.0, _TABLE_THICKNESS / 2]
             AddFixedBox(

@@ -1,7 +1,8 @@
-"""Contact detection at the slave from the wrench without the load's part, for the operator.
+"""Contact detection at the slave from the wrench without the load's part.
 
-`drake_teleop.load.contact` describes the statistic. Noise floor and threshold come from the
-identification run before: free motion of the same load with the same sensor.
+The flag is displayed to the operator. `drake_teleop.load.contact` describes the statistic. Noise
+floor and threshold come from an earlier identification: free motion of the same load with the same
+sensor.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -32,7 +33,7 @@ from drake_teleop.station.slave.arm import ArmModel, acceleration_into
 @settings
 @dataclass
 class ContactDetectionConfig:
-    """Settings of the contact detector; a scenario without this block has none."""
+    """Settings of the contact detector; a scenario without this block has no detector."""
 
     statistic: str = choice("glr", STATISTICS, "statistic that is compared with the threshold")
     margin: float = quantity(
@@ -49,7 +50,10 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _update_flag(memory, sample, estimate, arm, settings):
-    """Update the detector with one sample and return its flag; a fault keeps the flag."""
+    """Update the detector with one sample; return whether there is contact.
+
+    An invalid sample or estimate does not change the result.
+    """
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
     contact, acceleration = np.empty(6), np.empty(3)
@@ -63,22 +67,22 @@ def _update_flag(memory, sample, estimate, arm, settings):
 class ContactDetection(LeafSystem):
     """Detector of contact between slave and environment.
 
-    The flag keeps its value while the wrist sensor is saturated and while its low-pass recovers.
+    The flag keeps its value while the wrist sensor is saturated or the sensor's low-pass recovers.
 
     .. pydrake_system::
 
         name: ContactDetection
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.load.regressor`
-        - load_estimate: (16,) Eq. (7), [offsets; phi]
+        - sample: sample of the wrist sensor, see `drake_teleop.load.regressor`
+        - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
         output_ports:
         - contact: (1,) 1 in contact, else 0
 
     Args:
         config: settings of the detector.
-        floor: noise floor of the free motion, fitted at the rate of this block.
+        floor: noise floor in free motion, fitted at the rate of this block.
         arm: the slave's kinematics.
-        period: between samples [s].
+        period: time between samples [s].
 
     Raises:
         DrakeTeleopError: if the floor was not fitted to a motion.

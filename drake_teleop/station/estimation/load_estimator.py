@@ -34,7 +34,7 @@ _CHECK_SAMPLES = 16
 @settings
 @dataclass
 class LoadEstimatorConfig:
-    """Recursive estimation with offsets, Eqs. (7)-(8)."""
+    """Recursive estimation of load and offsets, Eqs. (7)-(8)."""
 
     enabled: bool = plain(
         False,
@@ -63,10 +63,10 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Check that the method suits `watch`.
+        """Check that the method can be combined with `watch`.
 
         Raises:
-            DrakeTeleopError: with `where`, if its covariance is too small.
+            DrakeTeleopError: with `where`, if the method's covariance is too small.
         """
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
@@ -77,7 +77,7 @@ class LoadEstimatorConfig:
 
 
 class LoadEstimator(LeafSystem):
-    """Load estimate that is constant, updated with every sample, or monitored.
+    """Load estimator whose estimate is constant, updated with every sample, or monitored.
 
     .. pydrake_system::
 
@@ -91,14 +91,16 @@ class LoadEstimator(LeafSystem):
 
     Args:
         config: settings.
-        noise_std: (6,) weights, 1 sigma of the wrench channels [N, N m].
-        motion_std: (9,) 1 sigma of s [m/s^2], omega [rad/s] and alpha [rad/s^2], for "rtls" and for
-            `watch`. For learning only their ratios matter.
+        noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
+        motion_std: (9,) standard deviations of specific force s [m/s^2], angular velocity omega
+            [rad/s] and angular acceleration alpha [rad/s^2], for "rtls" and for `watch`. For
+            learning only their ratios matter.
         period: sampling period [s].
         sample_size: length of the sample.
-        initial: (16,) the estimate to start from.
-        covariance: (16, 16) of it, or None if unknown. With it, monitoring begins at once.
-        fallback: (10,) phi after a change of load.
+        initial: (16,) initial estimate.
+        covariance: (16, 16) covariance of `initial`; None if unknown. With it, `watch` begins at
+            once.
+        fallback: (10,) phi to use after a change of load.
 
     Raises:
         DrakeTeleopError: for `watch` without `enabled` and without a covariance.

@@ -1,1 +1,1 @@
-"""Methods that keep a bilateral station passive over a channel, and their energy accounts."""
+"""Methods that keep a bilateral station passive over a channel, and their energy balances."""

@@ -1,6 +1,6 @@
-"""Stiffness and damping of a contact from force, depth and speed.
+"""Estimation of a contact's stiffness k and damping b from force, depth and speed.
 
-Over successive stretches of the displacement into the contact,
+Over successive pieces of displacement (stretches),
 
     change of force = k displacement + b change of speed
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from drake_teleop.common.compiled import njit
 
-NUM_SUMS = 5  #: length of the sums of a contact, zero at the start
+NUM_SUMS = 5  #: number of sums of the fit; all are 0 at the start
 # Relative increase of the squared speed changes: where speed and displacement are proportional, the
 # fit then assigns the force to stiffness.
 _RIDGE = 0.05
@@ -19,17 +19,17 @@ _RIDGE = 0.05
 
 @njit(cache=True)
 def update_fit(sums, force_change, displacement, speed_change, keep):
-    """Add a stretch to the sums and return the present estimate.
+    """Add one stretch to the sums of the fit and return the present stiffness and damping.
 
     Args:
-        sums: (NUM_SUMS,) updated: products of displacement, speed change and force change.
-        force_change: [N].
+        sums: (NUM_SUMS,) products of displacement, speed change and force change; updated.
+        force_change: change of the contact force [N].
         displacement: displacement into the contact [m], not 0.
-        speed_change: change of the speed into it [m/s].
+        speed_change: change of the speed into the contact [m/s].
         keep: share of the old sums that is kept, 0 to 1.
 
     Returns:
-        stiffness [N/m] and damping [N s/m], neither below 0.
+        Stiffness [N/m] and damping [N s/m], both at least 0.
     """
     for i in range(NUM_SUMS):
         sums[i] *= keep
@@ -41,24 +41,25 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
     square = (1.0 + _RIDGE) * sums[2]
     determinant = sums[0] * square - sums[1] * sums[1]
     damping = sums[0] * sums[4] - sums[1] * sums[3]
-    if not damping > 0.0:  # below, the determinant is not 0
+    if not damping > 0.0:  # after this branch the determinant is not 0
         return max(sums[3] / sums[0], 0.0), 0.0
     return max(square * sums[3] - sums[1] * sums[4], 0.0) / determinant, damping / determinant
 
 
 @njit(cache=True)
 def smooth_slip(displayed, component, explained, share, max_slip):
-    """Return the rendered force along a mean direction that friction has tilted [N].
+    """Return the force to render along the contact's mean direction, without steps by slips [N].
 
-    A slip changes the component by up to f^2 / |w|, although the contact force is the same. A step
-    of up to that size which depth and speed do not explain is rendered gradually (S3).
+    Friction f tilts the mean direction of the contact wrench w. A slip then changes the component
+    along it by up to f^2 / |w|. Changes of up to this size that depth and speed do not explain are
+    rendered gradually (step S3).
 
     Args:
         displayed: previous result [N].
-        component: present component along the mean, not negative [N].
+        component: present component of w along the mean direction, not negative [N].
         explained: change that depth and speed explain [N].
         share: share of the remaining change that is rendered now.
-        max_slip: f^2 / |w|, with the largest recent friction [N].
+        max_slip: f^2 / |w| for the largest recent f [N].
     """
     displayed += explained
     displayed += min(share, 1.0) * (component - displayed)
@@ -69,10 +70,10 @@ def smooth_slip(displayed, component, explained, share, max_slip):
 def slip_change(force_change, largest_change, max_slip):
     """Return the part of a stretch's force change that friction explains [N].
 
-    It is the part outside the range between stiffness 0 and the largest one, bounded by `max_slip`.
+    It is the part that no stiffness from 0 to the largest one explains, at most `max_slip`.
 
     Args:
-        force_change: [N].
+        force_change: change of the contact force [N].
         largest_change: change by the largest stiffness, with the sign of the displacement [N].
         max_slip: as in `smooth_slip` [N].
     """

@@ -1,11 +1,11 @@
 """Energy observers: energy through a port from recorded wrenches and poses.
 
-The pair of wrench and displacement depends on the port:
+The work of a step pairs a wrench with a displacement:
 
 - `held`: f_(k-1) . (x_k - x_(k-1)), exact for a wrench that is held between samples: the hand's
   port and a motor's.
-- `backward`: f_k . (x_k - x_(k-1)), known when a method selects f_k. TDPA and waves are exact in
-  it.
+- `backward`: f_k . (x_k - x_(k-1)), known when a method selects f_k. The energy balances of TDPA
+  and wave variables are exact for it.
 - `mean`: mean of both, of second order for a steadily changing wrench such as contact.
 """
 
@@ -23,7 +23,7 @@ from drake_teleop.station.passivity.packet import difference_into, dot
 
 Array = NDArray[np.float64]
 
-#: Pair -> weight of f_k; f_(k-1) has the rest.
+#: Name of the pair -> weight of f_k; the weight of f_(k-1) is 1 minus it.
 PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
@@ -32,12 +32,12 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
 
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
-        pose: (N, 7) [qw qx qy qz px py pz] of the port, in W, at the same instants.
+        pose: (N, 7) pose of the port [qw qx qy qz px py pz], in W, at the same instants.
         pair: one of `PAIRS`.
 
     Returns:
-        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample. The hand puts
-        in the negative at the master's port; the environment puts in this at the slave's port.
+        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample. This is the
+        environment's energy input at the slave's port, and minus the hand's at the master's port.
 
     Raises:
         DrakeTeleopError: for an unknown pair or arrays of wrong shape.
@@ -70,23 +70,23 @@ def _work_into(wrench, pose, share, work):
 
 
 def created(energy: Array) -> Array:
-    """Return the least energy that was created up to each sample: max(0, -energy), monotonic.
+    """Return the energy created up to each sample: the running maximum of max(0, -energy) [J].
 
     Args:
-        energy: (N, ...) put into a passive element without stored energy at the start [J].
+        energy: (N, ...) energy input of an element without stored energy at the start [J].
     """
     return np.maximum.accumulate(np.maximum(-np.asarray(energy), 0.0), axis=0)
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Energy balance of the method at one end of the channel, each field (..., 2) [J].
+    """Energy balance at one end of the channel; fields (..., 2): translation, rotation [J].
 
     Attributes:
         stored: energy that the end may still release.
-        received: counter of the other end, as accounted.
-        sent: counter of this end.
-        lost: energy removed from the loop. `tdpa`: withheld work, a measure of its activity;
+        received: energy received from the other end so far.
+        sent: energy sent so far.
+        lost: energy removed from the loop. `tdpa`: work of the withheld wrench and motion;
             `two_layer`, `pspm`, `ledger`: overflow; `wave`: dissipation of the matching damper.
     """
 
@@ -97,7 +97,7 @@ class Ledger:
 
 
 def ledger(memory: Array) -> Ledger:
-    """Return the energy balance in the memory (..., MEMORY) of an end; zero for methods without."""
+    """Return the energy balance in the memory (..., MEMORY) of an end; zero if it keeps none."""
     if memory.shape[-1] != MEMORY:
         raise DrakeTeleopError(
             f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"
@@ -109,5 +109,5 @@ def ledger(memory: Array) -> Ledger:
 
 
 def in_flight(master: Ledger, slave: Ledger) -> Array:
-    """Return the energy that is sent and has not arrived, both directions, (..., 2) [J]."""
+    """Return the energy (..., 2) that was sent and has not arrived, sum of both directions [J]."""
     return (master.sent - slave.received) + (slave.sent - master.received)

@@ -1,7 +1,8 @@
-"""Energy ledger at the slave's actual motion: parameters and the master's end.
+"""Energy ledger, a passivity method at the slave's actual motion: parameters and master's end.
 
-docs/theory.md, section "The energy ledger", contains the law, its promises and the purpose of each
-constant. M1 to M7 and S1 to S6 are the steps there. `ledger_slave` is the slave's end.
+docs/theory.md, section "The energy ledger", contains the equations, the guarantees, the purpose of
+each constant, and the steps M1 to M7 (master) and S1 to S6 (slave). `ledger_slave` is the slave's
+end.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -94,8 +95,8 @@ _BRAKE_N, _FULL_BRAKE_SPEED, _NO_BRAKE_SPEED = 0.5, 0.1, 0.05  # N, m/s, m/s
 # Memory. The first places are those of `ledger_slave`, up to `NORMAL`.
 _places = own_memory()
 _places.vector(NORMAL.stop - OWN_VELOCITY.start)
-# Distance of hand and slave at the onset. The remembered wall: direction into it, stiffness (0: no
-# wall), depth of the hand in it, impulse that the slave missed in it.
+# Pose difference of hand and slave at the onset of contact. Remembered wall: direction into it,
+# stiffness (0: no wall), depth of the hand in it, missing impulse of the slave in it.
 _OFFSET, _INWARD = _places.vector(6), _places.vector(6)
 _WALL_STIFFNESS, _WALL_DEPTH, _UNMET_IMPULSE = _places.number(), _places.number(), _places.number()
 _FRICTION_WRENCH, _MAX_FRICTION = _places.vector(6), _places.vector(2)
@@ -105,7 +106,7 @@ _DRAG_ACTIVE = _places.vector(2)
 # Number of the newest packet; whether the wrench cross-fades; wrench before the energy limit.
 _NEWEST_PACKET, _CROSS_FADING, _LAST_WRENCH = _places.number(), _places.vector(2), _places.vector(6)
 
-AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
+AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
 
 
 @settings
@@ -138,7 +139,7 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """See `Methods`."""
+        """Write the parameters into `p`."""
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -150,17 +151,17 @@ class LedgerConfig:
 
 
 def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
-    """Give half of the initial energy to an end; place the servo model at the slave's pose."""
+    """Write half of the initial energy and the servo model's initial pose into an end's memory."""
     memory[LEDGER] = p[INITIAL] / 2.0
     memory[SERVO_MODEL] = memory[COMMAND_POSE]
 
 
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest speed of the slave with full reserves, step S4 (2,) [m/s, rad/s].
+    """Return the largest speed (2,) of the slave that a full reserve permits [m/s, rad/s].
 
     Args:
-        config: contains the reserves, which grow with the square of the speed.
-        mass: (2,) of the slave, in the master's power units [kg, kg m^2].
+        config: parameters; `reserve` is the bound of the kinetic energy (step S4).
+        mass: (2,) mass and inertia of the slave, in the master's power units [kg, kg m^2].
     """
     left = (1.0 - MARGIN) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (MASS_FACTOR * mass))
@@ -168,7 +169,7 @@ def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """See `methods.master_step`."""
+    """Run the master's step, see `methods.master_step`."""
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
     smooth_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
     memory[_WALL_DEPTH] += work_along(memory[_INWARD], dx)
@@ -206,7 +207,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    """Step M1."""
+    """Update the master's ledger by the work on the hand (step M1)."""
     work, ledger = dot(memory[HELD_WRENCH], dx, g), memory[LEDGER]
     memory[_WORK_ON_HAND][g] = max(memory[_WORK_ON_HAND][g] + work, 0.0)
     if work < 0.0 and in_contact and ledger[g] > _FORWARD_LEVEL * p[MASTER_RESERVE][g]:
@@ -219,7 +220,8 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     """Write the predicted contact wrench (M2, M3) into `wrench`.
 
-    `offset_to_slave` contains x_m - z; it may be the same array as `wrench`.
+    `offset_to_slave` (6,), which may be `wrench`, contains x_M - z: pose of the hand minus pose of
+    the slave without a wall.
     """
     contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
@@ -290,7 +292,7 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, memory):
-    """Step M2, (T68)."""
+    """Update the friction wrench and its limit (M2, (T68))."""
     normal, friction, largest = memory[NORMAL], memory[_FRICTION_WRENCH], memory[_MAX_FRICTION]
     # A torque's weight in the metric is 0 where rotation is not transmitted.
     metric, displacement, total = max(p[METRIC][g], 1e-12), work_along(normal, dx), 0.0
@@ -308,7 +310,7 @@ def _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, m
 
 @njit(cache=True)
 def _add_friction(dx, force_ratio, p, memory, wrench):
-    """Write the friction h, advanced by one step (M2)."""
+    """Write the friction wrench h, advanced by one step (M2), into `wrench`."""
     normal, displacement = memory[NORMAL], work_along(memory[NORMAL], dx)
     for g in range(2):
         metric = max(p[METRIC][g], 1e-12)
@@ -321,7 +323,7 @@ def _add_friction(dx, force_ratio, p, memory, wrench):
 
 @njit(cache=True)
 def _cross_fade(g, T, p, memory, wrench):
-    """Bound the change of the wrench after fading packets or a change of contact."""
+    """Bound the change of the wrench after missing packets or a change of contact."""
     last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -337,7 +339,7 @@ def _cross_fade(g, T, p, memory, wrench):
 
 @njit(cache=True)
 def _limit_to_ledger(g, dx, T, p, memory, wrench):
-    """Shorten the wrench so that its cost until the next step is within the ledger (M5)."""
+    """Shorten the wrench to the energy that it may use until the next step (M5)."""
     size, cost = length(wrench, g), 0.0
     if size > 0.0:
         displacement = dot(wrench, memory[OWN_VELOCITY], g) / size * T
@@ -356,9 +358,10 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
-    """Return the share of an energy-absorbing force that an empty ledger permits, 0 to 1.
+    """Return the share of a braking wrench that the ledger permits, 0 to 1.
 
-    The velocity filter detects a reversal at least one encoder step late (M5).
+    The velocity filter detects a reversal at least one encoder step late: with an empty ledger the
+    wrench must not push the hand until then (M5).
     """
     if memory[LEDGER][g] >= MARGIN * p[SLAVE_RESERVE][g]:
         return 1.0
@@ -369,7 +372,7 @@ def _opposing_share(g, dx, T, p, memory):
 
 @njit(cache=True)
 def _add_drag(g, received, dx, T, p, memory, wrench):
-    """Step M6."""
+    """Add drag on the hand to the wrench (M6)."""
     velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
     speed, master_level = length(velocity, g), memory[LEDGER][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.

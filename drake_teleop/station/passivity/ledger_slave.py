@@ -1,6 +1,6 @@
 """Slave's end of the energy ledger (long: all steps of one end).
 
-See docs/theory.md, section "The energy ledger": steps S1 to S6, promises, constants.
+See docs/theory.md, section "The energy ledger": steps S1 to S6, guarantees, constants.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from drake_teleop.station.passivity.packet import (
 )
 
 # docs/theory.md, "The energy ledger", lists the purpose of each constant.
-#: Of translation and rotation: angle for a length, torque for a force.
+#: For translation and rotation: angle that equals a unit length, torque that equals a unit force.
 ANGLE_PER_LENGTH, TORQUE_PER_FORCE = (1.0, 10.0), (1.0, 0.01)
 MARGIN = 0.03  #: share of the slave's reserve that is never used
 SHARED_RESERVE = 0.7  #: share of the slave's reserve that the master may hold in contact
@@ -80,7 +80,8 @@ _HORIZON_S = 4e-3
 _FREE_FORCE_N = 5.0
 _STANDSTILL_SPEED, _DECELERATION = 2e-3, 20.0  # m/s, m/s^2
 
-# In the packet of the slave: k_c, b and round trip. Of both: ledger. Of the master: newest packet.
+# Fields of the slave's packet: k_c, damping b, round trip. Of both packets: level of the sender's
+# ledger. Of the master's packet: number of the newest packet from the slave.
 CONTACT_STIFFNESS, CONTACT_DAMPING, ROUND_TRIP = range(INTEGRAL.start, INTEGRAL.start + 3)
 LEDGER_LEVEL = OTHER_ENERGY
 ECHO = INTEGRAL.stop - 1
@@ -97,7 +98,7 @@ MEAN_WRENCH, NORMAL = _places.vector(6), _places.vector(6)
 SERVO_MODEL, _SERVO_MODEL_TWIST = _places.vector(7), _places.vector(6)
 _MOTOR_WRENCH = _places.vector(6)
 _BALANCE, _CONTACT_INPUT = _places.vector(2), _places.vector(2)  # A, Q
-# k, b; rho and its goal, c - 1, depth of the slave in the wall.
+# k and b of the contact; rho and its goal; c - 1; depth of the slave in the wall.
 _CONTACT_STIFFNESS, _CONTACT_DAMPING = _places.number(), _places.number()
 _DISPLAYED_SHARE, _SHARE_GOAL, _EXTRA_GAIN, _WALL_DEPTH = (_places.number() for _ in range(4))
 # Fit of k and b: filtered force; force and speed at the start of the stretch; its length and the
@@ -114,7 +115,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    """Filter the velocity of this end, with `share` of the new twist."""
+    """Low-pass the velocity of this end; `share` is the weight of the new twist."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -122,7 +123,7 @@ def smooth_velocity(twist, share, memory):
 
 @njit(cache=True)
 def is_contact(wrench, p):
-    """Return whether a wrench exceeds the contact threshold."""
+    """Return whether force or torque exceeds the contact threshold."""
     threshold = p[CONTACT_THRESHOLD]
     return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
@@ -135,13 +136,13 @@ def component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work of a wrench over a displacement; for a unit wrench the component [m]."""
+    """Return the work over a displacement [J]; for a unit wrench its component along it [m]."""
     return dot(wrench, displacement, 0) + dot(wrench, displacement, 1)
 
 
 @njit(cache=True)
 def find_direction(wrench, round_trip, T, p, memory):
-    """Update the contact's direction, a unit wrench, and return the component along it [N].
+    """Update the contact's direction, a unit wrench; return the component of `wrench` along it [N].
 
     A much larger wrench or the opposite direction is a new contact and replaces the mean at once.
     """
@@ -164,7 +165,7 @@ def find_direction(wrench, round_trip, T, p, memory):
 
 @njit(cache=True)
 def receive(g, received, memory):
-    """Add newly received energy to the ledger of group `g` and return it."""
+    """Add newly received energy to the ledger of group `g`; return this energy [J]."""
     new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
     return new
@@ -172,7 +173,7 @@ def receive(g, received, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """See `methods.slave_step`."""
+    """Run the slave's step, see `methods.slave_step`."""
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = arrived(received)
     memory[_PERIOD] = T
@@ -225,7 +226,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
-    """Update the slave's ledger and return surplus energy (S1, S2)."""
+    """Update the slave's ledger and send surplus energy to the master (S1, S2)."""
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
     new = receive(g, received, memory)
@@ -259,7 +260,7 @@ def _servo_lag(p):
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return the largest displayed stiffness k_d (S3) [N/m]."""
+    """Return k_d, the largest stiffness that is displayed (S3) [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
@@ -280,7 +281,7 @@ def _max_displayed_stiffness(received, T, p, memory):
 
 @njit(cache=True)
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
-    """Identify direction, stiffness, damping, displayed share and depth of the contact (S3)."""
+    """Estimate direction, stiffness, damping, displayed share and depth of the contact (S3)."""
     normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
     if not in_contact:
         if memory[IN_CONTACT] > 0.0 and _wall_is_removed(dx, memory):
@@ -347,7 +348,7 @@ def _wall_is_removed(dx, memory):
 
 @njit(cache=True)
 def _max_slip_change(wrench, size, T, p, memory):
-    """Return f^2 / |w| of S3: the largest change along n that a slip can cause [N]."""
+    """Return f^2 / |w|, the largest force change along n that a slip can cause (S3) [N]."""
     mean_wrench = memory[MEAN_WRENCH]
     mean = max(math.sqrt(component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(component_along(wrench, wrench, p) - size * size, 0.0))
@@ -358,9 +359,9 @@ def _max_slip_change(wrench, size, T, p, memory):
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    """Compute the command's velocity (S3, S4).
+    """Compute the velocity of the slave's command (S3, S4).
 
-    `error` contains the pose difference from the command to the received pose and is overwritten.
+    `error` (6,) contains the difference between received pose and command. It is overwritten.
     """
     velocity, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
@@ -394,7 +395,7 @@ def _generate_command(received, connected, T, p, memory, error):
 def _limit_motor_energy(command, pose, twist, p, memory):
     """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved.
 
-    The command generator then continues from there, at most as fast as the slave.
+    The command generator continues from the moved command, at most as fast as the slave.
     """
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     difference_into(command, pose, motor_wrench)
@@ -417,7 +418,7 @@ def _limit_motor_energy(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _limit_motor_wrench(g, damping, twist, p, memory):
-    """Limit the motors' wrench to the available energy, or brake; return whether it changed."""
+    """Limit the motors' wrench to the available energy, or brake; return whether it was changed."""
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
@@ -453,7 +454,7 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
 
 @njit(cache=True)
 def _step_servo_model(received, connected, T, p, memory, error):
-    """Advance the servo model (S6) by implicit Euler, which is stable for every servo."""
+    """Advance the servo model (S6) by implicit Euler, which is stable for all K and D."""
     model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:
@@ -467,7 +468,7 @@ def _step_servo_model(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Limit the command after the safe state changed it (S5); see `methods.Methods`."""
+    """Limit the command if the safe state changed it (S5); see `methods.Methods`."""
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

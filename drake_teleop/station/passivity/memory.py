@@ -1,32 +1,32 @@
-"""Places of the values in the memory and parameter vectors of one end of the channel.
+"""Layout of the memory vector and the parameter vector of one end of the channel.
 
-Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. A
-method names its own places at the head of its file with `own_memory` and `own_parameters`.
+Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. The
+module of a method declares its own places with `own_memory` and `own_parameters`.
 """
 
 from __future__ import annotations
 
-MEMORY = 160  #: length of the memory of one end
-PARAMETERS = 26  #: length of the parameters, packed by `methods.parameters`
+MEMORY = 160  #: length of the memory vector of one end
+PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` fills
 
 
 class Slots:
-    """Allocator of named places in a vector, one after the other.
+    """Allocator of consecutive places in a vector.
 
     Args:
         size: length of the vector.
-        first: first place.
+        first: index of the first place.
     """
 
     def __init__(self, size: int, first: int = 0) -> None:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """Reserve the place of one number."""
+        """Reserve a place and return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """Return the place of a vector; ``array[place]`` is a view of it.
+        """Reserve `length` places and return their slice; ``array[slice]`` is a view of them.
 
         Raises:
             IndexError: if the vector does not fit.
@@ -42,24 +42,24 @@ class Slots:
 
 
 _memory = Slots(MEMORY)
-STEPS = _memory.number()  #: number of steps, and of the next packet
+STEPS = _memory.number()  #: number of steps so far; also the number of the next packet
 LEDGER = _memory.vector(2)  #: energy that this end may still release, by group [J]
-RECEIVED = _memory.vector(2)  #: accounted value of the other end's counter [J]
+RECEIVED = _memory.vector(2)  #: energy from the other end that is credited here [J]
 SENT = _memory.vector(2)  #: this end's counter of sent energy [J]
 LOST = _memory.vector(2)  #: energy that the method removed from the loop here [J]
 HELD_WRENCH = _memory.vector(6)  #: wrench at this port since the last step
 LOAD_WRENCH = _memory.vector(6)  #: part of the slave's wrench from its load's weight and inertia
-COMMAND = _memory.vector(13)  #: the slave's command since the last step, X_WS and twist
+COMMAND = _memory.vector(13)  #: slave's command since the last step: pose X_WS, twist
 #: Remaining time in which the slave keeps its command while a new channel fills [s].
 FILL_TIME = _memory.number()
-HAND_VELOCITY = _memory.vector(6)  #: filtered, at the master, see `retreat`
+HAND_VELOCITY = _memory.vector(6)  #: filtered twist at the master, see `retreat`
 PACKET = _memory.vector(38)  #: last sent packet, see `packet`
 _OWN = _memory.rest()
 _command = Slots(COMMAND.stop, COMMAND.start)
 COMMAND_POSE, COMMAND_TWIST = _command.vector(7), _command.rest()
 
 _parameters = Slots(PARAMETERS)
-#: Limits of the device, in the master's power units [N, N m].
+#: Largest force and torque at the hand, in the master's power units [N, N m].
 LIMIT = _parameters.vector(2)
 #: K of the slave's servo, in the master's power units [N/m, N m/rad].
 STIFFNESS = _parameters.vector(2)
@@ -67,18 +67,19 @@ STIFFNESS = _parameters.vector(2)
 DAMPING = _parameters.vector(2)
 #: Mass of the slave at its tool, in the master's power units [kg, kg m^2].
 MASS = _parameters.vector(2)
-#: Wrench at the hand over the wrench in the master's power units, of force and torque.
+#: Factors from the master's power units to the wrench at the hand, for force and torque.
 MOTION_SCALE = _parameters.vector(2)
-#: Speed of the hand along the wrench where that starts to fade, in slave motion [m/s, rad/s].
+#: Speed of the hand along the wrench at which the wrench starts to fade, scaled to slave motion
+#: [m/s, rad/s].
 RETREAT = _parameters.vector(2)
 _METHOD = _parameters.rest()
 
 
 def own_memory() -> Slots:
-    """Return an allocator for the method's own part of the memory, zero at the start."""
+    """Return an allocator for a method's own part of the memory, which starts with zeros."""
     return Slots(MEMORY, _OWN.start)
 
 
 def own_parameters() -> Slots:
-    """Return an allocator for the method's own part of the parameters."""
+    """Return an allocator for a method's own part of the parameters."""
     return Slots(PARAMETERS, _METHOD.start)

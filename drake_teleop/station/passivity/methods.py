@@ -1,14 +1,14 @@
-"""Methods by name, their parameters, and one step of either end of the channel.
+"""Passivity methods by name, their parameters, and one step of each end of the channel.
 
 Ports of the bilateral part of the station:
 
-- master: the wrench to render, and the motion of the command before the channel (after kinematic
-  scaling);
+- master: the wrench to render, and the motion of the master's command (after kinematic scaling,
+  before the channel);
 - slave: the contact wrench, and the actual motion of the slave.
 
 Motion and wrenches are in world axes. Wrenches are in the *master's power units*: wrench times
-motion of the slave's command is the work at the hand, docs/theory.md (T29). The hand puts in
--f . dx, the environment f . dx.
+motion of the slave's command is the work at the hand, docs/theory.md (T29). The hand puts in the
+energy -f . dx, the environment f . dx.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -56,11 +56,11 @@ from drake_teleop.station.passivity.wave import WaveConfig
 @settings
 @dataclass
 class Methods:
-    """Parameters of each method; a field registers its method by the field's name.
+    """Parameters of all passivity methods; each field registers the method of its name.
 
-    The module of the field's class is the method. Its config has `pack_into(p)`. The module
+    The module of the field's class implements the method. The class has `pack_into(p)`. The module
     contains the compiled `master_step` and `slave_step`, with the arguments of those below except
-    the first. Optional: `initialize(p, memory)` prepares the memory of an end; the compiled
+    `steps`. Optional: `initialize(p, memory)` prepares the memory of an end; the compiled
     `command_sent(requested, command, pose, twist, p, memory)` receives the command after the safe
     state; `AT_THE_MOTOR = True` marks an energy balance at the slave's motors instead of its
     command.
@@ -124,8 +124,8 @@ class _CommonConfig:
 class PassivityConfig(Methods, _CommonConfig):
     """Method that keeps the station passive, and the parameters of each method.
 
-    The servo pulls the slave with K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
-    `four_channel` use these K and D. `two_layer`, `ledger` and `retreat` use the mass.
+    The servo's force on the slave is K (x_command - x) - D v. `two_layer`, `pspm`, `ledger` and
+    `four_channel` use K and D. `two_layer`, `ledger` and `retreat` use the slave's mass.
     """
 
 
@@ -138,12 +138,12 @@ def parameters(
 
     Args:
         config: method and parameters.
-        power_scale: (2,) the master's power units over the slave's, for translation and rotation:
-            force scale over kinematic scale.
+        power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
+            torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
 
     Returns:
-        (PARAMETERS,) in the layout of `drake_teleop.station.passivity.memory`.
+        (PARAMETERS,) vector in the layout of `drake_teleop.station.passivity.memory`.
     """
     p = np.zeros(PARAMETERS)
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
@@ -165,7 +165,7 @@ def initial_memory(
     Args:
         method: one of `METHODS`.
         parameters: result of `parameters`.
-        pose: (7,) X_WS at the start: the slave's command until a packet arrives.
+        pose: (7,) slave's pose X_WS at the start, its command until a packet arrives.
 
     Raises:
         DrakeTeleopError: for an unknown method.
@@ -186,7 +186,7 @@ def initial_memory(
 
 @njit(cache=True)
 def _ignore_command(requested, command, pose, twist, p, memory):
-    """Do nothing, for a method without `command_sent`."""
+    """Ignore the command, for a method without `command_sent`."""
 
 
 _ROW = types.Array(types.float64, 1, "C")
@@ -214,7 +214,7 @@ def steps_of(method: str) -> tuple[int, int, int]:
 
 @njit(cache=True)
 def _number_packet(healthy, memory, packet):
-    """Number the packet; repeat the last good packet if the inputs are not finite."""
+    """Write the packet's number; if the inputs are not finite, repeat the last good packet."""
     if healthy:
         packet[HEALTHY] = 1.0
         put(memory, PACKET.start, packet, 0, PACKET_SIZE)
@@ -229,22 +229,22 @@ def _number_packet(healthy, memory, packet):
 def master_step(
     steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
 ):  # fmt: skip
-    """Run one step of the master's end without allocation: wrench at the hand and packet.
+    """Compute the wrench at the hand and the packet of one step at the master's end.
 
     Args:
         steps: result of `steps_of(method)`.
         received: (PACKET_SIZE,) newest packet of the slave; zeros before the first.
-        fresh: whether the packet is new.
-        pose: (7,) X_WS of the command, after kinematic scaling, before the channel.
-        twist: (6,) its twist [v; omega], in W.
-        dx: (6,) its increment since the last step [dp; log(R_k R_(k-1)^T)], in W.
-        hand: (6,) wrench of the hand on the device, in W and master power units (0 if it is not
-            measured; only `four_channel` uses it).
-        limits: (2,) of force and torque, in the master's power units [N, N m].
+        fresh: True if the packet is new.
+        pose: (7,) commanded pose X_WS, after kinematic scaling, before the channel.
+        twist: (6,) twist of this command [v; omega], in W.
+        dx: (6,) increment of this command since the last step [dp; log(R_k R_(k-1)^T)], in W.
+        hand: (6,) wrench of the hand on the device, in W and master power units; only
+            `four_channel` uses it.
+        limits: (2,) largest force and torque, in the master's power units [N, N m].
         T: time between steps [s].
         p: (PARAMETERS,) result of `parameters`.
-        memory: (MEMORY,) result of `initial_memory`, updated.
-        wrench: (6,) written: wrench to render until the next step; 0 if an input is not finite.
+        memory: (MEMORY,) memory of this end, updated.
+        wrench: (6,) written: wrench to render; 0 if an input is not finite.
         packet: (PACKET_SIZE,) written: packet to send.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
@@ -261,17 +261,17 @@ def master_step(
 
 @njit(cache=True)
 def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run one step of the slave's end without allocation: command of the slave and packet.
+    """Compute the slave's command and the packet of one step at the slave's end.
 
     Args:
         steps, received, fresh, T, p, memory, packet: as for `master_step`, with the master's
             packet.
-        pose: (7,) X_WS of the slave, actual.
-        twist: (6,) its twist [v; omega], in W.
-        dx: (6,) its increment since the last step, in W.
-        wrench: (6,) contact wrench, scaled, in W and master power units.
-        command: (13,) written: pose (7,) and twist (6,) of the slave's command. The last pose, at
-            rest, if an input is not finite.
+        pose: (7,) actual pose X_WS of the slave.
+        twist: (6,) actual twist of the slave [v; omega], in W.
+        dx: (6,) increment of this pose since the last step, in W.
+        wrench: (6,) contact wrench on the slave, in W and master power units.
+        command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
+            finite, it is the last pose with zero twist.
     """
     packet[:] = 0.0  # a method writes only the fields that it uses
     healthy = finite(received) and finite(pose) and finite(twist) and finite(dx) and finite(wrench)
@@ -287,5 +287,5 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 
 @njit(cache=True)
 def command_sent(steps, requested, command, pose, twist, p, memory):
-    """Pass the command after the safe state to the method; see `Methods`."""
+    """Pass the command that the safe state returned to the method; see `Methods`."""
     _command_sent(steps[2], requested, command, pose, twist, p, memory)

@@ -1,9 +1,9 @@
-"""Contents of a packet, and the small vector operations that all methods use.
+"""Layout of a packet, and small vector operations of all passivity methods.
 
 One layout, (38,) float64, serves every method and both directions. Counters and integrals are
 cumulative, so lost, late or duplicate packets do no harm. A vector of six has two *groups* of
-three, translation first. A ledger is one number for each group; a limit shortens a group without
-rotation.
+three, translation first. A ledger is one number for each group. A limit shortens the vector of a
+group and keeps its direction.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ SEQUENCE = _places.number()
 HEALTHY = _places.number()
 #: X_WS [qw qx qy qz px py pz] of the sender.
 POSE = _places.vector(7)
-#: Its twist [v; omega], in W.
+#: Twist of the sender [v; omega], in W.
 VELOCITY = _places.vector(6)
-#: Its wrench [f; tau], in W, in the master's power units.
+#: Wrench at the sender [f; tau], in W, in the master's power units.
 WRENCH = _places.vector(6)
 #: Cumulative integral; the method defines it.
 INTEGRAL = _places.vector(6)
@@ -35,7 +35,7 @@ OTHER_ENERGY = _places.vector(2)
 #: 1 while the slave's detector reports contact.
 CONTACT = _places.number()
 #: Part of the slave's wrench from weight and inertia of its load, as `WRENCH`. It is the last
-#: field, because only `ledger` uses it; other lines omit it.
+#: field, because only `ledger` uses it; with other methods it is not transmitted.
 LOAD = _places.vector(6)
 
 #: Largest rate of force and torque at the hand that is not perceived as an impact [N/s, N m/s].
@@ -44,14 +44,14 @@ MAX_WRENCH_RATE = (450.0, 4.5)
 
 @njit(cache=True)
 def arrived(received):
-    """Return whether any packet was received: a receiver contains zeros before."""
+    """Return whether `received` is a packet; before the first packet it contains zeros."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
 
 
 @njit(cache=True)
 def new_energy(g, received, memory):
-    """Return the energy of group g that was received since the last call [J]."""
+    """Return the energy of group `g` that was received since the last call [J]."""
     new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
     memory[RECEIVED][g] += new
     return new
@@ -59,7 +59,7 @@ def new_energy(g, received, memory):
 
 @njit(cache=True)
 def fill(pose, twist, wrench, packet):
-    """Write pose, twist and wrench of the sender into its packet."""
+    """Write pose, twist and wrench of the sender into the packet."""
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
         now[i] = pose[i]
@@ -69,28 +69,28 @@ def fill(pose, twist, wrench, packet):
 
 @njit(cache=True)
 def dot(a, b, g):
-    """Return a . b of group g: 0 translation, 1 rotation."""
+    """Return the scalar product a . b over group `g` (0: translation, 1: rotation)."""
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
 def length(a, g):
-    """Return |a| of group g without overflow."""
+    """Return the norm of group `g` of `a` without overflow."""
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
 def scale(a, g, s):
-    """Multiply the force (g = 0) or torque (g = 1) of a wrench by `share`."""
+    """Multiply group `g` of `a` by `s`."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
 
 @njit(cache=True)
 def limit(a, g, most):
-    """Shorten group g of `a` to at most the length `most`."""
+    """Shorten group `g` of `a` to at most the length `most`."""
     size = length(a, g)
     if size > most:
         scale(a, g, most / size)
@@ -107,7 +107,7 @@ def finite(a):
 
 @njit(cache=True)
 def difference_into(a, b, e):
-    """Write [p_a - p_b; log(R_a R_b^T)] of two poses (7,), in W, into e (6,)."""
+    """Write the difference of two poses (7,), [p_a - p_b; log(R_a R_b^T)] in W, into `e` (6,)."""
     turn = logarithm(multiply((a[0], a[1], a[2], a[3]), conjugate((b[0], b[1], b[2], b[3]))))
     for i in range(3):
         e[i] = a[4 + i] - b[4 + i]
@@ -116,7 +116,7 @@ def difference_into(a, b, e):
 
 @njit(cache=True)
 def moved_into(pose, e, out):
-    """Write the pose [exp(e_r) R; p + e_p] into out (7,), which may be `pose` itself."""
+    """Write the moved pose [exp(e_r) R; p + e_p] into `out` (7,), which may be `pose`."""
     turn = exponential((e[3], e[4], e[5]))
     q = normalized(multiply(turn, (pose[0], pose[1], pose[2], pose[3])))
     for i in range(4):

@@ -2,12 +2,11 @@
 
 A spring K pulls each end to a set position y. The set position moves as near to the requested one
 as the stored energy E permits. The master sends energy above a ceiling to the slave (energy
-shuffling); the slave discards it, because a limit cycle could live on circulating energy.
+shuffling). The slave discards energy above its ceiling: a limit cycle could use circulating energy.
 
-The balance is exact at the ports of hand and slave's *motors*. It also holds at the actual motion
-if K and D of the servo are configured correctly. The default is the servo of the reference with one
-degree of freedom; a station's servo is stiffer. At the hand the requested position is x + f / K_h,
-with a damper in parallel.
+The energy balance is exact at the ports of hand and slave's *motors*. It also holds at the actual
+motion if K and D of the servo are configured correctly. At the hand the requested set position is
+x + f / K_h for the received force f; a damper is in parallel.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -51,11 +50,11 @@ from drake_teleop.station.passivity.packet import (
 _places = own_parameters()
 _INITIAL, _CEILING = _places.vector(2), _places.vector(2)
 _SPRING, _DAMPER = _places.vector(2), _places.vector(2)
-# Memory: set position minus position; its requested value.
+# Memory: set position minus actual position; requested value of this offset.
 _places = own_memory()
 _OFFSET, _REQUESTED = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
+AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
 
 
 @settings
@@ -75,14 +74,14 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """See `Methods`."""
+        """Write the parameters into `p`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Store the initial energy."""
+    """Write the initial energy into the memory."""
     memory[LEDGER] = p[_INITIAL]
 
 
@@ -115,7 +114,7 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """See `methods.master_step`."""
+    """Run the master's step, see `methods.master_step`."""
     offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
@@ -136,7 +135,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """See `methods.slave_step`."""
+    """Run the slave's step, see `methods.slave_step`."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
@@ -156,9 +155,9 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Account for the command after the safe state; see `methods.Methods`.
+    """Use the command after the safe state as set position; see `methods.Methods`.
 
-    The ledger pays for additional energy of the spring.
+    The spring's additional energy is subtracted from the stored energy.
     """
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]

@@ -1,8 +1,8 @@
 """Safe state of both ends for silence and faulty data; docs/delay.md has the table of causes.
 
-An end is *silent* without a new packet of a healthy sender for `timeout`. It is silent at once if
-its own data are not finite (or beyond 1e6 in SI units), or if the newest packet says so. Both ends
-begin silent. A pose that is not finite counts no work at its port.
+An end is *silent* if it received no new packet of a healthy sender for `timeout` seconds. It is
+silent at once if its own data are not finite (or beyond 1e6 in SI units), or if the newest packet
+reports this of the other end. Both ends begin silent. A pose that is not finite adds no work.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """Return the master's monitor state (MASTER_WATCH,) before the first packet.
 
-    With the limits `full` (2,) it is in the normal state.
+    With `full` (2,), the device's limits, it is that of normal operation.
     """
     watch = np.zeros(MASTER_WATCH)
     if full is None:
@@ -52,7 +52,7 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slave's state (SLAVE_WATCH,): the command rests at `pose` (7,)."""
+    """Return the slave's initial monitor state (SLAVE_WATCH,), with the command at `pose`."""
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -76,11 +76,11 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
         alive: whether a new packet of a healthy slave came at this step.
         fault: whether the hand's data are not finite, or a new packet reports this of the slave.
         T: time between steps [s].
-        timeout: [s].
+        timeout: time without packets until the end is silent [s].
         full: (2,) the device's limits [N, N m].
         held: (6,) wrench displayed since the last step [N, N m].
-        watch: (MASTER_WATCH,) updated.
-        limits: (2,) written [N, N m].
+        watch: (MASTER_WATCH,) monitor state, updated.
+        limits: (2,) written: largest force and torque [N, N m].
     """
     _update_silence(alive, fault, T, watch)
     connected = watch[SILENT] <= timeout
@@ -107,10 +107,10 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
     Args:
         alive: whether a new packet of a healthy master came at this step.
         fault: whether the slave's data are not finite, or a new packet reports this of the hand.
-        T, timeout: [s].
-        requested: (7,) X_WS from the method.
-        watch: (SLAVE_WATCH,) updated.
-        command: (7,) written, X_WS.
+        T, timeout: as for `master_limits_into`.
+        requested: (7,) pose X_WS from the method.
+        watch: (SLAVE_WATCH,) monitor state, updated.
+        command: (7,) written: commanded pose X_WS.
     """
     _update_silence(alive, fault, T, watch)
     last, before = watch[_LAST_COMMAND], watch[_PREVIOUS_COMMAND]
@@ -146,14 +146,16 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Shorten the wrench (6,) at the hand in the master's power units.
+    """Shorten the wrench at the hand if the hand moves along it faster than `RETREAT`.
+
+    At twice this speed it is 0, except for the slave's inertial force while the hand decelerates.
 
     Args:
-        twist: (6,) of the command before the channel [v; omega], in W.
+        twist: (6,) twist of the command before the channel [v; omega], in W.
         T: time between steps [s].
         p: parameters of the method.
-        memory: of the master's end, updated.
-        wrench: (6,) in W, updated.
+        memory: memory of the master's end, updated.
+        wrench: (6,) in W and the master's power units, updated.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)
     for i in range(6):

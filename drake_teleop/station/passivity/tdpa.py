@@ -1,13 +1,15 @@
 """Time-domain passivity approach (TDPA) of a delayed two-port, with clipping controllers.
 
-See docs/theory.md, (T31), (T32), (T44). The promise is at the hand and the slave's *command*, for
-the backward pair. A shortened wrench recovers slowly (force-jump filter), a step drains only a
-share of the ledger, and the master keeps a part of the hand's input so that the hand can yield.
+See docs/theory.md, (T31), (T32), (T44). Passivity is guaranteed at the hand and the slave's
+*command*, for the backward pair (`energy`). A shortened wrench recovers slowly (force-jump filter).
+A step uses only a share of the stored energy. The master keeps a part of the hand's energy input,
+so that the wrench can push the hand back.
 
-`charged_tdpa` adds a drag on the hand that earns energy in free motion (level controller of Franken
-et al. 2011, with bounded force), and a filter of the slave's wrench against the delayed loop.
+`charged_tdpa` adds a drag on the hand that stores energy in free motion (level controller of
+Franken et al. 2011, with bounded force), and a filter of the slave's wrench that stabilises the
+delayed loop.
 
-The energy created at the actual motion, behind the servo, is about m v^2 / 2 at `speed`.
+At the actual motion, behind the servo, about m v^2 / 2 can be created at the speed `speed`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -132,7 +134,7 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """See `Methods`."""
+        """Write the parameters into `p`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
@@ -140,13 +142,13 @@ class TdpaConfig:
 
 
 def charged() -> TdpaConfig:
-    """Return the parameters of `charged_tdpa`: medium grip; 0.28 N of drag fill 60 mJ in 0.4 m."""
+    """Return the parameters of `charged_tdpa` for a medium grip; drag fills 60 mJ in 0.4 m."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """See `methods.master_step`."""
+    """Run the master's step, see `methods.master_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
@@ -180,8 +182,8 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
     """Return the share of the wrench that may be rendered in this step.
 
-    The full wrench would drain `drained`. The limit is the share `drain` of the stored energy, or
-    all of it where the wrench would otherwise drop abruptly.
+    The full wrench would use the energy `drained`. The rendered wrench may use the share `drain` of
+    the energy `stored`, or all of it if the wrench would otherwise drop abruptly.
     """
     least, size = length(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
     share = min(share, max(drain * stored / drained, least / size))
@@ -190,7 +192,7 @@ def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
 
 @njit(cache=True)
 def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    """Add drag along -dx to the wrench, which never drains the ledger."""
+    """Add drag along -dx to the wrench while an end has less than its reserve."""
     drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
         damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
@@ -201,7 +203,7 @@ def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 @njit(cache=True)
 def _send_surplus(g, p, memory):
-    """Send energy of the master beyond the reserve back to the slave."""
+    """Send the master's energy above its reserve to the slave."""
     ledger = memory[LEDGER]
     surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
@@ -211,7 +213,7 @@ def _send_surplus(g, p, memory):
 
 @njit(cache=True)
 def _account_for_work(g, drained, p, memory):
-    """Subtract drained work from the ledger, then from the kept energy; or send the input."""
+    """Subtract work on the hand from ledger and kept energy, or keep and send its input."""
     ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
@@ -224,7 +226,7 @@ def _account_for_work(g, drained, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """See `methods.slave_step`."""
+    """Run the slave's step, see `methods.slave_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
@@ -237,7 +239,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
     for g in range(2):
         available = _available_energy(memory, g)
         credit = min(memory[_INPUT][g], memory[_COMMAND_INPUT][g]) + min(available, 0.0)
-        # Unpaid output is repaid before energy is sent.
+        # Output beyond the received energy is compensated before energy is sent.
         memory[SENT][g] = max(memory[SENT][g], credit)
         memory[LEDGER][g] = available
         packet[ENERGY][g] = memory[SENT][g]
@@ -250,7 +252,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _filter(g, received, dx, wrench, T, p, memory):
-    """Filter the wrench that is sent (T44)."""
+    """Low-pass the wrench that the slave sends (T44)."""
     filtered, hand = memory[_FILTERED], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
@@ -276,7 +278,7 @@ def _filter(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
-    """Return the contact's -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
+    """Return the contact stiffness -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
     size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
         change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
@@ -287,7 +289,7 @@ def _contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _available_energy(memory, g):
-    """Return the input of the hand minus the output; negative if the servo released too much."""
+    """Return received energy minus output [J], negative if the servo released too much."""
     return memory[RECEIVED][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
 
 
@@ -317,7 +319,7 @@ def _move_command(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _account_command(command, sign, memory):
-    """Add (`sign` 1) or remove (-1) the work of the command step that ends at `command`."""
+    """Add (`sign` 1) or subtract (-1) the work of the command step that ends at `command`."""
     step = np.empty(6)
     difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
@@ -329,7 +331,7 @@ def _account_command(command, sign, memory):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Account for the command after the safe state; see `methods.Methods`."""
+    """Correct the energy balance if the safe state changed the command; see `methods.Methods`."""
     for i in range(7):
         if command[i] != requested[i]:
             _account_command(requested, -1.0, memory)

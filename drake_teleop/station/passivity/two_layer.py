@@ -1,12 +1,11 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-A tank of energy at each end must cover the cost of the wrench in the next step. At the slave the
-port is that of its motors. The tanks are never overdrawn if hand and walls accelerate less than
-`acceleration` and if servo and mass are configured correctly (the defaults are those of the
-reference with one degree of freedom).
+Each end has an energy tank, which must cover the energy that the wrench can use until the next
+step. At the slave this is the wrench of its motors. The tanks are never overdrawn if hand and walls
+accelerate less than `acceleration` and if servo and mass are configured correctly.
 
-Only the brake uses the slave's reserve: otherwise a slave slower than a T would coast with an empty
-tank. A damper on the hand fills the master's tank below its level.
+Only braking uses the slave's reserve: otherwise a slave slower than `acceleration` times period
+would coast with an empty tank. A damper on the hand fills the master's tank up to `level`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -58,7 +57,7 @@ _RESERVE_SHARE = 0.01  # share of the capacity
 _places = own_memory()
 _SPRING_WRENCH, _BRAKE_WRENCH = _places.vector(6), _places.vector(6)
 
-AT_THE_MOTOR = True  #: port of the energy balance, see `methods`
+AT_THE_MOTOR = True  #: the energy balance is at the port of the slave's motors
 
 
 @settings
@@ -89,7 +88,7 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """See `Methods`."""
+        """Write the parameters into `p`."""
         p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
         p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
         p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
@@ -103,7 +102,7 @@ def initialize(p, memory):
 
 @njit(cache=True)
 def _exchange(received, dx, T, p, memory, packet):
-    """Account for the held wrench, received and sent energy, before a new wrench is limited."""
+    """Update the energy tank by the work of the held wrench and by received and sent energy."""
     ledger, sent_so_far = memory[LEDGER], memory[SENT]
     held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
@@ -126,7 +125,7 @@ def _cost(f, dx, g, acceleration, T):
 
 @njit(cache=True)
 def _limit_to_tank(f, dx, g, acceleration, T, memory):
-    """Shorten group g of a wrench to the energy in the tank."""
+    """Shorten group `g` of the wrench `f` to the energy in the tank."""
     cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
@@ -134,7 +133,7 @@ def _limit_to_tank(f, dx, g, acceleration, T, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """See `methods.master_step`."""
+    """Run the master's step, see `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
     ledger, requested = memory[LEDGER], received[WRENCH]
     for g in range(2):
@@ -153,7 +152,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """See `methods.slave_step`."""
+    """Run the slave's step, see `methods.slave_step`."""
     spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
     _exchange(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
@@ -189,7 +188,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Note the servo's wrench at the command after the safe state; see `methods.Methods`."""
+    """Store the servo's wrench for the command after the safe state; see `methods.Methods`."""
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

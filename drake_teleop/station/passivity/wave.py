@@ -1,13 +1,14 @@
 """Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
 
-Equations: docs/theory.md, (T33) to (T36). An end releases only the energy of the received wave, in
-the backward pair at the hand and the slave's *command*. It sends integral and energy of its wave,
-and the receiver plays the integral through a first-order filter within the received energy
-(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
-energy. Lost packets cause no drift. Uneven arrival slows the filter; a playout buffer avoids this.
+Equations: docs/theory.md, (T33) to (T36). An end releases only the energy of the received wave,
+for the backward pair (`energy`) at the hand and the slave's *command*. It sends integral and energy
+of its wave. The receiver outputs the integral through a first-order filter within the received
+energy (Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold
+create no energy. Lost packets cause no drift. Uneven arrival slows the filter; a playout buffer
+avoids this.
 
-A damper at the slave's command matches the line: free motion then reflects nothing, and the hand
-displays b v. In silence the slave keeps its command and reflects.
+A damper at the slave's command matches the line's impedance b: free motion then reflects no wave,
+and the rendered force is b v. Without packets the slave keeps its command and reflects.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -54,7 +55,7 @@ _places = own_parameters()
 IMPEDANCE = _places.vector(2)
 _FILTER, _MATCHING = _places.number(), _places.number()
 _PATIENCE, _DRIFT_RATE = _places.number(), _places.number()
-# Memory: integrals of the played and the sent wave; wave of this step; silence [s].
+# Memory: integrals of the output wave and of the sent wave; wave of this step; silence [s].
 _places = own_memory()
 _PLAYED_INTEGRAL, _SENT_INTEGRAL, _WAVE = _places.vector(6), _places.vector(6), _places.vector(6)
 _SILENCE, _DRIFT = _places.number(), _places.vector(6)
@@ -86,17 +87,17 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """See `Methods`."""
+        """Write the parameters into `p`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, played out of the received integral.
+    """Write the wave (6,) of this step, taken from the integral of the received wave.
 
-    Playing the share a of the rest d in each step costs a |d|^2 / (2 T (2 - a)) in all. a is that
-    of the filter, or small enough for the stored energy (T34).
+    Each step outputs the share a of the rest d, which costs a |d|^2 / (2 T (2 - a)) in all. a is
+    the share of the filter, or less if the stored energy requires it (T34).
     """
     ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
@@ -116,7 +117,7 @@ def _play(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """See `methods.master_step`."""
+    """Run the master's step, see `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
@@ -147,10 +148,9 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _limit_change(g, energy, dx, most, held, wrench):
-    """Limit the change of the wrench to `most` if that drains at most `energy`.
+    """Limit the change of the wrench to `most`; return whether it was larger.
 
-    Returns:
-        Whether the change was larger.
+    If the limited wrench would use more than `energy`, the change is enlarged until it does not.
     """
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
@@ -168,7 +168,7 @@ def _limit_change(g, energy, dx, most, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """See `methods.slave_step`."""
+    """Run the slave's step, see `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     if memory[FILL_TIME] > 0.0:
@@ -210,9 +210,9 @@ def _reflect(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _play_rest(wrench, T, p, memory):
-    """Play the wave that keeps the slave at rest while the stored energy suffices.
+    """Output the wave that keeps the slave at rest, if the stored energy suffices.
 
-    It is reflected as by a rigid wall.
+    To the master this is the reflection of a rigid wall.
     """
     wave, ledger = memory[_WAVE], memory[LEDGER]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
@@ -230,10 +230,10 @@ def _play_rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _fill_line(received, wrench, T, p, memory):
-    """Reflect as a rigid wall while a new line fills, and prepare the steady state.
+    """Reflect as a rigid wall while a new channel fills, and prepare the steady state.
 
-    So the line begins with the energy of the present contact, f^2 / 4 b over a round trip and both
-    filter times, as if it had played the wave of `wrench` for long. This energy is given once.
+    The channel then begins with the energy of the contact force f, f^2 / 4 b over a round trip and
+    both filter times. This energy is added once.
     """
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
@@ -249,7 +249,7 @@ def _fill_line(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _correct_drift(received, wrench, T, p, memory):
-    """Add a step towards the received pose in a group where it does not increase contact force."""
+    """Add a step towards the received pose in each group where it increases no contact force."""
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):

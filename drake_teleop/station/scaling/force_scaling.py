@@ -1,4 +1,4 @@
-"""Force scaling and elimination (Figs. 2 and 4 of the paper)."""
+"""Force scaling, and elimination of the load's wrench (Figs. 2 and 4 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 @settings
 @dataclass
 class ForceScalingConfig:
-    """sigma, gamma, eta of the paper and the scale from slave to master."""
+    """Scales sigma, gamma, eta of the paper, and force scale from slave to master."""
 
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
@@ -57,7 +57,7 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
-        """Return (sigma_gripper, sigma_object, gamma); `where` is the place in the message.
+        """Return (sigma_gripper, sigma_object, gamma); `where` is the place in error messages.
 
         Raises:
             DrakeTeleopError: if eta is given and sigma is not 0 or gamma is not 1 (section V).
@@ -75,7 +75,7 @@ class ForceScalingConfig:
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    """Write `wrench_to_master` of one sample (6,) into `out`, compiled."""
+    """Write the result of `wrench_to_master` for one wrench (6,) into `out`; compiled."""
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
@@ -91,7 +91,7 @@ def wrench_to_master(
     force_scale: float,
     torque_scale: float,
 ) -> NDArray[np.float64]:
-    """Return the wrench to render at the master for a wrench of the slave's sensor.
+    """Return the wrench to render at the master for a wrench at the slave's sensor.
 
     The device displays the reaction of Eq. (1)'s wrench: for a load that is held up, the hand is
     pulled down. The moment about the origin of S becomes the moment about E. Equal power at both
@@ -115,11 +115,11 @@ def wrench_to_master(
 
 @njit(cache=True)
 def scales_at(change, time, scales):
-    """Write the four scales at `time`: a minimum-jerk blend from old to new.
+    """Write the four scales at `time`: a minimum-jerk blend from old to new scales.
 
     Args:
         change: (10,) old scales (4), new scales (4), start of the change [s], duration [s].
-        time: now [s].
+        time: present time [s].
         scales: (4,) written: sigma_gripper, sigma_object, gamma, force scale.
     """
     u = min(max((time - change[8]) / change[9], 0.0), 1.0) if change[9] > 0.0 else 1.0
@@ -131,9 +131,9 @@ def scales_at(change, time, scales):
 
 @njit(cache=True)
 def _scaled_into(sample, estimate, gripper, scales, out):
-    """Write F' of one sample; the object is the load without the gripper.
+    """Write the scaled wrench F' of one sample; the object is the load without the gripper.
 
-    `estimate` and `gripper` are (16,) [offsets; phi].
+    `estimate` and `gripper` are (16,) [offsets; phi] of load and gripper.
     """
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
@@ -147,12 +147,12 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, valid_range):
-    """Return the `Fault` of sample and load estimate.
+    """Return the `Fault` of a sample and a load estimate.
 
     Args:
-        sample: of the wrist sensor, see `drake_teleop.load.regressor`.
+        sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
         estimate: (16,) [offsets; phi].
-        time: now [s].
+        time: present time [s].
         valid_range: (7,) largest wrench [N, N m], largest age [s].
     """
     if not abs(time - sample[TIME]) <= valid_range[6]:
@@ -169,7 +169,7 @@ def fault_of(sample, estimate, time, valid_range):
 
 @njit(cache=True)
 def _scaled_now_into(sample, estimate, gripper, change, time, out):
-    """Write F' of one sample with the scales at `time`."""
+    """Write the scaled wrench F' of one sample with the scales at `time`."""
     scales = np.empty(4)
     scales_at(change, time, scales)
     _scaled_into(sample, estimate, gripper, scales, out)
@@ -177,7 +177,7 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_range, out):
-    """Write F' with the scales at `time`, the contact wrench, and the fault."""
+    """Write a log row: scaled wrench F' with the scales at `time`, contact wrench, fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
     _scaled_into(sample, estimate, gripper, elimination, out[6:12])
     out[12] = fault_of(sample, estimate, time, valid_range)
@@ -185,9 +185,9 @@ def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_ra
 
 @njit(cache=True)
 def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
-    """Write the wrench to render from F'; the orientation of S is of the same sample.
+    """Write the wrench to render, from the scaled wrench F' and the sensor's orientation.
 
-    `contact` is 1, or 0 for the load's part alone.
+    Both are of the same sample. `contact` is 1, or 0 for the load's part alone.
     """
     if fault_of(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
@@ -210,19 +210,19 @@ class ForceScaling(LeafSystem):
 
         name: ForceScaling
         input_ports:
-        - sample: the wrist sensor's, see `drake_teleop.load.regressor`
-        - load_estimate: (16,) Eq. (7), [offsets; phi]
+        - sample: sample of the wrist sensor, see `drake_teleop.load.regressor`
+        - load_estimate: (16,) load estimate of Eq. (7), [offsets; phi]
         output_ports:
-        - scaled_wrench_S: F' of Fig. 2
-        - contact_wrench_S: Eq. (13)
+        - scaled_wrench_S: scaled wrench F' of Fig. 2
+        - contact_wrench_S: contact wrench F_c of Eq. (13)
         - fault: `Fault` of sample or estimate
         - scaled_contact_and_fault: the three above in one vector, for a log
-        - non_contact_wrench_S: Eq. (12)
+        - non_contact_wrench_S: wrench of the load, Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
-        - load_wrench_B: its part from weight and inertia of the load, zero for sigma = 0
+        - load_wrench_B: part of wrench_B from weight and inertia of the load, zero for sigma = 0
 
     Args:
-        config: the scales.
+        config: initial scales.
         arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
         largest_wrench: (6,) largest valid reading [N, N m]; None for no limit.
@@ -276,9 +276,9 @@ class ForceScaling(LeafSystem):
         force_scale: float,
         duration: float = 0.25,
     ) -> None:
-        """Change the scales from now on within `duration` [s] on a minimum-jerk ramp.
+        """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
-        A change in progress is replaced from its present values.
+        The ramp starts at the present scales, also during an earlier change.
 
         Raises:
             DrakeTeleopError: for a scale or duration that is negative or not finite.
@@ -330,7 +330,7 @@ class ForceScaling(LeafSystem):
         _rendered_into(*self._inputs(context), *constants, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
-        """Return sample, estimate, gripper's part of it, change of the scales, and time."""
+        """Return sample, load estimate, gripper's part of it, change of the scales, and time."""
         estimate = self._estimate.Eval(context)
         return (
             self._sample.Eval(context),

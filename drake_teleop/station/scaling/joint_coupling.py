@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 
 
 class JointCoupling(LeafSystem):
-    """Joint positions of the slave from those of the leader, with a clutch.
+    """Coupling of the slave's joint positions to those of the leader, with a clutch.
 
-    While the clutch is open the slave's joints are constant; when it closes they return to the
-    leader's posture within the joint limits.
+    While the clutch is open the commanded joints are constant. When it closes they are the leader's
+    again; `JointFollower` limits the speed.
 
     .. pydrake_system::
 
@@ -30,13 +30,13 @@ class JointCoupling(LeafSystem):
         - master_state: (2 n,) [q; dq/dt] of the leader [rad, rad/s]
         - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
         output_ports:
-        - leader_joints: (n,) of the slave [rad]
+        - leader_joints: (n,) commanded joint positions of the slave [rad]
         - pose_command: (7,) X_WS for these joints
 
     Args:
         slave: the slave's arm.
-        start: (n,) its joints when the leader is at home [rad].
-        home: (n,) of the leader [rad].
+        start: (n,) joints of the slave when the leader is at `home` [rad].
+        home: (n,) joints of the leader [rad].
         period: sampling period of the clutch [s].
 
     Raises:

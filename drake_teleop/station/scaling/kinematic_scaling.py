@@ -39,7 +39,7 @@ class KinematicScalingConfig:
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
-    """Return the quaternion with the same axis and `scale` times the (shorter) angle.
+    """Return the rotation (quaternion) about the same axis by `scale` times the (shorter) angle.
 
     For a scale that is not an integer the result jumps where the angle passes 180 degrees.
     """
@@ -49,15 +49,15 @@ def scaled_rotation(rotation, scale):
 
 @njit(cache=True)
 def scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded X_WS (7,) into `out`.
+    """Write the commanded pose X_WS (7,) of the slave into `out`.
 
         p_WS = p_command + translation_scale R_WB (p_BE - p_master)
         R_WS = R_WB (R_BE R_master^T)^rotation_scale R_WB^T R_command
 
     Args:
-        pose: (7,) X_BE now.
-        master: (7,) X_BE when the clutch was closed.
-        command: (7,) X_WS when the clutch was closed.
+        pose: (7,) present pose X_BE of the master.
+        master: (7,) pose X_BE when the clutch was closed.
+        command: (7,) commanded X_WS when the clutch was closed.
         alignment: (4,) quaternion of R_WB.
         out: (7,) written; the quaternion has norm 1. It may be `command` itself.
     """
@@ -76,7 +76,7 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 @njit(cache=True, borrows=True)
 def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded X_WS (7,); `references` is the state of `KinematicScaling`."""
+    """Write the commanded pose X_WS (7,); `references` is the state of `KinematicScaling`."""
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
@@ -89,21 +89,21 @@ class KinematicScaling(LeafSystem):
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
     the new reference, so the command does not jump. A clutch that is engaged at the start closes
-    before the first sample. It keeps its state while the master's pose is not finite.
+    before the first sample. The clutch keeps its state while the master's pose is not finite.
 
     .. pydrake_system::
 
         name: KinematicScaling
         input_ports:
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) pose X_BE of the master
         - clutch: (1,) engaged if above 0.5; unconnected it is always engaged
         output_ports:
-        - pose_command: (7,) X_WS
+        - pose_command: (7,) commanded pose X_WS of the slave
 
     Args:
         config: scales and alignment.
         period: sampling period of the clutch [s].
-        start: (7,) X_WS commanded at the start.
+        start: (7,) commanded pose X_WS at the start.
     """
 
     __slots__ = ONE_DICT
@@ -126,7 +126,7 @@ class KinematicScaling(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._update)
 
     def Open(self, context: Context, command: NDArray[np.float64]) -> None:
-        """Open the clutch with the slave's command (7,) at `command`, X_WS."""
+        """Open the clutch; the slave's commanded pose X_WS stays at `command` (7,)."""
         references = context.get_discrete_state(0).CopyToVector()
         references[:7], references[14] = command, 0.0
         context.SetDiscreteState(0, references)

@@ -1,4 +1,4 @@
-"""Motion of S at the wrench's sampling instant (long: each source with its delay and noise).
+"""Estimated motion of the sensor frame S (long: each source with its delay and noise).
 
 - `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
   No accelerometer; the whole sample has the delay of the low-pass.
@@ -8,7 +8,7 @@
   accelerometer, slow motion the encoders.
 
 All delays are known. The angles pass the wrench's low-pass, and faster paths wait for the slowest,
-so that a sample belongs to one instant.
+so that wrench and motion of a sample belong to one instant.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -77,7 +77,7 @@ _LINEAR = _ANGULAR + _FILTER_SIZE
 _MOTION = _LINEAR + _FILTER_SIZE
 _JOINTS = _MOTION + MOTION_SIZE
 _PER_JOINT = 5 + 2 * _SECTIONS
-#: Index in the last row of `ArmModel.table`.
+#: Index of the gravity vector in the last row of `ArmModel.table`.
 _GRAVITY = 22
 
 
@@ -100,12 +100,12 @@ class MotionEstimationConfig:
 
 @dataclass(frozen=True)
 class Delays:
-    """Delays at low frequencies [s].
+    """Delays of the signal paths at low frequencies [s].
 
     Args:
-        wrench, acceleration, encoders: delay of each path before waiting; the encoders' with the
-            low-passes of this module.
-        sample: delay of a sample: that of the slowest path in use.
+        wrench, acceleration, encoders: delay of each path before it waits for slower ones; that of
+            the encoders includes the low-passes of this module.
+        sample: delay of a sample, equal to that of the slowest path in use.
     """
 
     wrench: float
@@ -119,9 +119,10 @@ class SteadyState:
     """Steady-state Kalman filter of position, rate and error of a measured acceleration.
 
     Attributes:
-        gains: (3,) of the innovation for position [1], rate [1/s] and acceleration [1/s^2].
-        innovation_std, position_std: standard deviations, in the position's unit.
-        crossover_hz: the accelerometer dominates above it, the positions below it.
+        gains: (3,) gains of the innovation for position [1], rate [1/s], acceleration [1/s^2].
+        innovation_std, position_std: standard deviations of innovation and estimated position, in
+            the position's unit.
+        crossover_hz: the accelerometer dominates above this frequency, the positions below it.
     """
 
     gains: NDArray[np.float64]
@@ -133,7 +134,7 @@ class SteadyState:
 def steady_state(
     position_std: float, acceleration_std: float, drift: float, period: float
 ) -> SteadyState:
-    """Return the filter for white position noise, white noise and random walk of the acceleration.
+    """Return the filter for white noise of position and acceleration, and an acceleration walk.
 
     The model is x_k = x_{k-1} + T v_k, v_k = v_{k-1} + T (a_{k-1} - e_{k-1} - noise). With
     u = (1 - z)(1 - 1/z) the spectrum of the innovations is, up to a factor,
@@ -141,10 +142,10 @@ def steady_state(
     the poles and the gains (spectral factorisation; Anderson and Moore, Optimal Filtering, ch. 9).
 
     Args:
-        position_std: of each measured position, any unit.
-        acceleration_std: of each measured acceleration [that unit / s^2].
+        position_std: standard deviation of a measured position, in any unit.
+        acceleration_std: standard deviation of a measured acceleration [that unit / s^2].
         drift: random walk of the acceleration's error [that unit / s^2 / sqrt(s)], positive.
-        period: T [s].
+        period: sampling period T [s].
     """
     white = (acceleration_std * period**2 / position_std) ** 2
     walk = (drift * period**2.5 / position_std) ** 2
@@ -168,9 +169,9 @@ def steady_state(
 
 
 def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, period: float) -> Delays:
-    """Return the delays of all paths and of the sample.
+    """Return the delays of all signal paths and of the sample.
 
-    The wrench waits whole samples, so that only the encoders' angles are interpolated.
+    The wrench is delayed by whole samples, so that only the encoders' angles are interpolated.
     """
     wrench, acceleration, encoders = sensor.delays(period)
     encoders += _group_delay(_filters(config, sensor, period)) * period
@@ -195,10 +196,10 @@ def motion_gains(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return (9,) noise of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
+    """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
 
-    As `WristSensorConfig.wrench_std`, before a low-pass after the converter. The small noise of
-    omega counts as 0.
+    They hold before a low-pass after the converter, as those of `WristSensorConfig.wrench_std`. The
+    small noise of omega counts as 0.
     """
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
@@ -217,7 +218,7 @@ def estimated_motion_std(
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the rounding error of the angles as rotation about any axis of S [rad].
+    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad].
 
     Assumption: n joint axes of random direction; each direction has a third of their variance.
     """
@@ -228,7 +229,7 @@ def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
 def _accelerometer_std(
     sensor: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (3,) standard deviations of s, moved to So (adds alpha x r), and of alpha."""
+    """Return standard deviations (3,) of s, moved to So (adds alpha x r), and (3,) of alpha."""
     std = np.maximum(sensor.motion_std(), _MIN_ACCELERATION_STD)
     p_SoAo_S, R_SA = sensor.accelerometer()
     s_std, alpha_std = np.sqrt(R_SA**2 @ std[:3] ** 2), np.sqrt(R_SA**2 @ std[6:] ** 2)
@@ -242,7 +243,7 @@ def motion_estimator(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `estimate_into` for an arm with n joints.
 
-    `sensor` gives the nominal delays, filter, noise and pose of the accelerometer.
+    `sensor` contains the nominal delays, filter, noise and pose of the accelerometer.
 
     Raises:
         DrakeTeleopError: if the encoders' bandwidth is 0.45 of the sensor's rate or more.
@@ -274,7 +275,7 @@ def motion_estimator(
 def _filters(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    """Return (4, 5) second-order sections for the angles; unused ones have b0 = 1, else 0."""
+    """Return second-order sections (4, 5) for the angles; unused ones are [1, 0, 0, 0, 0]."""
     filters = np.zeros((_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
@@ -303,9 +304,9 @@ def estimate_into(constants, memory, arm, reading, sample):
     Call it once per period. At the first reading all filters settle on it, at rest.
 
     Args:
-        constants, memory: of `motion_estimator`.
+        constants, memory: results of `motion_estimator`; memory is updated.
         arm: `ArmModel.table`.
-        sample: see `drake_teleop.load.regressor`.
+        sample: written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
     starts = memory[0] == 0.0
@@ -332,7 +333,7 @@ def estimate_into(constants, memory, arm, reading, sample):
 def _delay_paths(constants, memory, n, reading, sample):
     """Delay wrench, accelerometer (written in place of s and omega) and angles.
 
-    The saturation flag stays while any part of its reading waits.
+    The saturation flag stays set while any part of the saturated reading waits.
     """
     angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
@@ -364,9 +365,9 @@ def _delay_paths(constants, memory, n, reading, sample):
 
 @njit(cache=True)
 def _differentiate(constants, joints, angles):
-    """Update velocity and acceleration by backward differences of second order.
+    """Update joint velocity and acceleration by backward differences of second order.
 
-    Only source `encoders` gets the acceleration: without low-pass, rounding dominates it.
+    The acceleration is for source `encoders` only: without its low-pass, rounding dominates.
     """
     n, period = angles.shape[0], constants[_PERIOD]
     for i in range(n):
@@ -381,7 +382,7 @@ def _differentiate(constants, joints, angles):
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
     """Convert the accelerometer's reading in `sample` to s, omega and alpha.
 
-    `motion` is the encoders' motion without accelerations.
+    `motion` is the motion of S from the encoders, without accelerations; it is overwritten.
     """
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
@@ -429,7 +430,7 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
 @njit(cache=True)
 def _rotation_vector_into(before, R, angle):
-    """Write the rotation vector from one R_WS (by rows) to the next, in S, for small angles."""
+    """Write the small rotation vector from R_WS `before` (by rows) to `R`, in S, into `angle`."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0
@@ -440,14 +441,14 @@ def _rotation_vector_into(before, R, angle):
 
 @njit(cache=True)
 def _update_filters(gains, period, moved, acceleration, kept):
-    """Update the three filters of `steady_state`.
+    """Update the filters of `steady_state` for three axes.
 
     The rate belongs to the middle between two samples. The mean acceleration is Numerov's, so that
     both integrations are of fourth order.
 
     Args:
         moved: (3,) encoder displacement since the last sample; becomes the acceleration correction.
-        acceleration: (3,) now.
+        acceleration: (3,) present acceleration.
         kept: estimated position error (3), rate half a sample ago (3), last acceleration and the
             one before (6); updated, except for the last acceleration.
     """

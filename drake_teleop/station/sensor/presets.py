@@ -18,10 +18,10 @@ def _with_imu(
     torque_noise: float,
     **others: Any,
 ) -> WristSensorConfig:
-    """Return a wrench sensor with the IMU of the ATI record.
+    """Return the settings of a force/torque sensor with the IMU of the ATI record.
 
-    Ranges: `side` of fx, fy and `along` of fz [N], `bending` of tx, ty and `twist` of tz [N m].
-    Noise: white, 1 sigma per sample [N, N m].
+    Ranges: `side` for fx, fy and `along` for fz [N], `bending` for tx, ty and `twist` for tz [N m].
+    White noise: standard deviation of a sample [N, N m].
     """
     figures: dict[str, Any] = {
         "p_SoAo_S": [0.0, 0.0, 0.05],
@@ -138,7 +138,7 @@ accordingly.
 
 
 def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """Return the defaults for a scenario's block `wrist_sensor`, from its preset.
+    """Return the default settings for a scenario's block `wrist_sensor`, from the block's preset.
 
     The check of the loaded block rejects unknown names.
     """

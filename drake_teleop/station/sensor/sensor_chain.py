@@ -1,4 +1,4 @@
-"""The wrist sensor as a chain to its readings (long: parameters beside their functions)::
+"""Wrist sensor as a chain from truth to readings (long: parameters beside their functions)::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |
@@ -144,15 +144,15 @@ class WristSensorConfig:
     )
 
     def noise_std(self) -> NDArray[np.float64]:
-        """Return (12,) standard deviations of raw white noise [N, N m, m/s^2, rad/s^2]."""
+        """Return the standard deviations (12,) of raw white noise [N, N m, m/s^2, rad/s^2]."""
         return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
     def random_walk(self) -> NDArray[np.float64]:
-        """Return (12,) standard deviations of the random walks after 1 s, in units per sqrt(s)."""
+        """Return the standard deviations (12,) of the random walks after 1 s [unit / sqrt(s)]."""
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
-        """(12,) ranges of force, torque, acceleration and angular acceleration."""
+        """Return the ranges (12,) of force, torque, acceleration and angular acceleration."""
         return np.concatenate(
             [
                 self.force_range,
@@ -163,29 +163,31 @@ class WristSensorConfig:
         )
 
     def largest_wrench(self) -> NDArray[np.float64]:
-        """Return (6,) the largest valid reading [N, N m]."""
+        """Return the largest valid readings (6,) of force and torque [N, N m]."""
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """Return (6,) noise and quantisation for an estimator, at least 1e-6 [N, N m].
+        """Return standard deviations (6,) of force and torque for an estimator [N, N m].
 
-        For raw samples: before a low-pass after the converter.
+        They contain noise and quantisation of raw samples, before a low-pass after the converter,
+        and are at least 1e-6.
         """
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return (9,) noise and quantisation of s [m/s^2], omega [rad/s], alpha [rad/s^2].
+        """Return standard deviations (9,) of s [m/s^2], omega [rad/s], alpha [rad/s^2].
 
-        For raw samples. Omega counts as exact: filtered encoder rounding is small.
+        They contain noise and quantisation of raw samples. The angular velocity omega counts as
+        exact, because filtered encoder rounding is small.
         """
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
     def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return p_SoAo_S (3,) [m] and R_SA (3, 3); So and S for an ideal sensor."""
+        """Return p_SoAo_S (3,) [m] and R_SA (3, 3) of the accelerometer; 0 and I if ideal."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
@@ -198,7 +200,8 @@ class WristSensorConfig:
     def delays(self, period: float) -> NDArray[np.float64]:
         """Return (3,) delays of force, acceleration and encoder readings [s].
 
-        Latency; for the first two plus the low-pass's group delay at zero frequency.
+        A delay is the latency; for force and acceleration plus the low-pass's group delay at zero
+        frequency.
         """
         delays = self.latencies(period) * np.float64(period)
         if not self.ideal and self.low_pass != "none":
@@ -208,7 +211,7 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Raise a DrakeTeleopError if R_SA is no rotation or the bandwidth is too high."""
+        """Raise DrakeTeleopError for an invalid R_SA or a low-pass bandwidth that is too high."""
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
@@ -231,7 +234,7 @@ _CALIBRATION = (
     *("acceleration_gain_error", "acceleration_misalignment"),
 )
 _QUANTITIES = ("force", "torque", "acceleration", "angular_acceleration")
-#: Parts by name, with the field values that switch them off.
+#: Parts of the sensor by name, with the field values that switch each part off.
 PARTS: dict[str, dict[str, Any]] = {
     "calibration": dict.fromkeys(_CALIBRATION, 0.0),
     "place": {
@@ -250,7 +253,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
-    """Return a copy of the sensor with some of its `PARTS` off.
+    """Return a copy of the configuration with some `PARTS` switched off.
 
     >>> without(WristSensorConfig(), "noise", "offset").force_noise
     0.0
@@ -260,7 +263,7 @@ def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
 
 
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
-    """Return (2, 5) rows [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
+    """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
 
     Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires. The
     poles equal those of `scipy.signal.butter`, whose import is slow.
@@ -285,8 +288,8 @@ def calibration_matrices(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return the calibration matrices: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
 
-    (1 + gains + cross-talk) times the rotation of the misalignment. Gains and cross-talk are
-    uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
+    Each is (1 + gains + cross-talk) times the rotation of the misalignment. Gains and cross-talk
+    are uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -308,7 +311,7 @@ def _rotation(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
 
 #: Constants: offset of force and torque, which may change during a run.
 OFFSET = slice(0, 6)
-# The truth: as a sample (`drake_teleop.load.regressor`) without the flag.
+# True values: as a sample (`drake_teleop.load.regressor`) without the flag.
 TRUE_ANGLES = slice(15, None)
 # A reading: wrench, accelerometer, whether a channel is saturated, angles.
 READ_WRENCH, READ_ACCELERATION = slice(0, 6), slice(6, 12)
@@ -378,10 +381,10 @@ def sensor_chain(
 
 @njit(cache=True)
 def is_plausible(constants, truth):
-    """Return whether the truth is finite and does not overload the sensor.
+    """Return whether the true values are finite and do not overload the sensor.
 
     Args:
-        constants, truth: of `read_into`. A NaN offset marks a dead channel.
+        constants, truth: as for `read_into`. A NaN offset marks a dead channel.
     """
     good = True
     for i in range(6):
@@ -393,12 +396,12 @@ def is_plausible(constants, truth):
 
 @njit(cache=True)
 def read_into(constants, memory, noise, truth, reading):
-    """Convert `truth` (15 + n,) to `reading` (13 + n,): one sample of the sensor.
+    """Convert true values `truth` (15 + n,) to the sensor's `reading` (13 + n,) at one instant.
 
     Call it once per period. At the first sample filters and delay lines settle on it.
 
     Args:
-        constants, memory: of `sensor_chain`.
+        constants, memory: results of `sensor_chain`; memory is updated.
         noise: (NOISE_SIZE,) standard normal numbers for this block of NOISE_BLOCK samples.
         truth: [wrench (6) of the sensor on the tool at So in S | specific force of So (3),
             angular velocity (3), angular acceleration (3) in S | joint angles (n)].
@@ -465,7 +468,7 @@ def read_into(constants, memory, noise, truth, reading):
 
 @njit(cache=True)
 def shift(line, width):
-    """Shift a delay line, newest row first, by one row.
+    """Shift the delay line `line`, newest row of `width` values first, by one row.
 
     A ring buffer is not faster, and its memory would not be periodic.
     """
@@ -475,7 +478,7 @@ def shift(line, width):
 
 @njit(cache=True)
 def _calibrate(constants, truth, out):
-    """Write the 12 channels with gains, cross-talk, axes and place of the accelerometer."""
+    """Write the 12 channels with calibration errors and the accelerometer's axes and position."""
     wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
     omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
@@ -491,7 +494,7 @@ def _calibrate(constants, truth, out):
 
 @njit(cache=True)
 def _convert(constants, first, end, channels):
-    """Quantise and saturate in place; return 1.0 if one of the channels is saturated."""
+    """Quantise and saturate channels in place; return 1.0 if one of them is saturated, else 0."""
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
@@ -509,9 +512,9 @@ def low_pass(sections, memory, values):
     """Apply second-order sections in series to `values` in place (transposed direct form II).
 
     Args:
-        sections: (5 k,) [b0, b1, b2, a1, a2] of each; sections with b0 = 1 are skipped.
-        memory: (2 k n,) updated.
-        values: (n,) channels.
+        sections: (5 k,) [b0, b1, b2, a1, a2] of each section; sections with b0 = 1 are skipped.
+        memory: (2 k n,) state of the filter, updated.
+        values: (n,) one value of each channel.
     """
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):

@@ -1,4 +1,4 @@
-"""The wrist sensor in the station: instants and samples (long: the step and its block).
+"""Wrist sensor in the station: sampling instants, samples (long: the step and its block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
@@ -100,10 +100,10 @@ _USE_CONTACT_LAW = np.zeros(0)
 
 @njit(cache=True)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+    """Write the true [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
 
-    The wrench is Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the tool
-    about the world's origin, in W.
+    The wrench is that of Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the
+    tool about the world's origin, in W.
     """
     sensor_motion(arm, q, v, vdot, motion)
     put(out, MOTION.start, motion, 0, 9)
@@ -119,7 +119,7 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 
 @njit(cache=True)
 def _interpolate(h, u, x, xdot, end, end_dot, out):
-    """Interpolate by Hermite polynomials: quintic for positions, cubic for velocities."""
+    """Write the state at the fraction u of a step: quintic positions, cubic velocities."""
     half = x.shape[0] // 2
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -136,7 +136,7 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 @njit(cache=True)
 def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
-    """Write one sample of the state x into `memory`, see `sample_step`."""
+    """Take one sample of the arm at the state x and write it into `memory`, see `sample_step`."""
     arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
     half = x.shape[0] // 2
@@ -167,7 +167,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 @njit(cache=True)
 def queue_step(tail, time, state, around):
-    """Append the end of a step to the queue of `sample_step`, see its `memory`."""
+    """Append time and state of a step's end to the sample queue, see `sample_step`, `memory`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
@@ -185,7 +185,7 @@ def _try_queue_step(memory, tail, longest, time, state, around):
 
 @njit(cache=True)
 def _torque_at(held, after, torque):
-    """Write the motors' torque (n,) at `after` from now [s]; `held` as in `sample_step`."""
+    """Write the motor torque (n,) at the time now + `after` [s]; `held` as in `sample_step`."""
     put(torque, 0, held[0], 0, torque.shape[0])
     for i in range(held[1].shape[0]):
         torque[i] += after * held[1][i]
@@ -196,20 +196,20 @@ def sample_step(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
-    """Take the samples due in the steps since the last call.
+    """Take the samples that are due in the steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
-            acceleration by gravity; joints of other moving bodies, wrenches from Drake).
+            acceleration by gravity; `JointTable` of other moving bodies, wrenches from Drake).
         sensor: (chain's constants, estimator's constants, start of its memory, start of the tail,
             ideal).
-        period: of the sensor [s].
-        time: now [s], the end of a step.
-        state: (2 n,) [q; v] now.
-        around: [deflection and rate of the sheet, plant's state if other bodies move] now.
-        held: motor torque (n,) now [N m], and its rate in these steps; (0,) for held torque.
-        applied_W: (6,), see `environment_wrench`.
-        noise: for the chain.
+        period: sampling period [s].
+        time: present time [s], the end of a step.
+        state: (2 n,) present state [q; v] of the arm.
+        around: present [deflection and rate of the sheet, plant's state if other bodies move].
+        held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
+        applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
+        noise: random numbers for the chain.
         memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
             samples taken, length of the queue, time and x of each step's end in it].
         until_now: whether to take a sample that is due now.
@@ -287,13 +287,13 @@ class WristSensor(LeafSystem):
 
         name: WristSensor
         input_ports:
-        - slave_state: [q; v] of the arm
-        - joint_torque: (n,) of the motors now [N m]
-        - torque_rate: (n,) its rate of change [N m/s] (only with `ramps`)
-        - slave_acceleration: vdot of the arm, to detect unknown forces
+        - slave_state: state [q; v] of the arm
+        - joint_torque: (n,) present torque of the motors [N m]
+        - torque_rate: (n,) rate of joint_torque [N m/s] (only with `ramps`)
+        - slave_acceleration: acceleration vdot of the arm, to detect unknown forces
         - sheet_state: [z; v_z] of the sheet spring (only if there is one)
         - plant_state: [q; v] of the whole plant (only if other bodies move)
-        - contact_results: the plant's (only with surroundings)
+        - contact_results: contact results of the plant (only with surroundings)
         - noise: standard normal numbers for NOISE_BLOCK samples (not if the sensor is ideal)
         - applied_wrench_W: (6,) [f; tau] on the tool about So, in W, from all sources except
           contacts [N, N m] (may be left unconnected)
@@ -303,12 +303,12 @@ class WristSensor(LeafSystem):
 
     Args:
         slave: the plant; source of the tool's true inertial parameters and contact shapes.
-        config: the sensor.
+        config: parts of the sensor.
         motion: estimation of the motion of S.
         period: sampling period [s].
         held: duration for which the motors hold a torque, or its rate [s].
         q_start: (n,) joint angles at rest before the first sample [rad].
-        ramps: whether the motors hold a rate.
+        ramps: True if the motors hold a rate.
 
     Raises:
         DrakeTeleopError: during simulation, if a force that the sensor does not receive moves the
@@ -396,33 +396,33 @@ class WristSensor(LeafSystem):
 
     @property
     def offset(self) -> Array:
-        """(6,) offset of force and torque [N, N m]; a view that may be changed during a run."""
+        """Offset (6,) of force and torque [N, N m]; a view that may be changed during a run."""
         return self._offset
 
     @property
     def phi(self) -> Array:
-        """(10,) inertial parameters of the tool; a view that may be changed during a run."""
+        """Inertial parameters (10,) of the tool; a view that may be changed during a run."""
         return self._physics[1]
 
     @property
     def contact_pairs(self) -> Array:
-        """(k, 28) contact pairs, see `Pairs`; a view."""
+        """Contact pairs (k, 28), see `Pairs`; a view."""
         return self._physics[2]
 
     @property
     def beyond(self) -> str:
-        """Contact outside the compiled contact law, see `Contact`."""
+        """Reason why contact is outside the compiled contact law, or "", see `Contact`."""
         return self._beyond_contact_law
 
     @property
     def moves(self) -> str:
-        """Moving bodies of the surroundings besides a leaf, as a sentence, or ""."""
+        """Sentence that names the moving bodies of the surroundings except a leaf, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Indices of the discrete state that depend on the motion.
+        """Indices of the discrete state's numbers that depend on the motion.
 
         Counters, flags, random walks and the sample before the last one are excluded.
         """
@@ -433,7 +433,7 @@ class WristSensor(LeafSystem):
         return np.delete(np.arange(end), others)
 
     def take_samples(self, context: Context) -> None:
-        """Take the samples before now and store the resulting discrete state."""
+        """Take the samples due before the present time and store the resulting discrete state."""
         seen = self._states(context)
         self._sample(
             context, seen, self._contact_level(*seen), False, _USE_CONTACT_LAW, self._result
@@ -518,7 +518,7 @@ class WristSensor(LeafSystem):
         touching_W: Array,
         result: Array,
     ) -> None:
-        """Call `sample_step`, with Drake's contact at each instant near monitored shapes."""
+        """Call `sample_step`; near monitored shapes, with Drake's contact at each instant."""
         inputs = self._inputs(context, seen)
         if near != WATCHED:
             sample_step(*inputs, until_now, touching_W, self._scratch, result)
@@ -580,7 +580,7 @@ class WristSensor(LeafSystem):
 
 
 def sample_at_rest(arm: ArmModel, q: Array) -> Array:
-    """Return the true sample (16 + n,) of the arm at rest at q (n,) [rad]."""
+    """Return the true sample (16 + n,) with the arm at rest at the joint angles q (n,) [rad]."""
     sample, still = np.zeros(sample_size(len(q))), np.zeros(len(q))
     touching, motion, truth = np.zeros(6), np.zeros(MOTION_SIZE), sample[WRENCH_AND_MOTION]
     true_sample(arm.table, arm.phi_load, q, still, still, touching, motion, truth)
@@ -599,12 +599,13 @@ def AddWristSensor(
     *,
     ramps: bool = False,
 ) -> dict[str, OutputPort]:
-    """Add "wrist_sensor", its noise, and demultiplexers of its port; arguments as `WristSensor`.
+    """Add the block "wrist_sensor", its noise source, and demultiplexers of its output.
 
-    State, acceleration and torque of the arm remain to be connected.
+    The arguments are those of `WristSensor`. The caller must connect state, acceleration and torque
+    of the arm.
 
     Returns:
-        The ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
+        The output ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
     """
     sensor = WristSensor(slave, config, motion, period, held, q_start, ramps=ramps)
     builder.AddNamedSystem("wrist_sensor", sensor)
