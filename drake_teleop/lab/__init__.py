@@ -1,1 +1,1 @@
-"""Experiments with a station."""
+"""Experiments that simulate or analyse a station."""

@@ -42,7 +42,7 @@ from drake_teleop.station.station import MakeIdentificationStation
 
 # The design depends on the arm, not on the seed of the run.
 _DESIGN_SEED = 0
-#: Trajectory and its kappa_w10 by a hash of all inputs of the design.
+#: Designed trajectory and its criterion kappa_w10, by a hash of all inputs of the design.
 _DESIGN_CACHE: dict[str, tuple[FourierTrajectory, float]] = {}
 
 
@@ -51,9 +51,10 @@ class LoadIdentification:
     """Result of an identification run.
 
     Attributes:
-        estimate: (16,) Eq. (7), [offsets; phi], final estimate of the recursive estimator.
-        batch: batch total least squares on the same record.
-        real_time_factor: simulated over elapsed time.
+        estimate: (16,) final estimate [offsets; phi] of the recursive estimator, Eq. (7).
+        batch: estimate by batch total least squares from the same record.
+        kappa_w10: criterion of the trajectory, see `excitation.criteria`.
+        real_time_factor: simulated time over elapsed time.
     """
 
     trajectory: FourierTrajectory
@@ -69,13 +70,13 @@ class LoadIdentification:
 
     @property
     def identification(self) -> Identification:
-        """Recursive estimate with uncertainties and residuals of the batch."""
+        """Recursive estimate with uncertainties and residuals of the batch estimate."""
         return dataclasses.replace(
             self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """Fit the noise floor in this free motion."""
+        """Fit the noise floor of the contact wrench to this contact-free motion."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -86,26 +87,26 @@ class LoadIdentification:
 
     @property
     def recursive_against_batch(self) -> float:
-        """Largest difference of both estimates, in standard deviations."""
+        """Largest difference of recursive and batch estimate, in standard deviations."""
         batch = np.concatenate([self.batch.offsets, self.batch.phi])
         return float(np.max(np.abs(self.estimate - batch) / self.batch.standard_deviations))
 
 
 def slave_arm(scenario: Scenario) -> ArmModel:
-    """Return the arm of the slave with tool and payload as its load."""
+    """Return the model of the slave's arm, with tool and payload as its load."""
     check_scenario(scenario)
     return NominalSlave(scenario.slave).arm
 
 
 def true_load(scenario: Scenario) -> Array:
-    """Return (16,) the true [offsets; phi], with zero offsets."""
+    """Return the true load (16,) [offsets; phi], with zero offsets."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     """Return the shipped scenario "identification" with slave and sensor of `scenario`.
 
-    With contact detection it logs at the estimator rate, because the noise floor includes the
+    With contact detection, the log has the estimator's rate, because the noise floor includes the
     correlation of consecutive samples.
     """
     check_scenario(scenario)
@@ -133,12 +134,13 @@ def identify_load(
     """Run an excitation trajectory and identify the load.
 
     Args:
-        progress: True shows progress bars; a `Stage` receives the progress.
-        trajectory: of the scenario's duration; None: designed once for each process.
-        log: log folder, see `simulate`.
+        progress: True shows progress bars; or a `Stage` that receives the progress.
+        trajectory: excitation of the scenario's duration; None: one that each process designs once.
+        log: folder of the log, see `simulate`.
 
     Raises:
-        DrakeTeleopError: if the load estimator is off, or a trajectory violates limits or duration.
+        DrakeTeleopError: if the load estimator is off, or if `trajectory` violates a limit or has
+            another duration.
     """
     check_scenario(scenario)
     if not scenario.load_estimator.enabled:
@@ -173,10 +175,12 @@ def identify_load(
 def batch_identification(
     scenario: Scenario, wrench: Array, s: Array, omega: Array, alpha: Array, rate_hz: float
 ) -> Identification:
-    """Identify load and offsets (at the start of the record) by total least squares.
+    """Identify the load, and the offsets at the start of the record, by total least squares.
 
     Args:
-        wrench, s, omega, alpha: (N, 6), (N, 3) samples at `rate_hz`.
+        wrench: (N, 6) samples of the wrist sensor, in S.
+        s, omega, alpha: (N, 3) samples of the sensor's specific force and angular motion, in S.
+        rate_hz: rate of the samples.
     """
     sensor, rates = scenario.wrist_sensor, scenario.rates
     motion = estimated_motion_std(
@@ -200,7 +204,7 @@ def _design_trajectory(scenario: Scenario, stage: Stage) -> tuple[FourierTraject
     design_inputs = replace(scenario, simulation__seed=0, rates__log_hz=1.0)
     models = [path.read_bytes() for path in scenario.slave.files()]
     key = sha256(repr((dataclasses.asdict(design_inputs), models)).encode()).hexdigest()
-    if key not in _DESIGN_CACHE or scenario.environment:  # its files may change
+    if key not in _DESIGN_CACHE or scenario.environment:  # the environment's files may change
         robot, period = RobotFromScenario(scenario), scenario.simulation.duration
         found = excite(robot, period=period, seed=_DESIGN_SEED, progress=stage).trajectory
         _DESIGN_CACHE[key] = found, criteria_of(robot, found)["kappa_w10"]
@@ -227,7 +231,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
 def simulate_with_timing(
     station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
-    """Simulate a station; return result and real-time factor."""
+    """Simulate a station; return the result and the real-time factor."""
     start = time.perf_counter()
     result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start
@@ -235,7 +239,7 @@ def simulate_with_timing(
 
 
 def sensor_samples(result: SimulationResult) -> tuple[Array, Array, Array, Array]:
-    """Return wrench (N, 6), s, omega, alpha (N, 3) of the wrist sensor in S."""
+    """Return the wrist sensor's samples in S: wrench (N, 6), s, omega and alpha (N, 3)."""
     return (
         result["measured_wrench_S"],
         result["specific_force_S"],

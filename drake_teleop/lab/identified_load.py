@@ -30,14 +30,14 @@ from drake_teleop.station.scenario import Scenario, check_scenario
 CACHE_VARIABLE = "DRAKE_TELEOP_CACHE_DIR"
 """Environment variable with the cache folder."""
 MAX_FILES = 2000
-"""Maximum number of cached files of 5 kB each."""
+"""Maximum number of cached files; each has 5 kB."""
 
 _LIBRARIES = ("drake", "numpy", "scipy", "numba")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedLoad:
-    """Load identified before a run; `noise_floor` only with contact detection."""
+    """Load identified before a run; `noise_floor` is None without contact detection."""
 
     identification: Identification
     noise_floor: NoiseFloor | None
@@ -48,7 +48,7 @@ class IdentifiedLoad:
 
     @property
     def estimate(self) -> Array:
-        """(16,) [offsets; phi], Eq. (7)."""
+        """Estimate (16,) [offsets; phi] of Eq. (7)."""
         return np.concatenate([self.identification.offsets, self.identification.phi])
 
 
@@ -62,11 +62,12 @@ def identified_load(
     """Return the load of a scenario from the cache, or identify and cache it.
 
     Args:
-        progress: True shows progress bars; a `Stage` receives the progress.
-        fresh: True ignores a cached load.
+        progress: True shows progress bars; or a `Stage` that receives the progress.
+        fresh: True ignores the cached load.
+        folder: cache folder; None: `cache_folder()`.
 
     Raises:
-        DrakeTeleopError: as `identify_load`; errors of cache files are ignored.
+        DrakeTeleopError: for the reasons of `identify_load`; errors of cache files are ignored.
     """
     check_scenario(scenario)
     # Another seed: noise of identification and run must be independent.
@@ -78,13 +79,13 @@ def identified_load(
     found = identify_load(before, progress)
     floor = found.noise_floor(slave_arm(scenario)) if detects else None
     load = IdentifiedLoad(found.identification, floor, from_cache=False)
-    with suppress(CannotWrite, OSError):  # without a cache it is identified again
+    with suppress(CannotWrite, OSError):  # next time the load is identified again
         write_load(path, load)
     return load
 
 
 def cache_folder() -> Path:
-    """Return the default cache folder."""
+    """Return the folder that `CACHE_VARIABLE` specifies, or the user's cache folder."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))
@@ -112,7 +113,7 @@ def _cache_key(before: Scenario, detects: bool) -> str:
 
 
 def write_load(path: Path, load: IdentifiedLoad) -> None:
-    """Write a load atomically; remove the oldest files."""
+    """Write a load into a cache file atomically; remove the oldest files above `MAX_FILES`."""
     columns = {
         f"{name}.{field.name}": getattr(part, field.name)
         for name, part in (("load", load.identification), ("floor", load.noise_floor))
@@ -128,7 +129,7 @@ def write_load(path: Path, load: IdentifiedLoad) -> None:
 
 
 def read_load(path: Path) -> IdentifiedLoad | None:
-    """Return the load of a file; None if missing or damaged."""
+    """Return the load in a cache file; None if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             columns = {name: archive[name] for name in archive.files}

@@ -1,7 +1,7 @@
-"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: a station with a custom arm.
+"""`drake-teleop new DIR --arm FILE --sensor-frame NAME`: creation of a station with a custom arm.
 
-It finds a start with the tool down, chooses scales that match the device, writes a commented
-scenario, and runs it: free motion, then contact with a wall.
+The command finds a start pose with the tool down, chooses scales that match the device, writes a
+commented scenario, and runs it: free motion, then contact with a wall.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from drake_teleop.station.slave.tool import Ball, Tool
 
 #: Half edge of the Phantom's workspace cube around the default start [m] (E).
 _PHANTOM_HALF_M = 0.08
-#: Placeholder of a tool [kg, m].
+#: Placeholder for a missing tool [kg, m].
 _TIP = Ball(radius=0.012, position=[0, 0, 0.1])
 _PLACEHOLDER_TOOL = Tool(mass=1.0, com=[0.0, 0.0, 0.05], shapes=[_TIP])
 _CUBE_HALVES_M = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
-_NUM_POSTURES, _NUM_PLACES = 20_000, 24  # random postures; examined places
+_NUM_POSTURES, _NUM_PLACES = 20_000, 24  # number of random postures and of examined places
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 # URDF rpy of the rotation from z to another axis.
 _RPY_ONTO_Z = {
@@ -51,11 +51,11 @@ _RPY_ONTO_Z = {
     "-y": "1.5708 0 0",
     "-z": "3.1416 0 0",
 }
-_MAX_RELATIVE_ERROR = 0.1  # position error of an arm of few joints, over the displacement
+_MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of z_S from vertical
 _PREFERRED_POSITION = np.array([0.6, 0.0, 0.4])  # preferred position, in units of the reach
-_MAX_SWING_M, _MAX_DEPTH_M = 0.04, 0.01  # of the slave: amplitude, depth in the wall
+_MAX_SWING_M, _MAX_DEPTH_M = 0.04, 0.01  # largest amplitude of the slave, and depth in the wall
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
@@ -68,11 +68,11 @@ class Place(NamedTuple):
     """Start of an arm with the tool down.
 
     Attributes:
-        pose: (7,) X_WS [qw qx qy qz px py pz] [-, m].
-        by_position: True if the position alone defines the pose.
-        q: (n,) joint positions [rad].
-        half: half edge of the reachable cube [m].
-        room: smallest distance of a joint to its limit, over half its range.
+        pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
+        by_position: True if the position is sufficient to specify the pose in a scenario.
+        q: (n,) joint positions at the start [rad].
+        half: half edge of the reachable cube around the start [m].
+        room: smallest distance of a joint to its limit, over half the joint's range.
     """
 
     pose: Array
@@ -83,25 +83,25 @@ class Place(NamedTuple):
 
     @property
     def position(self) -> Array:
-        """(3,) p_WS [m]."""
+        """Position p_WS (3,) of the sensor [m]."""
         return self.pose[4:]
 
     @property
     def home(self) -> list[float]:
-        """Value of `slave.home`; empty if the position is sufficient."""
+        """Joint positions for the field `slave.home`; empty if the position is sufficient."""
         return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Start, scales and motions for an arm and a device.
+    """Start, scales and motions of a new station.
 
     Args:
         tool_mass: mass beyond the sensor [kg].
         own_tool: True if the model contains the tool.
         swing: amplitude of the slave in free motion [m].
-        lowest: p_W of the tool's lowest point at the start [m].
-        about_z: note about unusual axes of the sensor.
+        lowest: (3,) position in W of the tool's lowest point at the start [m].
+        axis_note: advice on unusual axes of the sensor frame.
     """
 
     joints: tuple[str, ...]
@@ -130,7 +130,7 @@ def new_command(
     """Write `station.yaml` into a folder, run it into `first_run`, and return the summary.
 
     Args:
-        tool: model file; None: the bodies beyond the sensor, or a placeholder.
+        tool: model file of the tool; None: the bodies beyond the sensor, or a placeholder.
         sensor: preset of the wrist sensor; None: the default sensor.
 
     Raises:
@@ -188,7 +188,7 @@ def plan_station(
     tool: Path | None = None,
     device: str = PHANTOM,
 ) -> Plan:
-    """Choose start and scales for an arm and a device."""
+    """Choose start, scales and motions for an arm and a device."""
     slave = Slave(
         model=str(arm),
         sensor_frame=sensor_frame,
@@ -231,7 +231,7 @@ def find_place(arm: ArmModel, seed: int = 0) -> Place:
     """Find a start with the tool down and reachable space in all directions.
 
     Raises:
-        DrakeTeleopError: if there is none.
+        DrakeTeleopError: if no such start is found.
     """
     random = np.random.default_rng(seed)
     postures = random.uniform(arm.lower, arm.upper, (_NUM_POSTURES, arm.num_joints))
@@ -269,7 +269,7 @@ def _merit(place: Place) -> tuple[float, bool, float]:
 
 
 def _axis_advice(arm: ArmModel) -> str:
-    """Return advice if another axis of S is along the last joint."""
+    """Return advice if another axis of S than z is along the last joint."""
     n = arm.num_joints
     # Axis of the last joint in S, directed away from the joint.
     along = arm.table[n, ROTATION:TRANSLATION].reshape(3, 3)[2]
@@ -292,7 +292,7 @@ def _is_in_front(places: Array, reach: float) -> NDArray[np.bool_]:
 
 
 def _place_with_cube(arm: ArmModel, position: Array, yaw_deg: float) -> Place:
-    """Return a place with the largest reachable cube of `_CUBE_HALVES_M`."""
+    """Return the start at a position, with the largest reachable cube."""
     R_WS = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
     w = R_WS.ToQuaternion().wxyz()
     q, status = tool_down(arm, position, R_WS)
@@ -309,7 +309,6 @@ def _place_with_cube(arm: ArmModel, position: Array, yaw_deg: float) -> Place:
 
 
 def _place_of_short_arm(arm: ArmModel, q: Array, pose: Array) -> Place:
-    """Return a place of an arm with at most five joints."""
     reached = np.empty(7)
 
     def is_reachable(displacement: Array) -> bool:
@@ -345,7 +344,6 @@ def _read_arm(slave: Slave) -> tuple[ArmModel, list[str]]:
 
 
 def _round_down(value: float) -> float:
-    """Round down to two significant digits."""
     unit = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")
 
@@ -403,7 +401,7 @@ def _scenario_text(
 
 
 def _device_rates(device: str) -> dict[str, Any]:
-    """Return slow rates for a slow device, as `analyze` requires."""
+    """Return the rates of a slow device for the scenario, as `analyze` requires."""
     own = Master(model=device).own_period(Rates().hand_hz)
     return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
 

@@ -1,7 +1,8 @@
 """`drake-teleop run SCENARIO`: run one scenario; write its log, picture and summary.
 
-An enabled load estimator starts without a load; without intent and task of the operator, the slave
-runs an excitation trajectory. Otherwise the load is identified first or read from the cache.
+With an enabled load estimator, the run starts without a load; if the operator has neither intent
+nor task, the slave runs an excitation trajectory. With a disabled estimator, the load is identified
+before the run or read from the cache.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _FINAL_FILES = (
 
 
 class RecordedDrive(Protocol):
-    """Drive that can be repeated, see `drake_teleop.live.session.read_drive`."""
+    """Recorded live session that can be simulated, see `drake_teleop.live.session.read_drive`."""
 
     @property
     def folder(self) -> Path:
@@ -49,14 +50,14 @@ class RecordedDrive(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario of the drive, with the duration of the drive."""
+        """Scenario of the session, with the duration of the session."""
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load with which the station was made."""
+        """Load with which the session's station was made."""
 
     def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
-        """Simulate the drive again."""
+        """Simulate the recorded session again."""
 
 
 def run_command(
@@ -69,21 +70,22 @@ def run_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run one scenario; write all results into a folder, without files of an earlier run.
+    """Run one scenario; write all results into `out` and delete those of an earlier run.
 
     Args:
         scenario: name of a shipped scenario, or a YAML file.
-        drive: recorded drive that is repeated instead.
+        drive: recorded live session that is simulated instead of `scenario`.
         seed: replaces the scenario's seed.
-        fresh: True ignores a cached load.
-        progress: False: no progress bars; `quiet`: no tables either.
+        fresh: True ignores the cached load.
+        quiet: True hides progress bars and tables.
+        progress: False hides the progress bars.
 
     Returns:
         The summary and the content of session.json.
 
     Raises:
         DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
-        KeyboardInterrupt: with the number of recorded samples.
+        KeyboardInterrupt: its message contains the number of recorded samples.
     """
     if drive is not None and (seed is not None or fresh):
         raise DrakeTeleopError("a drive has its own seed and load", where="run --inputs")
@@ -148,12 +150,12 @@ def run_scenario(
     *,
     fresh: bool = False,
 ) -> ScenarioRun:
-    """Run a scenario, with its load as described at the top.
+    """Run a scenario with the load that the module's docstring describes.
 
     Args:
-        progress: True shows progress bars; a `Stage` receives the progress.
-        log: log folder, see `simulate`.
-        fresh: True ignores a cached load.
+        progress: True shows progress bars; or a `Stage` that receives the progress.
+        log: folder of the log, see `simulate`.
+        fresh: True ignores the cached load.
 
     Raises:
         DrakeTeleopError: for an unusable scenario or a joint outside its range.

@@ -3,7 +3,7 @@
 =========================== =====================================================================
 peak_measured_force_N       largest measured |f| without offsets; also peak_measured_torque_Nm
 peak_contact_force_N        largest contact force from the final load estimate; also ..._torque_Nm
-residual_force_max_N        the same outside contacts, or null; also residual_torque_max_Nm
+residual_force_max_N        largest one outside contacts, or null; also residual_torque_max_Nm
 true_contact_s              [start, end] of each contact
 contact_noticed_ms          delay of each detection, or null; also contact_at_hand_ms
 false_contacts              number of detections without true contact
@@ -48,12 +48,12 @@ FILTER_TAIL_S = 0.01
 
 @dataclass(frozen=True, eq=False)
 class ScenarioRun:
-    """Scenario with its results.
+    """Scenario and results of one run.
 
     Attributes:
-        identification: load identified before the run, if any.
-        load_source: as in session.json.
-        real_time_factor: simulated over elapsed time.
+        identification: identified load, or None.
+        load_source: origin of the load, as in session.json.
+        real_time_factor: simulated time over elapsed time.
     """
 
     scenario: Scenario
@@ -64,7 +64,7 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) true contact; gaps below FILTER_TAIL_S are closed."""
+    """Return (N,) booleans: True in true contact, with gaps below FILTER_TAIL_S closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -72,7 +72,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return (N, 6) Eq. (13) with the final load estimate.
+    """Return the contact wrench (N, 6) of Eq. (13) with the final load estimate.
 
     Raises:
         DrakeTeleopError: if no load was identified.
@@ -84,7 +84,7 @@ def calculated_contact_wrench(result: SimulationResult) -> Array:
 
 
 def summarise(run: ScenarioRun) -> dict[str, Any]:
-    """Return the values of summary.json."""
+    """Return the content of summary.json, except the scenario's name."""
     result, arm = run.result, slave_arm(run.scenario)
     estimate = result["load_estimate"][-1]
     measured = result["measured_wrench_S"] - estimate[:6]
@@ -128,7 +128,7 @@ def summarise(run: ScenarioRun) -> dict[str, Any]:
 
 
 def overview(result: SimulationResult) -> Figure:
-    """Draw wrenches, motion and force to the master."""
+    """Draw wrenches, motion and force to the master over time."""
     signals = ("measured_wrench_S", "contact_wrench_S", "pose_command", "force_to_master")
     if "contact_wrench_S" not in result:
         signals = ("measured_wrench_S", "specific_force_S", "angular_velocity_S", "load_estimate")
@@ -158,7 +158,7 @@ def _detection_figures(
 
 
 def _unmodelled_contact(scenario: Scenario) -> str:
-    """Return the surroundings that the compiled contact law lacks."""
+    """Return why the compiled contact law does not apply; empty if it applies."""
     surroundings = scenario.surroundings
     if surroundings is None:
         return ""
@@ -185,13 +185,12 @@ def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
 
 
 def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
-    """Return (N,) time since the last contact; inf before the first."""
+    """Return the time (N,) since the last contact [s]; at first inf."""
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
 
 
 def _time_until(contact: NDArray[np.bool_], t: Array) -> Array:
-    """Return (N,) time until the next contact; inf after the last."""
     return _time_since(contact[::-1], -t[::-1])[::-1]
 
 

@@ -1,1 +1,1 @@
-"""Stability and transparency of a station, from closed forms and from the Diagram itself."""
+"""Stability and transparency of a station, from closed forms and the linearised Diagram."""

@@ -1,8 +1,8 @@
 """Stability with any passive hand and environment, or with those in bounded ranges.
 
-Two-ports (..., 2, 2) are on the imaginary axis; results are for each frequency, omega in rad/s.
-Stability also requires h11 and h22 without poles in the right half plane, which the station's
-servo ensures.
+Hybrid matrices H (..., 2, 2) are on the imaginary axis; results are for each frequency omega
+[rad/s]. Stability also requires h11 and h22 without poles in the right half plane, which the
+station's servo ensures.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
 
 
 def llewellyn(H: Complex) -> Real:
-    """Return 2 Re h11 Re h22 - Re(h12 h21) - |h12 h21|; negative: not absolutely stable (T54).
+    """Return Llewellyn's criterion 2 Re h11 Re h22 - Re(h12 h21) - |h12 h21| (T54).
 
-    Llewellyn, Proc. IRE 40 (1952).
+    Negative: the station is not absolutely stable. Llewellyn, Proc. IRE 40 (1952).
     """
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
@@ -37,14 +37,17 @@ def llewellyn(H: Complex) -> Real:
 
 
 def llewellyn_parameter(H: Complex) -> Real:
-    """Return (2 Re h11 Re h22 - Re h12 h21) / |h12 h21|, at least 1 if absolutely stable."""
+    """Return Llewellyn's parameter (2 Re h11 Re h22 - Re h12 h21) / |h12 h21|.
+
+    It is at least 1 if the station is absolutely stable.
+    """
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
         return 1.0 + llewellyn(H) / product
 
 
 def absolutely_stable(H: Complex) -> Flags:
-    """Return whether the station is stable with all passive hands and environments."""
+    """Return booleans: True where all passive hands and environments are stable."""
     h11, h12, h21, h22 = entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
@@ -69,16 +72,17 @@ def required_damping(H: Complex) -> Real:
 
 
 def raisbeck(H: Complex) -> Real:
-    """Return 4 Re h11 Re h22 - |h12 + conj(h21)|^2; negative: not passive (T55).
+    """Return Raisbeck's criterion 4 Re h11 Re h22 - |h12 + conj(h21)|^2 (T55).
 
-    Use `power_scaled` ports. Raisbeck, J. Appl. Phys. 25 (1954).
+    Negative: the station is not passive. Use `power_scaled` ports. Raisbeck, J. Appl. Phys. 25
+    (1954).
     """
     h11, h12, h21, h22 = entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
 
 
 def passive(H: Complex) -> Flags:
-    """Return whether the station absorbs power for every input."""
+    """Return booleans: True where the station absorbs power for every input."""
     h11, h12, h21, h22 = entries(H)
     size = np.abs(h11 * h22) + np.abs(h12) ** 2 + np.abs(h21) ** 2
     return (
@@ -91,11 +95,12 @@ def passive(H: Complex) -> Flags:
 def positive_real(system: control.lti.LTI) -> bool:
     """Return whether a rational impedance or hybrid matrix is passive at all frequencies.
 
-    The least eigenvalue of G + G^H changes its sign only at eigenvalues of the pencil of
-    G(s) + G(-s)^T; one test between any two of them misses no frequency.
+    The least eigenvalue of G + G^H changes its sign only at eigenvalues of the pencil of G(s) +
+    G(-s)^T; one test between any two of them misses no frequency.
 
     Raises:
-        DrakeTeleopError: not continuous, square and proper (then pass the admittance).
+        DrakeTeleopError: if the system is not continuous, square and proper (then pass the
+            admittance).
     """
     import control
     from scipy import linalg
@@ -133,16 +138,17 @@ def positive_real(system: control.lti.LTI) -> bool:
 
 
 def scattering_norm(S: Complex) -> Real:
-    """Return the largest singular value of S; passive if it is at most 1."""
+    """Return the largest singular value of the scattering matrix S; passive if at most 1."""
     return _largest_singular_value(*entries(S))
 
 
 def structured_singular_value(
     S: Complex, hand: ArrayLike = 1.0, environment: ArrayLike = 1.0
 ) -> Real:
-    """Return mu of S for loads with reflection factors up to `hand` and `environment` (T56).
+    """Return mu of the scattering matrix S for loads with bounded reflection factors (T56).
 
-    With 1 (any passive load), mu <= 1 means absolutely stable.
+    `hand` and `environment` are the bounds. With 1 (any passive load), mu <= 1 means absolutely
+    stable.
     """
     s11, s12, s21, s22 = entries(S)
     r1, r2 = np.asarray(hand), np.asarray(environment)
@@ -153,7 +159,6 @@ def structured_singular_value(
 
 
 def _largest_singular_value(a: Complex, b: Complex, c: Complex, d: Complex) -> Real:
-    """Return that of [[a, b], [c, d]] as half the sum of two norms."""
     determinant = a * d - b * c
     size = np.abs(determinant)
     phase = np.where(size > 0, determinant / np.where(size > 0, size, 1.0), 1.0)
@@ -168,14 +173,14 @@ def _squared_abs(z: Complex) -> Real:
 
 
 class WorstLoads(NamedTuple):
-    """Reactances X of the lossless loads closest to oscillation, (...,) [N s/m].
+    """Reactances X (...,) of the lossless hand and environment closest to oscillation [N s/m].
 
     X > 0 at a frequency w is a mass X / w, X < 0 a spring -X w.
     """
 
     hand: Real
     environment: Real
-    resistance: Real  #: of the loop; negative: the oscillation grows
+    resistance: Real  #: resistance of the loop; negative: the oscillation grows
 
 
 def worst_loads(H: Complex) -> WorstLoads:
@@ -194,9 +199,9 @@ def worst_loads(H: Complex) -> WorstLoads:
 
 @dataclass(frozen=True)
 class ImpedanceRange:
-    """Hands or environments m s + b + k / s with (smallest, largest) values.
+    """Range of hands or environments m s + b + k / s; parameters are (smallest, largest).
 
-    At a frequency their impedances fill a rectangle.
+    At one frequency the impedances fill a rectangle.
     """
 
     mass: tuple[float, float]  #: kg
@@ -212,7 +217,7 @@ class ImpedanceRange:
                 )
 
     def corners(self, omega: Real) -> Complex:
-        """Return the (..., 4) corners of the rectangle [N s/m], in order."""
+        """Return the corners (..., 4) of the rectangle of impedances [N s/m], in order."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
         least, most = self.damping
@@ -221,7 +226,7 @@ class ImpedanceRange:
         )
 
     def contains(self, impedance: Complex, omega: Real) -> Flags:
-        """Return whether the range has this impedance [N s/m] at omega."""
+        """Return booleans: True where the range has this impedance [N s/m] at omega."""
         corners = self.corners(omega)
         low, high = corners[..., 0], corners[..., 2]
         return (
@@ -233,7 +238,7 @@ class ImpedanceRange:
 
 
 def range_of_grips() -> ImpedanceRange:
-    """Return the range from the lightest to the firmest grip."""
+    """Return the range of hands from the lightest to the firmest grip."""
     from drake_teleop.station.operator.operator import GRIPS
 
     mass, damping, stiffness = (
@@ -248,11 +253,11 @@ def range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return whether some hand and environment of the ranges can oscillate at each frequency (T57).
+    """Return booleans: True where some hand and environment of the ranges can oscillate (T57).
 
-    If none can at any frequency, all pairs are stable or none is (zero exclusion): check one pair.
-    Behind an ideal servo this holds if the displayed tool mass is less than that of hand and
-    device. The frequencies must be dense.
+    If no pair can at any frequency, either all pairs are stable or none is (zero exclusion): check
+    one pair. Behind an ideal servo this holds if the displayed tool mass is less than that of hand
+    and device. The frequencies must be dense.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
@@ -270,8 +275,8 @@ def can_oscillate(
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: float = 0.0) -> Real:
     """Return the softest wall with which some hand of the range oscillates at each frequency [N/m].
 
-    Up to the least value over the frequencies, all hands are stable that are stable without a wall.
-    `damping` is that of the wall [N s/m].
+    A wall up to the least value over the frequencies keeps all hands stable that are stable without
+    it. `damping` is the wall's damping [N s/m].
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
@@ -303,9 +308,9 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu for hands and environments of the ranges; below 1 none of them can oscillate.
+    """Return mu for hands and environments of the ranges; below 1 no pair can oscillate.
 
-    Sufficient only, but graded: each rectangle is enlarged to the best of five discs.
+    The condition is only sufficient, because the best of five discs replaces each rectangle.
     """
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))
@@ -322,11 +327,10 @@ def bounded_singular_value(
     return np.sqrt(np.min(square, axis=(-2, -1)) / 2)
 
 
-_DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # of a disc, in half diagonals
+_DISC_OFFSETS = np.array([0.3, 1.0, 3.0, 10.0, 100.0])  # offsets of the discs, in half diagonals
 
 
 def _enclosing_discs(corners: Complex) -> tuple[Complex, Real]:
-    """Return (..., 5) discs through the two corners with least damping."""
     diagonal = corners[..., 2] - corners[..., 0]
     right = diagonal.real[..., None] / 2 + np.abs(diagonal)[..., None] / 2 * _DISC_OFFSETS
     middle = corners[..., 0] + 0.5j * diagonal.imag

@@ -61,7 +61,7 @@ from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.slave.plant import NominalSlave
 
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-_LEAF_DEPTH = 5e-3  # m, depth in the leaf
+_LEAF_DEPTH = 5e-3  # m, displacement of the tip into the leaf
 
 
 def analyze_command(
@@ -75,13 +75,13 @@ def analyze_command(
     """Analyse a scenario; write summary.json, report.html and its pictures into `out`.
 
     Args:
-        scenario: the name of a shipped one, or a YAML file.
+        scenario: name of a shipped scenario, or a YAML file.
         direction: x, y or z of the world.
-        quiet: no progress bars and no tables.
+        quiet: True hides progress bars and tables.
         progress: False hides only the progress bars.
 
     Returns:
-        The summary, see the top of this module.
+        The summary, see the module's docstring.
     """
     setup = LoadScenario(scenario)
     make_folder(out)  # before the work, so that a bad path fails early
@@ -98,9 +98,10 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """Return the figures of a scenario along x, y or z of the world, and its curves.
+    """Return the summary of a scenario along x, y or z of the world, and its curves.
 
-    A passivity method, which is not linear, is left out. `progress`: whether or where to show it.
+    A passivity method, which is not linear, is left out. `progress`: whether or where to show the
+    progress.
     """
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
@@ -183,7 +184,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
 
 
 def describe_wall(scenario: Scenario, is_known: bool) -> str:
-    """Return the report's description of the wall."""
+    """Return the source of the wall's stiffness as text."""
     if scenario.leaf is not None:
         return "the leaf"
     surroundings = scenario.surroundings
@@ -195,7 +196,7 @@ def describe_wall(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """Return the rates of a scenario."""
+    """Return the rates and the sensor's low-pass of a scenario."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -222,16 +223,16 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the system with all loops closed."""
+    """Return the linear system of a scenario with all loops closed."""
     return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the system with all loops closed except the hand's along the direction.
+    """Return the linear system with all loops closed except the hand's along the direction.
 
-    If the direction is no axis of B, the hand's loop remains open.
+    If the direction is no axis of B, the hand's whole loop remains open.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)

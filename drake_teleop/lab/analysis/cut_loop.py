@@ -1,4 +1,4 @@
-"""The sampled axis cut at the force displayed to the hand: stability for every delay (T60).
+"""Loop of the sampled one-axis model, cut at the displayed force: stability for every delay (T60).
 
 If servo and sensor run at the hand's rate or a whole multiple of it, one loop through the channel
 remains: L(z) z^(-D) with D hand periods of round trip. From the crossings of |L| = 1 the argument
@@ -32,16 +32,16 @@ class CutLoop:
 
     open: Complex  #: (..., n) multipliers of the cut loop
     closed: Complex  #: (..., n) multipliers of the loop closed without delay
-    period: Array  #: of the hand [s], (...)
+    period: Array  #: period of the hand [s], (...)
     angles: Array  #: (..., 32) from 0 to pi: crossings of |L| = 1, and ends with |L| > 1
-    phases: Array  #: unwrapped phases there
+    phases: Array  #: unwrapped phases of L at these angles
     signs: Array  #: 1 if |L| falls below 1, -1 if it rises, 0 if unused
 
     @classmethod
     def of(
         cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
     ) -> CutLoop:
-        """Return the loop of these multipliers, with its crossings of |L| = level."""
+        """Return the loop with these multipliers, and its crossings of |L| = level."""
         shape, n = opened.shape[:-1], opened.shape[-1]
         found = np.zeros((3, *shape, _MAX_CROSSINGS))
         _find_crossings(
@@ -55,11 +55,11 @@ class CutLoop:
 
 
 def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
-    """Return the loop cut at the force displayed to the hand; `axis.delay` has no effect.
+    """Return the model's loop cut at the displayed force; `axis.delay` has no effect.
 
     Raises:
-        DrakeTeleopError: the servo is ideal, or servo or sensor do not run at a whole multiple of
-            the hand's rate.
+        DrakeTeleopError: if the servo is ideal, or servo or sensor do not run at a whole multiple
+            of the hand's rate.
     """
     M = cut_map(axis, sampling)
     n = M.shape[-1] - 3
@@ -71,7 +71,7 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return L(z) z^(-D) (N, ...) at z = e^(j w T); the closed loop is at its limit where it is 1.
+    """Return the loop L(z) z^(-D) (N, ...) at z = e^(j w T); 1 is the stability limit.
 
     `frequency`: (N,) w [rad/s]; `delay`: one way [s], (...).
     """
@@ -84,9 +84,9 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 
 
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number of multipliers of the closed loop outside the unit circle, (...).
+    """Return the number (...) of multipliers of the closed loop outside the unit circle.
 
-    `delay` is one way [s], (...); it is not rounded to hand periods.
+    `delay` is one way [s], (...), not rounded to hand periods.
     """
     D = (2 * np.asarray(delay) / loop.period)[..., None]
     turns = (loop.phases - D * loop.angles) / (2 * np.pi)
@@ -97,9 +97,9 @@ def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
 
 
 def delay_margin(loop: CutLoop) -> Array:
-    """Return the total round trip at which the loop first becomes unstable [s], (...).
+    """Return the total round trip (...) at which the loop first becomes unstable [s].
 
-    0 if it is unstable without delay, infinite without a limit. Longer delays may be stable again.
+    0: unstable without delay; infinite: no limit. Longer delays may be stable again.
     """
     inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
@@ -108,7 +108,7 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the largest multiplier of the closed loop with imaginary part >= 0, (...).
+    """Return the largest multiplier (...) of the closed loop, with imaginary part >= 0.
 
     No matrix grows with the delay, one way [s], (...); exact at whole hand periods.
     """
@@ -169,7 +169,6 @@ def _loop(closed, opened, angle, radius):
 
 @njit(cache=True)
 def _find_crossings(opened, closed, levels, angles, found):
-    """Write angles, phases and signs of |L| = level into `found` (3, loops, places)."""
     for n in range(opened.shape[0]):
         poles, zeros, level, count = opened[n], closed[n], levels[n], 0
         # Beside z = 1, where the cut loop has a multiplier if the hand has no stiffness.
@@ -217,7 +216,6 @@ def _add_pole_angles(angles, poles):
 
 @njit(cache=True)
 def _add_extremes(angles, poles, zeros, level):
-    """Return more angles, at extremes of |L| near the level, and L at all angles."""
     values = np.empty(angles.shape[0], np.complex128)
     for i in range(angles.shape[0]):
         values[i] = _loop(zeros, poles, angles[i], 1.0)

@@ -1,9 +1,9 @@
-"""A loop with a delay: its unstable poles, delay margin and windows of stable delays, exactly.
+"""Continuous loop with a delay: exact unstable poles, delay margin and windows of stable delays.
 
 The loop L(s) = N(s) / D(s) e^(-s RTT) is cut at the displayed force (T58). A pole can cross the
 imaginary axis only at roots of |N(jw)| = |D(jw)|, at delays 2 pi / w apart and always in the same
-direction (Walton and Marshall 1987; T59). With an ideal servo and a displayed inertia, |L| tends
-to a constant rho at high frequency; with rho >= 1 any delay causes infinitely many unstable poles.
+direction (Walton and Marshall 1987; T59). With an ideal servo and a displayed inertia, |L| tends to
+a constant rho at high frequency; with rho >= 1 any delay causes infinitely many unstable poles.
 
 Parameters that are not positive, or N of higher order than D, raise DrakeTeleopError.
 """
@@ -28,7 +28,7 @@ class DelayedLoop:
     """Loop L(s) = N(s) / D(s) e^(-s delay), or a grid of such loops."""
 
     numerator: Array  #: coefficients (..., n + 1), highest power first
-    denominator: Array  #: likewise, at least of the same order
+    denominator: Array  #: coefficients, at least of the numerator's order
     delay: Array  #: (...) [s], not negative
 
     def __post_init__(self) -> None:
@@ -68,14 +68,14 @@ class DelayedLoop:
         )
 
     def to_control(self, omega: ArrayLike) -> Any:
-        """Return a single loop as control.FRD at omega (n,) [rad/s]."""
+        """Return a single loop as `control.FRD` at omega (n,) [rad/s]."""
         import control
 
         omega = np.asarray(omega, dtype=float)
         return control.frd(self(1j * omega), omega)
 
     def __call__(self, s: ArrayLike) -> Complex:
-        """Return L (n, *grid) at s (n,) [rad/s]."""
+        """Return the loop L (n, *grid) at s (n,) [rad/s]."""
         s = np.asarray(s, dtype=complex)
         return self._at(s.reshape(s.shape + (1,) * self.delay.ndim))
 
@@ -111,7 +111,7 @@ def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
 
     L = k_f l_p G (gamma (b_e s + k_e) + M s^2) / (m s^2 + b s + k) e^(-2 s T), with
     G = g / (s^2 + k_v s + g + (b_e s + k_e) / m_s), g = k_v k_p, or 1 for an ideal servo;
-    m, b, k of hand and device. Fields of the axis may be arrays: the grid.
+    m, b, k of hand and device; displayed tool mass M. Arrays as fields of the axis form the grid.
     """
     if not contact:
         axis = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
@@ -140,7 +140,7 @@ def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
 
     Returns:
         frequency (..., n) [rad/s], NaN if unused; direction (..., n): 1 into the right half plane
-        (|L| falls), -1 out of it, 0 if unused.
+            (|L| falls), -1 out of it, 0 if unused.
     """
     excess = squared_magnitude(loop.denominator) - squared_magnitude(loop.numerator)
     slope = excess[..., :-1] * np.arange(excess.shape[-1] - 1, 0, -1)
@@ -154,7 +154,7 @@ def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
 
 
 def unstable_poles(loop: DelayedLoop) -> Array:
-    """Return the number of closed-loop poles in the right half plane (...), or inf."""
+    """Return the number (...) of closed-loop poles in the right half plane; may be inf."""
     frequency, direction = gain_crossings(loop)
     excess_turns = (loop.delay[..., None] - _first_delay(loop, frequency)) * frequency / (2 * np.pi)
     crossed = np.ceil(np.clip(np.nan_to_num(excess_turns), 0, None))
@@ -164,9 +164,9 @@ def unstable_poles(loop: DelayedLoop) -> Array:
 
 
 def delay_margin(loop: DelayedLoop) -> Array:
-    """Return the delay that may be added before the loop becomes unstable (...) [s].
+    """Return the delay (...) that may be added before the loop becomes unstable [s].
 
-    inf for any delay, 0 if it is unstable already.
+    inf: any delay; 0: the loop is already unstable.
     """
     return margin_of_delay(loop, unstable_poles(loop) == 0)[0]
 
@@ -194,7 +194,7 @@ def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]
 
 
 def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the delay margin and the frequency at which a pole reaches the axis."""
+    """Return the delay margin, and the frequency at which a pole reaches the imaginary axis."""
     frequency, _ = gain_crossings(loop)
     past = np.mod(phase_lag_to_minus_one(loop, frequency), 2 * np.pi)
     margin, at = min_without_nan(past / frequency, frequency)
@@ -203,7 +203,7 @@ def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array
 
 
 def phase_lag_to_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
-    """Return the phase lag of each loop to -1 at frequencies (..., n)."""
+    """Return the phase lag [rad] that moves each loop to -1, at frequencies (..., n)."""
     along = DelayedLoop(
         loop.numerator[..., None, :], loop.denominator[..., None, :], loop.delay[..., None]
     )
@@ -223,7 +223,7 @@ def _unstable_without_delay(loop: DelayedLoop) -> Array:
 
 
 def min_without_nan(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
-    """Return the least value along the axis without NaN, or inf, and its place."""
+    """Return the least value along the axis without NaN, or inf, and the entry of `at` there."""
     value = np.where(np.isnan(value), np.inf, value)
     if not value.shape[axis]:
         shape = np.delete(value.shape, axis)
@@ -248,7 +248,7 @@ def checked_positive(value: ArrayLike, what: str) -> Array:
 
 
 def stack_coefficients(*coefficients: Any) -> Array:
-    """Return broadcast coefficients along the last axis."""
+    """Return broadcast polynomial coefficients, stacked along the last axis."""
     return np.stack(np.broadcast_arrays(*(np.asarray(c, float) for c in coefficients)), axis=-1)
 
 
@@ -263,7 +263,7 @@ def multiply_polynomials(p: Array, q: Array) -> Array:
 
 
 def squared_magnitude(p: Array) -> Array:
-    """Return |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
+    """Return the polynomial |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
     powers = np.arange(p.shape[-1] - 1, -1, -1)
     return multiply_polynomials(p, p * (-1.0) ** powers)[..., ::2] * (-1.0) ** powers
 
@@ -277,7 +277,7 @@ def polynomial_value(p: Array, x: Any) -> Any:
 
 
 def polynomial_roots(p: Array) -> Complex:
-    """Return the roots (..., n); a leading zero gives a very large root."""
+    """Return the roots (..., n) of a polynomial; a leading zero gives a very large root."""
     order = p.shape[-1] - 1
     if order == 0:
         return np.zeros((*p.shape[:-1], 0), dtype=complex)

@@ -1,4 +1,4 @@
-"""Figures of `drake-teleop analyze`, one function for each part of its summary."""
+"""Numbers in the summary of `drake-teleop analyze`, one function for each part."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OMEGA: Array = 2 * np.pi * np.geomspace(0.1, 300.0, 500)
 S: Complex = 1j * OMEGA.astype(complex)
 _FIT_BAND = 2 * np.pi * 5.0  # rad/s, limit of the fit of mass, damping and stiffness
 _MIN_LOOP_GAIN = 1e-9  # largest |L| that counts as no loop
-_MAP_POINTS = 80  # of a map, in each direction
+_MAP_POINTS = 80  # points of a map in each direction
 _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
@@ -59,7 +59,7 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion; above `MAX_STATES` states only of one axis."""
+    """Return stability and slowest motion; above `MAX_STATES` states only of the one-axis model."""
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -85,7 +85,7 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the Diagram's deviations from closed and sampled form, hand's mass included."""
+    """Return the Diagram's deviations from two one-axis models, hand's mass included."""
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
@@ -127,7 +127,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria for passive loads."""
+    """Return criteria of stability and passivity with arbitrary passive loads."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -159,7 +159,7 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedance in free motion and at the wall."""
+    """Return displayed and ideal impedance in free motion and at the wall, and tracking."""
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
@@ -189,7 +189,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the virtual walls that the device itself could render."""
+    """Return the stiffest virtual walls that the device itself could render."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -218,7 +218,10 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Return the impedance displayed in free motion, simulated with noise, without friction."""
+    """Return the impedance displayed in free motion, measured in the nonlinear simulation.
+
+    The simulation has noise but no friction.
+    """
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
     smooth = replace(free, master=frictionless, slave__friction=[])
@@ -245,7 +248,7 @@ def measured_figures(
 def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
-    """Return title -> grip -> map."""
+    """Return the stability maps: title -> grip -> map."""
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _MAP_POINTS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)

@@ -28,7 +28,7 @@ from drake_teleop.station.station import MakeTeleopStation
 
 Array = NDArray[np.float64]
 
-_PHASE_DRAWS = 300  # of random phases; the flattest is used
+_PHASE_DRAWS = 300  # number of random phase sets; the one with the lowest peak is used
 _APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparent mass
 
 
@@ -41,18 +41,18 @@ class MultiSine:
     lines: int = 16  #: largest number of frequencies
     velocity: float = 0.04  #: amplitude at each frequency [m/s] or [rad/s]
     period: float = 2.0  #: s; all frequencies are odd multiples of its inverse
-    periods: int = 3  #: recorded
+    periods: int = 3  #: number of recorded periods
     settle: float = 1.5  #: s, for fading in and transients
-    seed: int = 0  #: of the phases
+    seed: int = 0  #: seed of the random phases
 
     def multiples(self) -> NDArray[np.int64]:
-        """Return the (n,) odd multiples of 1 / period."""
+        """Return the odd multiples (n,) of 1 / period in the motion."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def segments(self, direction: Array, start: float) -> list[Sine]:
-        """Return the intent along `direction` (6,) in B, from `start` [s]."""
+        """Return the intended motion along `direction` (6,) in B, from `start` [s]."""
         frequencies = self.multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
@@ -93,12 +93,12 @@ class StationResponse:
     force_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
-        """Return the (n,) ratio of output to input."""
+        """Return the ratio (n,) of two spectra, output over input."""
         ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
         return ratio
 
     def coherence(self, output: str, input_: str) -> Array:
-        """Return the (n,) fraction of the output's power that is linear in the input."""
+        """Return the fraction (n,) of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
@@ -107,10 +107,10 @@ class StationResponse:
     def apparent_mass(self) -> float:
         """Return the tool mass displayed to the hand, in the slave's units [kg]; ideally sigma m_t.
 
-        It is extrapolated to frequency 0, for delays far below 0.1 s.
+        The mass is extrapolated to frequency 0, for delays far below 0.1 s.
 
         Raises:
-            DrakeTeleopError: fewer than three lines are below 10 Hz.
+            DrakeTeleopError: if fewer than three lines are below 10 Hz.
         """
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
@@ -146,12 +146,12 @@ def measure_frequency_response(
     """Simulate the station with a multi-sine of the operator and return the spectra.
 
     Args:
-        scenario: its intent is replaced.
+        scenario: scenario whose intent is replaced.
         load_estimate: (16,) as for `MakeTeleopStation`.
-        approach: moves to the operating point, before the multi-sine.
+        approach: motions to the operating point, before the multi-sine.
 
     Raises:
-        DrakeTeleopError: a period is no whole number of steps of the hand.
+        DrakeTeleopError: if the multi-sine's period is no whole number of hand periods.
     """
     check_scenario(scenario)
     rate = scenario.rates.hand_hz
@@ -193,7 +193,7 @@ def predict_frequency_response(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> StationResponse:
-    """Return the spectra of the linearised Diagram; see `linearize_station`."""
+    """Return the spectra that the linearised Diagram predicts; see `linearize_station`."""
     system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
     first = system.inputs.index("hand_wrench.x")
     pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand

@@ -1,15 +1,15 @@
 """The station's Diagram, linearised at rest (long: a model and how it is computed).
 
-Each state is displaced up and down and the Diagram simulated for one period of the hand (T63).
-The loops are cut at
+Each state is displaced up and down and the Diagram simulated for one period of the hand (T63). The
+loops are cut at
 
     loop                       output              input
     hand on the stylus         operator_wrench     hand_wrench      F_E_B at E, in B
     network, master to slave   pose_command        pose_received    of S, in W
     network, slave to master   wrench_B            wrench_received  F_E_B, in B
 
-The input `tool_wrench` acts on the tool, about So, in W. Inputs are held for a period. Left out are
-noise, offset, quantisation and saturation of the sensor, and all Coulomb friction.
+The input `tool_wrench` acts on the tool, about So, in W. Inputs are held for a period. The model
+excludes noise, offset, quantisation and saturation of the sensor, and all Coulomb friction.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 _INPUTS = ("hand_wrench", "pose_received", "wrench_received", "tool_wrench")
 _OUTPUTS = ("operator_wrench", "pose_command", "wrench_B", "twist_master", "twist_slave")
 
-# Displacements of the differences: the error is their square, or rounding over them.
+# Displacements for differences: errors grow with their square, and with rounding over them.
 _ANGLE_STEP, _RATE_STEP, _UNIT_STEP = 1e-4, 1e-4, 1.0
 _HAND_WRENCH_STEP = np.repeat([1.0, 0.02], 3)  # N, N m: within the device's range
 _MAX_ACCELERATION = 20.0  # rad/s^2, requested of a joint: within the motors' torque
@@ -59,14 +59,14 @@ _REST_TOLERANCE = 1e-6  # motion per period at rest, relative to the displacemen
 _MAX_NEWTON_STEPS = 8  # of Newton's method
 _RAMP_S, _SETTLE_S = 0.3, 0.1  # s, motion to the operating point, rest there
 _MAX_DENSE_STATES = 800  # states; more need the sparse eigenvalue search
-MAX_STATES = 8000  #: largest number, delay included, for multipliers
+MAX_STATES = 8000  #: largest number of states, delay included, for multipliers
 _MAX_FREQUENCY_HZ = 100.0  # Hz, limit of the sparse search
 _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Model x' = A x + B u, y = C x + D u over one period, and loops with delay.
+    """Linear model x' = A x + B u, y = C x + D u over one period, and delayed loops.
 
     Parts of a port are "port.x", ..., "port.rz": poses as translation [m] and rotation vector
     [rad], wrenches [N, N m], twists [m/s, rad/s].
@@ -88,7 +88,7 @@ class Linearization:
     ) -> Linearization:
         """Return the model with outputs fed back to inputs, u += z^-periods y; the inputs remain.
 
-        `outputs` and `inputs` are a port's name, or names of parts; other names raise an error.
+        `outputs` and `inputs` are a port's name, or names of its parts; other names raise an error.
         """
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
@@ -112,10 +112,10 @@ class Linearization:
 
     @property
     def multipliers(self) -> Complex:
-        """Eigenvalues over a period, largest first; stable below 1.
+        """Eigenvalues over a period, largest first; stable if all magnitudes are below 1.
 
-        Above 800 states, delay included: only those near the unit circle up to 100 Hz. Above 8000:
-        DrakeTeleopError.
+        Above 800 states, delay included: only those near the unit circle up to 100 Hz. Above 8000
+        states, DrakeTeleopError is raised.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _MAX_DENSE_STATES:
@@ -186,7 +186,7 @@ def _use_brackets(name: str) -> str:
 
 
 def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
-    """Return eigenvalues of a sparse A, by shift and invert along the unit circle."""
+    """Return eigenvalues of a sparse A near the unit circle, by shift and invert."""
     from scipy.sparse.linalg import eigs
 
     start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
@@ -230,7 +230,7 @@ def linearize(
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
-        DrakeTeleopError: the rates have no common period, or the slave does not come to rest.
+        DrakeTeleopError: if the rates have no common period, or the slave does not come to rest.
     """
     check_scenario(scenario)
     if load_estimate is not None:
@@ -261,7 +261,7 @@ def linearize_station(
 ) -> Linearization:
     """Return the linearised Diagram with all loops closed, over the scenario's constant delays.
 
-    As `linearize`; a passivity method raises an error, because it is not linear.
+    See `linearize`; a passivity method raises an error, because it is not linear.
     """
     check_scenario(scenario)
     if scenario.passivity.method != "none":
@@ -282,9 +282,9 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 
 
 def delays(scenario: Scenario) -> tuple[int, int]:
-    """Return the delays of pose and wrench over the network, in periods of the hand.
+    """Return the delays of pose and wrench over the network, in hand periods.
 
-    They are 0 for an ideal network without a passivity method, otherwise at least 1.
+    The delays are 0 for an ideal network without a passivity method, otherwise at least 1.
     """
     lines = scenario.channel.lines()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
@@ -296,7 +296,7 @@ def delays(scenario: Scenario) -> tuple[int, int]:
 
 
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """Return H (n, 2, 2) along one direction of hand and tool (see `TaskDirection`).
+    """Return the hybrid matrix H (n, 2, 2) along one direction (see `TaskDirection`).
 
     In `system` the hand loop is cut in that direction. The hand's mass is part of the device.
     Forces are those of `sampled_two_port`. omega: (n,) [rad/s], not zero.
@@ -495,7 +495,7 @@ class _Period:
         )
 
     def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
-        """Return the states at the operating point, A and C; set the cut inputs to balance it."""
+        """Return states, A and C at the operating point; set the cut inputs to balance it."""
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -527,7 +527,7 @@ class _Period:
         return self.get()
 
     def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the slave's state of rest, A and C, by Newton's method; the master is at rest."""
+        """Return the slave's states at rest, A and C, by Newton's method."""
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_NEWTON_STEPS):
             A, C = self.derivative(x)

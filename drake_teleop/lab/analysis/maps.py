@@ -31,7 +31,7 @@ from drake_teleop.lab.analysis.transparency import ideal_impedance
 
 Array = NDArray[np.float64]
 
-#: Parameter of a map: the hand's rate [Hz], the other rates in proportion.
+#: Name of a map's parameter: the hand's rate [Hz]; the other rates change in proportion.
 RATE = "rate"
 _PARAMETERS = {entry.name for entry in fields(OneAxis)} - {"ideal_servo"} | {RATE, "low_pass_hz"}
 _HALVINGS = 10
@@ -40,19 +40,19 @@ _DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, delibera
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Stability over the grid of two parameters."""
+    """Stability and distortion over a grid of two parameters."""
 
     x_name: str
     y_name: str
-    x: Array  #: (nx,)
-    y: Array  #: (ny,)
+    x: Array  #: (nx,) values of the first parameter
+    y: Array  #: (ny,) values of the second parameter
     unstable: NDArray[np.int64]  #: (ny, nx) multipliers outside the unit circle
     distortion: Array  #: (ny, nx), valid only where the loop is stable
     boundary: Array  #: (n, 2) points x, y, to a thousandth of the grid's step
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Whether the loop is stable, (ny, nx)."""
+        """Booleans (ny, nx): True where the loop is stable."""
         return self.unstable == 0
 
 
@@ -64,7 +64,7 @@ def stability_map(
     y_name: str,
     y: ArrayLike,
 ) -> StabilityMap:
-    """Return stability and distortion over two parameters.
+    """Return stability and distortion over a grid of two parameters.
 
     Args:
         x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's [Hz], the other
@@ -72,7 +72,8 @@ def stability_map(
         x, y: (nx,), (ny,) increasing values.
 
     Raises:
-        DrakeTeleopError: another name, values that do not increase, or as `cut_loop`.
+        DrakeTeleopError: for another name, values that do not increase, or the reasons of
+            `cut_loop`.
     """
     xs, ys = _increasing(x_name, x), _increasing(y_name, y)
 
@@ -104,9 +105,10 @@ def stability_map(
 
 
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
-    """Return the largest relative error of the hand's total force over a band [rad/s], (...).
+    """Return the largest relative error (...) of the hand's total force over a band [rad/s].
 
-    The total is for hand, device and displayed force; the reference has the `ideal_impedance`.
+    The total moves hand and device against the displayed force; the reference has the
+    `ideal_impedance`.
     """
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))

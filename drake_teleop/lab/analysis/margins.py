@@ -23,22 +23,23 @@ from drake_teleop.lab.analysis.delayed_loop import (
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of a loop, or of each loop of a grid (...); an unstable loop has 1, 0 and 0.
+    """Stability margins of a loop, or of each loop of a grid (...).
 
-    Without a limit the margin is inf and its frequency NaN.
+    An unstable loop has gain 1, phase 0, delay 0. Without a limit the margin is inf, its frequency
+    NaN.
     """
 
-    unstable_poles: Array  #: of the closed loop
+    unstable_poles: Array  #: number of them in the closed loop
     gain: Array  #: factor by which L may grow
     gain_frequency: Array  #: where L then reaches -1 [rad/s]
     phase: Array  #: rotation of L to -1, in either direction [rad]
     phase_frequency: Array  #: [rad/s]
-    delay: Array  #: that may be added [s]
+    delay: Array  #: delay that may be added [s]
     delay_frequency: Array  #: [rad/s]
 
 
 def margins(loop: DelayedLoop) -> Margins:
-    """Return the margins of a loop with known coefficients; the delay is exact.
+    """Return the margins of a loop from its coefficients; the delay is exact.
 
     The gain margin needs a grid of frequencies for each loop: for large grids of parameters use
     `delay_margin` and `unstable_poles`.
@@ -77,9 +78,9 @@ def margins_of_response(
     log |L| and the phase are interpolated linearly in log w.
 
     Args:
-        omega: (n,) [rad/s], increasing, positive.
-        response: L(jw) or L(e^(jw Ts)), (n, ...), as `frdata[0, 0]` of a control.FRD.
-        delay: (...) [s], added to the response, exactly.
+        omega: (n,) frequencies [rad/s], increasing, positive.
+        response: (n, ...) loop L(jw) or L(e^(jw Ts)), as `frdata[0, 0]` of a control.FRD.
+        delay: (...) delay [s] that is added to the response, exactly.
         open_loop_poles, poles_at_origin, sampled: as in `encirclements`.
     """
     omega = np.asarray(omega, dtype=float)
@@ -125,18 +126,18 @@ def encirclements(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Array:
-    """Return the unstable closed-loop poles (...), from the turns of 1 + L about the origin.
+    """Return the number (...) of unstable closed-loop poles, by the encirclements of -1.
 
     A continuous response must extend to where |L| < 1 remains, a sampled one to half the sampling
     rate.
 
     Args:
-        response: L at increasing frequencies from near zero, (n, ...).
-        open_loop_poles: unstable poles of L.
-        poles_at_origin: of L, at s = 0 or z = 1; the contour passes them on the unstable side.
+        response: (n, ...) loop L at increasing frequencies from near zero.
+        open_loop_poles: number of unstable poles of L.
+        poles_at_origin: number at s = 0 or z = 1; the contour passes them on the unstable side.
 
     Raises:
-        DrakeTeleopError: the frequencies are too coarse, or end too early.
+        DrakeTeleopError: if the frequencies are too coarse, or end too early.
     """
     difference = 1 + np.asarray(response, dtype=complex)
     steps = np.angle(difference[1:] / difference[:-1])
@@ -158,7 +159,6 @@ def encirclements(
 
 
 def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
-    """Return the least factor above 1 that puts a single L on -1, and its frequency."""
     slow, fast = break_frequencies(loop)
     # Above the last pole |L| falls, and with a delay its phase passes -pi within one turn.
     delay = float(loop.delay)
@@ -183,14 +183,14 @@ def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
 
 
 def break_frequencies(loop: DelayedLoop) -> tuple[float, float]:
-    """Return least and largest magnitude of the poles without delay, except 0."""
+    """Return the least and largest magnitude of the poles of N / D, except 0."""
     breaks = np.abs(polynomial_roots(loop.denominator))
     breaks = breaks[breaks > 0]
     return float(np.min(breaks, initial=1.0)), float(np.max(breaks, initial=1.0))
 
 
 def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
-    """Return frequencies up to the top between which L and its delay turn little."""
+    """Return frequencies up to `top`, between which L and its delay rotate little."""
     step = np.pi / 8 / max(float(loop.delay), 1 / top)
     return np.union1d(np.geomspace(1e-3 * slow, top, 1000), np.arange(step, top, step))
 

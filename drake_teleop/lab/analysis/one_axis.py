@@ -51,7 +51,7 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class OneAxis(Axis):
-    """One direction of the linear analysis."""
+    """Parameters of one direction for the linear analysis."""
 
     device_damping: float = 0.5  #: N s/m
     mass_error: float = 0.0  #: kg, estimated minus true tool mass
@@ -61,27 +61,27 @@ class OneAxis(Axis):
 
     @property
     def displayed_tool_mass(self) -> float:
-        """Tool mass sigma m_t + (sigma - gamma) dm after the elimination [kg]."""
+        """Displayed tool mass sigma m_t + (sigma - gamma) dm, after the elimination [kg]."""
         return self.sigma * self.tool_mass + (self.sigma - self.gamma) * self.mass_error
 
 
 def hand_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return Z_h."""
+    """Return the hand's impedance Z_h."""
     return axis.hand_mass * s + axis.hand_damping + axis.hand_stiffness / s
 
 
 def device_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return Z_m."""
+    """Return the device's impedance Z_m."""
     return axis.device_mass * s + axis.device_damping
 
 
 def environment_impedance(axis: OneAxis, s: Complex) -> Complex:
-    """Return Z_e."""
+    """Return the environment's impedance Z_e."""
     return axis.wall_damping + axis.wall_stiffness / s
 
 
 def servo_response(axis: OneAxis, s: Complex) -> Complex:
-    """Return C / (Z_s + C), slave over command."""
+    """Return the servo's response C / (Z_s + C), slave over command."""
     if axis.ideal_servo:
         return np.ones_like(s)
     gain = axis.velocity_gain * axis.position_gain
@@ -89,7 +89,7 @@ def servo_response(axis: OneAxis, s: Complex) -> Complex:
 
 
 def servo_admittance(axis: OneAxis, s: Complex) -> Complex:
-    """Return 1 / (Z_s + C), the admittance of the slave."""
+    """Return the slave's admittance 1 / (Z_s + C)."""
     if axis.ideal_servo:
         return np.zeros_like(s)
     kv, kp = axis.velocity_gain, axis.position_gain

@@ -1,4 +1,4 @@
-"""The station's one axis over the common period of its rates: sampled, held, delayed.
+"""Sampled one-axis model of the station over the common period of its rates.
 
 The map keeps the order of events. All updates at one instant read earlier values:
 
@@ -7,8 +7,8 @@ The map keeps the order of events. All updates at one instant read earlier value
 * The sensor samples just before the servo's update; its low-pass, if any, is digital.
 * A channel with a delay of d hand periods returns its input of d periods ago.
 
-Between events, matrix exponentials are exact. Fields of `OneAxis` and `Sampling` may be arrays
-that broadcast; results have their shape in front.
+Between events, matrix exponentials are exact. Fields of `OneAxis` and `Sampling` may be arrays that
+broadcast; results have their shape in front.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_EVENTS = 1000
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rates of the station; defaults: its own, with the ideal sensor."""
+    """Rates of the station; defaults: those of the shipped scenarios, with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
@@ -44,13 +44,13 @@ class Sampling:
 
 
 def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
-    """Return the delay in hand periods: rounded, at least 1 for a positive delay."""
+    """Return the one-way delay in hand periods: rounded, at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the map (..., n + 3, n + 3) over the hand's period, cut and without delay."""
+    """Return the map (..., n + 3, n + 3) over the hand's period, for the cut loop without delay."""
     M, periods = period_map(axis, sampling, 0, cut=True)
     if periods != 1:
         raise DrakeTeleopError(
@@ -62,9 +62,9 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 
 
 def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
-    """Return the map (..., n + 3, n + 3) over the common period, and the hand periods in it.
+    """Return the matrix over the common period of all rates, and the hand periods in it.
 
-    It maps [states; held inputs; force received].
+    The matrix (..., n + 3, n + 3) maps [states; held inputs; force received].
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
@@ -109,7 +109,7 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
 
 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """Return the hand periods in the common period; each event's duration and updates."""
+    """Return the hand periods in the common period; for each event, duration and updates."""
     hand = np.asarray(sampling.hand_hz, dtype=float)
     ratios = []
     for name in ("joint_control_hz", "sensor_hz"):
@@ -202,7 +202,7 @@ class _Rows:
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor(self, sections: Array) -> Array:
-        """Return the scaled sample after elimination, and the filter's memory."""
+        """Return rows of the scaled sample after elimination, and of the filter's memory."""
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass
@@ -236,7 +236,7 @@ class _Rows:
 
 
 def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Array, Array]:
-    """Return the parts (..., 2) of (x, v) due to x, v and u of x'' = u - b x' - k x."""
+    """Return the parts (..., 2) of (x, v) due to x, v and held u of x'' = u - b x' - k x."""
     k, b, t = np.broadcast_arrays(stiffness, damping, time)
     M = np.zeros((*k.shape, 3, 3))
     M[..., 0, 1], M[..., 1, 0], M[..., 1, 1], M[..., 1, 2] = t, -k * t, -b * t, t
@@ -245,7 +245,6 @@ def _held_response(stiffness: Any, damping: Any, time: Array) -> tuple[Array, Ar
 
 
 def _matrix_exponential(M: Array) -> Array:
-    """Return e^M by the Taylor series of M / 2^s, squared s times."""
     largest = float(np.abs(M).sum(axis=-1).max(initial=0.0))
     halvings = math.ceil(math.log2(largest / 0.25)) if largest > 0.25 else 0
     term = E = np.broadcast_to(np.eye(M.shape[-1]), M.shape)

@@ -48,12 +48,12 @@ _AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Data of the pictures beyond the figures."""
+    """Data of the report's pictures beyond the summary."""
 
     axis: OneAxis
     omega: NDArray[np.float64]  #: (n,) [rad/s]
-    H: Complex  #: (n, 2, 2) of the Diagram, without the hand's mass
-    closed_form: Complex  #: likewise, of one axis
+    H: Complex  #: (n, 2, 2) two-port of the Diagram, without the hand's mass
+    closed_form: Complex  #: (n, 2, 2) two-port of the one-axis model
     wall: tuple[float, float]  #: stiffness [N/m] and damping [N s/m]
     nyquist: dict[str, Complex]  #: grip -> (n,) loop, at its limit where it is -1
     maps: dict[str, dict[str, StabilityMap]]  #: title -> grip -> map
@@ -105,7 +105,7 @@ def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
-    """Return a row of the table of margins, as text."""
+    """Return a row of the table of margins as text, for a one-way delay [s]."""
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")

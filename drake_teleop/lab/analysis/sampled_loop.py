@@ -1,4 +1,4 @@
-"""The sampled axis as a discrete linear system: closed, or as two-port without hand and wall."""
+"""Sampled one-axis model as a linear system: closed loop, or two-port without hand and wall."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ _MOTION = ("x_m", "v_m", "servo_acceleration", "x_s", "v_s", "sample")
 class SampledLoop:
     """System x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k] over the common period of all rates.
 
-    Outputs are those before the updates of a period. Inputs are held: additional force of the hand
-    on the device, and of the slave on the environment [N].
+    Outputs are sampled before the updates of a period. Inputs are held: additional force of the
+    hand on the device, and of the slave on the environment [N].
     """
 
     A: Array  #: (..., n, n)
@@ -57,9 +57,9 @@ class SampledLoop:
 
 
 def sampled_loop(axis: OneAxis, sampling: Sampling) -> SampledLoop:
-    """Return the closed loop over the common period of all rates.
+    """Return the closed loop of the sampled model over the common period of all rates.
 
-    `axis.delay` must be one number; it is rounded as in the channel.
+    `axis.delay` must be one number; it is rounded to hand periods.
     """
     steps = delay_steps(axis, sampling)
     M, periods = period_map(axis, sampling, steps, cut=False)
@@ -90,10 +90,11 @@ def growth_rate(system: Any) -> Any:
 
 
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
-    """Return H (N, 2, 2) of the sampled station with held forces, without hand and wall.
+    """Return the two-port H (N, 2, 2) of the sampled station, without hand and wall.
 
-    The spectrum of the hold, (1 - e^(-j w T)) / (j w T), is divided out of the forces. The delay is
-    rounded as in the channel. `frequency` (N,) [rad/s] is not zero and below half the hand's rate.
+    The spectrum of the hold, (1 - e^(-j w T)) / (j w T), is divided out of the held forces. The
+    delay is rounded to hand periods. `frequency` (N,) [rad/s] is not zero and below half the hand's
+    rate.
     """
     bare = replace(
         axis,
@@ -123,7 +124,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
 
 
 def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
-    """Return C (z - A)^-1 B, (N, p, m), at z (N,) by A's Schur form."""
+    """Return C (z - A)^-1 B (N, p, m) at z (N,), by the Schur form of A."""
     balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
     T, Q = schur(balanced, output="complex")
     right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q

@@ -5,9 +5,9 @@ wall of stiffness K [N/m] and damping B [N s/m] answers d samples later, and the
 
     H(z) = z^-d (K + B (z - 1) / (Ts z)),    force of the wall at t_k: f_k = (H x)_k.
 
-It is passive if and only if b exceeds the right side of (T62), here a sum of cosines of
-theta = w Ts. Passive is sufficient for stability. Invalid signs, and delays that are no whole
-number, raise DrakeTeleopError.
+The wall is passive if and only if b exceeds the right side of (T62), here a sum of cosines of theta
+= w Ts. Passivity is sufficient for stability. Invalid signs, and delays that are no whole number,
+raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Array:
-    """Return the device damping for a wall H(e^(j theta)) at theta in (0, pi] (T62)."""
+    """Return the device damping for a wall H(e^(j theta)), at angles theta in (0, pi] (T62)."""
     checked_positive(period, "period")
     H = np.asarray(response, dtype=complex)
     # Re[(1 - e^(-j theta)) H] / (1 - cos theta), without cancellation
@@ -36,7 +36,7 @@ def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Ar
 def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> float:
     """Return the least device damping that makes a sampled wall H(z) passive.
 
-    `wall` returns H at z, (n,): a function or a sampled control.TransferFunction.
+    `wall` returns H at z (n,): a function or a sampled control.TransferFunction.
     """
     from scipy.optimize import minimize_scalar
 
@@ -60,7 +60,7 @@ def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> flo
 def passive_damping(
     stiffness: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Return the least device damping that makes the wall passive, exact."""
+    """Return the exact least device damping that makes the wall passive."""
     K, B = np.asarray(stiffness, dtype=float), np.asarray(wall_damping, dtype=float)
     return _maximum(_cosine_coefficients(K, B, period, delay))[0]
 
@@ -68,7 +68,7 @@ def passive_damping(
 def passive_stiffness(
     device_damping: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Return the largest K of a passive wall, 0 if there is none."""
+    """Return the largest stiffness K of a passive wall; 0 if there is none."""
     b, B = np.broadcast_arrays(
         checked_positive(device_damping, "damping of the device"), wall_damping
     )
@@ -104,9 +104,10 @@ def passive_friction(
 def friction_stiffness(
     device_damping: ArrayLike, friction: ArrayLike, period: float, resolution: float
 ) -> Array:
-    """Return min(2 b / Ts, 2 f_c / Delta), the passive K with friction and encoder (B = d = 0).
+    """Return the largest passive stiffness, min(2 b / Ts, 2 f_c / Delta), if B = d = 0.
 
-    Diolaiti, Niemeyer, Barbagli and Salisbury (2006).
+    Friction f_c compensates the encoder's resolution Delta. Diolaiti, Niemeyer, Barbagli and
+    Salisbury (2006).
     """
     b = checked_positive(device_damping, "damping of the device")
     checked_positive(period, "period")
@@ -125,7 +126,7 @@ def stable_stiffness(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Array:
-    """Return the K at which the loop with one hand becomes unstable; 0 if any K is unstable.
+    """Return the wall stiffness K at which the loop becomes unstable; 0: unstable with any K.
 
     A pole reaches the unit circle where the K that closes the loop there is real. `mass`, `damping`
     and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
@@ -164,7 +165,7 @@ def sampled_poles(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Return the multipliers (..., 3 + d) over a sample; see `stable_stiffness`."""
+    """Return the loop's multipliers (..., 3 + d) over a sample; see `stable_stiffness`."""
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )
@@ -185,7 +186,6 @@ def sampled_poles(
 
 
 def _cosine_coefficients(K: Array, B: Array, period: float, delay: int) -> Array:
-    """Return the required damping's coefficients over cos(i theta)."""
     checked_positive(period, "period")
     _require_whole_samples(delay)
     K, B = np.broadcast_arrays(K, B)
@@ -202,7 +202,6 @@ def _cosine_sum(coefficients: Array, angle: Array) -> Array:
 
 
 def _maximum(coefficients: Array) -> tuple[Array, Array]:
-    """Return the largest sum of cosines and its theta."""
     order = np.arange(coefficients.shape[-1])
     angles = np.linspace(0, np.pi, 64 * len(order) + 1)
     step = angles[1]
@@ -228,7 +227,7 @@ def _maximum(coefficients: Array) -> tuple[Array, Array]:
 def _sampled_device(
     mass: ArrayLike, damping: ArrayLike, stiffness: ArrayLike, period: float
 ) -> tuple[Array, Array]:
-    """Return Phi (..., 2, 2) and Gamma (..., 2) of the device under held force."""
+    """Return the matrices Phi (..., 2, 2), Gamma (..., 2) of the device under held force."""
     from scipy.linalg import expm
 
     m, b = (
@@ -249,7 +248,7 @@ def _sampled_device(
 def _critical_stiffness(
     state: Array, held: Array, B: Array, period: float, delay: int, angle: Array
 ) -> Complex:
-    """Return the K that puts a pole on e^(j theta), if real."""
+    """Return the stiffness K that puts a pole on e^(j theta), if it is real."""
     z = np.exp(1j * angle)
     trace = state[..., 0, 0] + state[..., 1, 1]
     det = state[..., 0, 0] * state[..., 1, 1] - state[..., 0, 1] * state[..., 1, 0]

@@ -1,7 +1,7 @@
-"""One-axis parameters of a scenario along a task direction: true values from its models.
+"""Parameters of the one-axis model along a task direction, from the scenario's true models.
 
 One axis represents the station if a contact force causes no rotation, as along the tool. Sideways,
-wrist and tool turn: the tip is about a hundred times softer than the servo. `linearization`
+wrist and tool rotate: the tip is about a hundred times softer than the servo. `linearization`
 models this.
 """
 
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TaskDirection:
-    """A direction of the task, at a state of rest."""
+    """Direction of the task, with one-axis parameters at a state of rest."""
 
     axis: OneAxis
     hand: Array  #: (6,) direction of the hand's force and velocity at E, in B
@@ -51,7 +51,7 @@ def OneAxisFromScenario(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> OneAxis:
-    """Return the axis of `task_direction`."""
+    """Return the one-axis parameters of `task_direction`."""
     return task_direction(
         scenario, direction, load_estimate=load_estimate, displacement=displacement
     ).axis
@@ -64,7 +64,7 @@ def task_direction(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> TaskDirection:
-    """Return the parameters of a scenario along one direction of the slave's motion in W.
+    """Return the one-axis parameters of a scenario along one direction of the slave's motion in W.
 
     Masses are those of bodies that are free in all other directions: 1 / (n' J M^-1 J' n). The
     network's delay is the mean of both ways.
@@ -74,8 +74,8 @@ def task_direction(
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
-        DrakeTeleopError: the direction is zero, the pose out of reach, or gripper and object have
-            different scales.
+        DrakeTeleopError: if the direction is zero, the pose is out of reach, or gripper and object
+            have different scales.
     """
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)
@@ -134,7 +134,7 @@ def task_direction(
 
 
 def _wall_stiffness(scenario: Scenario) -> float:
-    """Return that of the leaf, or of wall and tool ball in series; else 0."""
+    """Return the stiffness of the leaf, or of wall and tool ball in series; else 0."""
     if scenario.leaf is not None:
         return float(scenario.leaf.stiffness)
     wall = scenario.surroundings

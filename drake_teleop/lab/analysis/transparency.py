@@ -1,4 +1,4 @@
-"""Impedance displayed to the hand against the ideal one, and human thresholds.
+"""Comparison of the displayed impedance with the ideal one and with human thresholds.
 
 Arrays are over frequency, impedances in N s/m, omega in rad/s.
 """
@@ -18,7 +18,7 @@ Real = NDArray[np.float64]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the impedance that the scales specify (T52)."""
+    """Return the ideal impedance, which the scales specify (T52)."""
     felt = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
 
@@ -32,7 +32,7 @@ class Apparent(NamedTuple):
 
 
 def apparent(felt: Complex, omega: Real) -> Apparent:
-    """Return the m s + b + k / s nearest to an impedance (n, ...), by least squares."""
+    """Return mass, damping, stiffness of the m s + b + k / s nearest to an impedance (n, ...)."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = felt.imag.reshape(len(omega), -1)
     # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.
@@ -46,12 +46,12 @@ class Tracking(NamedTuple):
     """Position and force tracking between both ends."""
 
     position: Complex  #: slave over device, V_s / V_m; l_p is ideal
-    force: Complex  #: hand over environment, F_h / F_e, with the force on the device
+    force: Complex  #: hand over environment, F_h / F_e, including the force on the device
     reflected: Complex  #: as `force`, without the force on the device; k_f gamma is ideal
 
 
 def tracking(H: Complex, environment: Complex, device: Complex) -> Tracking:
-    """Return the tracking in contact with an environment Z_e, not 0, for a device Z_m."""
+    """Return the tracking in contact with an environment Z_e, not 0, and a device Z_m."""
     _, _, h21, h22 = entries(H)
     position = -h21 / (1 + h22 * environment)
     felt = transmitted_impedance(H, environment)
@@ -60,7 +60,7 @@ def tracking(H: Complex, environment: Complex, device: Complex) -> Tracking:
 
 
 class ZWidth(NamedTuple):
-    """Impedances displayed in free motion and of a rigid wall."""
+    """Displayed impedances in free motion and at a rigid wall."""
 
     free: Complex
     rigid: Complex
@@ -83,7 +83,7 @@ def transmitted_width(H: Complex) -> ZWidth:
 
 
 def sensitivity(H: Complex, environment: ArrayLike) -> Complex:
-    """Return dZ_to / dZ_e; the ideal is k_f l_p gamma.
+    """Return the derivative dZ_to / dZ_e of the displayed impedance; ideal: k_f l_p gamma.
 
     Its norm over frequencies is the fidelity of Cavusoglu, Sherman and Tendick, T-RA 18 (2002).
     """
@@ -117,17 +117,17 @@ WEBER_FRACTIONS = {
 
 
 class Fidelity(NamedTuple):
-    """Displayed against ideal impedance."""
+    """Comparison of the displayed impedance with the ideal one."""
 
     level: Real  #: displayed over ideal [dB]
     phase: Real  #: phase lead [deg], within +-180
-    noticed: NDArray[np.bool_]  #: whether a human can detect the difference
+    noticed: NDArray[np.bool_]  #: True where a human can detect the difference
 
 
 def fidelity(
     felt: Complex, ideal: Complex, weber: float = WEBER_FRACTIONS["stiffness"].value
 ) -> Fidelity:
-    """Return level, phase and detectability of the difference between two impedances.
+    """Return level, phase and detectability of the difference from the ideal impedance.
 
     One Weber fraction of the ideal impedance applies to mass, damping and stiffness (Fu, Landman,
     van Paassen and Mulder, T-HMS 48, 2018; abstracts).

@@ -29,21 +29,21 @@ if TYPE_CHECKING:
 
 
 def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
-    """Return matrices of four entries."""
+    """Return matrices (..., 2, 2) of four entries."""
     entries = np.broadcast_arrays(h11, h12, h21, h22)
     stacked = np.stack(entries, axis=-1).astype(complex, copy=False)
     return stacked.reshape(*stacked.shape[:-1], 2, 2)
 
 
 def entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """Return h11, h12, h21 and h22."""
+    """Return the entries h11, h12, h21 and h22 of H."""
     return H[..., 0, 0], H[..., 0, 1], H[..., 1, 0], H[..., 1, 1]
 
 
 def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None) -> Complex:
-    """Return H of the position-force station (T51).
+    """Return the hybrid matrix H of the position-force station (T51).
 
-    `servo` replaces C/(Z_s + C) and 1/(Z_s + C) of the axis.
+    `servo` replaces response C/(Z_s + C) and admittance 1/(Z_s + C) of the axis.
     """
     response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
     delay_factor = np.exp(-s * axis.delay)
@@ -58,13 +58,13 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
 
 def force_velocity_exchange(s: Complex, delay: ArrayLike) -> Complex:
-    """Return H of a line that delays force and velocity (T53)."""
+    """Return the hybrid matrix H of a line that delays force and velocity (T53)."""
     delay_factor = np.exp(-s * np.asarray(delay))
     return two_port(0.0, delay_factor, -delay_factor, 0.0)
 
 
 def wave_line(s: Complex, delay: ArrayLike, impedance: ArrayLike) -> Complex:
-    """Return H of a delay line with wave variables (T53)."""
+    """Return the hybrid matrix H of a delay line with wave variables (T53)."""
     delay_factor = np.exp(-s * np.asarray(delay))
     tanh = (1 - delay_factor**2) / (1 + delay_factor**2)
     sech = 2 * delay_factor / (1 + delay_factor**2)
@@ -73,7 +73,7 @@ def wave_line(s: Complex, delay: ArrayLike, impedance: ArrayLike) -> Complex:
 
 
 class Channels(NamedTuple):
-    """Channels of a four-channel station (Lawrence 1993)."""
+    """Transfer functions of a four-channel station (Lawrence 1993)."""
 
     c1: ArrayLike  #: velocity of the master, to the slave
     c2: ArrayLike  #: force of the environment, to the master
@@ -89,7 +89,7 @@ def transparent_channels(
     """Return the channels that make a station without delay transparent (T39).
 
     Args:
-        master, slave: Z_cm, Z_cs, each with its local control.
+        master, slave: impedances Z_cm, Z_cs, each with its local control.
         c5, c6: local force feedback, greater than -1.
     """
     return Channels(slave, 1 + np.asarray(c6), 1 + np.asarray(c5), -master, c5, c6)
@@ -98,7 +98,7 @@ def transparent_channels(
 def four_channel(
     s: Complex, master: Complex, slave: Complex, channels: Channels, delay: ArrayLike = 0.0
 ) -> Complex:
-    """Return H of the four-channel station with delayed C1 to C4 (T39)."""
+    """Return the hybrid matrix H of the four-channel station with delayed C1 to C4 (T39)."""
     delay_factor = np.exp(-s * np.asarray(delay))
     c1, c2, c3, c4 = (delay_factor * np.asarray(c) for c in channels[:4])
     at_slave, at_master = 1 + np.asarray(channels.c5), 1 + np.asarray(channels.c6)
@@ -115,30 +115,40 @@ def four_channel(
 
 
 def impedance(H: Complex) -> Complex:
-    """Return Z of [F_h; F_e] = Z [V_m; -V_s] (applied to Z: H); raise if h22 is 0."""
+    """Return the impedance matrix Z of [F_h; F_e] = Z [V_m; -V_s]; raise if h22 is 0.
+
+    Applied to Z, the function returns H.
+    """
     h11, h12, h21, h22 = entries(H)
     _require_nonzero(h22, "impedance", "h22")
     return two_port(h11 - h12 * h21 / h22, h12 / h22, -h21 / h22, 1 / h22)
 
 
 def admittance(H: Complex) -> Complex:
-    """Return Y of [V_m; -V_s] = Y [F_h; F_e] (applied to Y: H); raise if h11 is 0."""
+    """Return the admittance matrix Y of [V_m; -V_s] = Y [F_h; F_e]; raise if h11 is 0.
+
+    Applied to Y, the function returns H.
+    """
     h11, h12, h21, h22 = entries(H)
     _require_nonzero(h11, "admittance", "h11")
     return two_port(1 / h11, -h12 / h11, h21 / h11, h22 - h12 * h21 / h11)
 
 
 def chain(H: Complex) -> Complex:
-    """Return A of [F_h; V_m] = A [F_e; V_s] (in series: the product); raise if h21 is 0."""
+    """Return the chain matrix A of [F_h; V_m] = A [F_e; V_s]; raise if h21 is 0.
+
+    The chain matrix of two-ports in series is the product of theirs.
+    """
     h11, h12, h21, h22 = entries(H)
     _require_nonzero(h21, "chain", "h21")
     return two_port(h12 - h11 * h22 / h21, -h11 / h21, -h22 / h21, -1 / h21)
 
 
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
-    """Return S from the waves F + b V to the waves F - b V, with -V_s at the slave's port.
+    """Return the scattering matrix S from the waves F + b V to F - b V; the slave's port has -V_s.
 
-    `reference` has b of both ports. It changes the norm of S, but not whether it exceeds 1.
+    `reference` contains b of both ports; b changes the norm of S, but not whether the norm exceeds
+    1.
     """
     h11, h12, h21, h22 = entries(H)
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
@@ -157,7 +167,7 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return b for `scattering`: the hand's damping, alone and over k_f l_p."""
+    """Return b of both ports for `scattering`: the hand's damping, alone and over k_f l_p."""
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
@@ -169,12 +179,12 @@ def reference_impedances(axis: OneAxis) -> tuple[float, float]:
 
 
 def power_ratio(axis: OneAxis) -> float:
-    """Return k_f gamma / l_p, the power at the hand per power at the slave."""
+    """Return the ratio k_f gamma / l_p of power at the hand to power at the slave."""
     return axis.force_scale * axis.gamma / axis.position_scale
 
 
 def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
-    """Return H with the slave's power multiplied by `ratio`; raise if it is not positive.
+    """Return H with the slave's power multiplied by `ratio`; raise if `ratio` is not positive.
 
     Scales alone make a station active or dissipative; `power_ratio` compensates them.
     """
@@ -186,7 +196,7 @@ def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
 
 
 def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
-    """Return H that includes parts of the impedances of hand and environment."""
+    """Return the hybrid matrix H including parts of the impedances of hand and environment."""
     h11, h12, h21, h22 = entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
@@ -200,7 +210,7 @@ def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
 
 
 def transfer_function(axis: OneAxis) -> control.TransferFunction:
-    """Return H without its delay as a python-control object.
+    """Return the hybrid matrix H without its delay as a python-control object.
 
     h11 and h12 have no state space if the device has mass, or if the tool mass is displayed behind
     an ideal servo.
@@ -222,7 +232,7 @@ def transfer_function(axis: OneAxis) -> control.TransferFunction:
 
 
 def to_frd(H: Complex, omega: NDArray[np.float64]) -> control.FRD:
-    """Return a two-port or impedance as a python-control object."""
+    """Return a two-port or impedance as `control.FRD`."""
     import control
 
     return control.FRD(H if H.ndim == 1 else np.moveaxis(H, 0, -1), omega)

@@ -1,4 +1,4 @@
-"""Verdict of `drake-teleop analyze`: its figures in short sentences."""
+"""Verdict of `drake-teleop analyze`: the summary in short sentences."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """Return the figures as short sentences, each understandable alone."""
+    """Return the summary's figures as short sentences, each understandable alone."""
     sentences = []
     if figures["method"] != "none":
         sentences += [

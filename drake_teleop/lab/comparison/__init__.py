@@ -1,1 +1,1 @@
-"""The passivity methods compared."""
+"""Comparison of passivity methods over networks with delay."""

@@ -1,12 +1,12 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
 Three studies use the same channel: the whole station presses on leaves (`delayed_contact`); in one
-degree of freedom the hand lets go and taps (`release_and_taps`); there, the longest stable round
-trip for walls of three stiffnesses (`one_dof`). `summary.json` contains
+degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round trip
+is found for walls of three stiffnesses (`one_dof`). `summary.json` contains
 
 ========= ======================================================================================
 decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
-          leaked_J: all of it null or empty if unstable
+          leaked_J. If unstable, these are empty or null
 station   list of runs: method, network, leaf; fields of `one_dof.Figures`, with the energy between
           hand and actual motion; pressed_force [N], the ideal of felt_force; felt_share of it;
           left_behind [m]; leaked [J]. A run that is not at rest in its hold ends there
@@ -73,7 +73,7 @@ SIGMAS = (0.0, 1.0)
 _COVERING_CASES = tuple(itertools.product(SIGMAS, (0.01, 0.1, 0.3), (0.0, 5100.0)))
 #: Rates of the station: a quarter (sensor) or half of those of the shipped scenarios.
 _RATES = Rates(sensor_hz=2000.0, hand_hz=1000.0, joint_control_hz=1000.0, log_hz=1000.0)
-#: s; longer than the events' period, to avoid extra steps of one rounding error before them.
+#: Step [s], longer than the events' period; else tiny steps (rounding) precede the events.
 _MAX_STEP = 2e-3
 #: m/s, slip speed of full friction at the leaf: Drake's default. With a tenth of it, a tip at rest
 #: needs 9,000 to 16,000 steps per second instead of 1,500.
@@ -94,15 +94,15 @@ def compare_command(
     """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        networks, methods: by name.
+        networks, methods: names of networks and methods.
         scenario: a shipped one or a YAML file; its rates, integrator and environment are not used.
-        seed: of sensor and networks.
+        seed: seed of sensor noise and networks.
         jobs: number of processes; -1: one for each core.
-        quiet: no progress bars and no tables.
+        quiet: True hides progress bars and tables.
         progress: False hides only the progress bars.
 
     Returns:
-        The summary, see the top of this module.
+        The summary, see the module's docstring.
     """
     _check_names("network", networks, tuple(PRESETS))
     _check_names("method", methods, METHODS)
@@ -149,7 +149,7 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS` [s] up to which every run is stable, or 0."""
+    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none."""
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -162,7 +162,7 @@ def longest_round_trip(
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario with the comparison's rates and steps, without environment."""
+    """Return the scenario without environment, with the comparison's rates and steps."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP),
@@ -176,7 +176,7 @@ def station_run(
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     """Run the whole station once; return its row of the table and the traces of a picture.
 
-    `estimate` is (16,) of the load.
+    `estimate` (16,) is the load estimate [offsets; phi].
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]
@@ -204,7 +204,6 @@ def station_run(
 def _run_to_end_or_hold(
     station: Diagram, scenario: Scenario, task: Task
 ) -> tuple[SimulationResult, Figures]:
-    """Return run and figures; end it after the hold if it is not at rest there."""
     settle = scenario.simulation.settle
     simulator = MakeSimulator(station, scenario.simulation)
     simulator.Initialize()

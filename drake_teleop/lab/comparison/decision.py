@@ -1,8 +1,9 @@
 """Decision table: one verdict for each method and network.
 
-The first that applies, of the whole station on all leaves (energy: also of `release_and_taps`)::
+The first condition that the whole station meets on any leaf is the verdict (energy: also of the
+runs of `release_and_taps`)::
 
-    unstable      it does not come to rest, or the run ended early
+    unstable      the station does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact
     leaks         more than 1 mJ came out between hand and actual motion, beyond the energy put in
                   and stored at the start
@@ -26,14 +27,14 @@ class Cell:
     """Result of one method over one network."""
 
     verdict: str
-    #: For each leaf, mean in the hold: force on the hand, scaled contact force [N].
+    #: For each leaf, means in the hold of the force on the hand and the scaled contact force [N].
     forces: tuple[tuple[float, float], ...] = ()
-    unrest: tuple[str, ...] = ()  #: for each leaf, motion in the hold; stable: empty
-    leaked: float | None = None  #: largest of all runs [J]; None if unstable
+    unrest: tuple[str, ...] = ()  #: for each leaf, motion in the hold as text; stable: empty
+    leaked: float | None = None  #: largest leaked energy of all runs [J]; None: unstable
 
     @property
     def words(self) -> str:
-        """Verdict, with the leaked energy."""
+        """Verdict as text, with the leaked energy."""
         if self.verdict != LEAKS or self.leaked is None:
             return self.verdict
         number, unit = (1e3 * self.leaked, "mJ") if self.leaked < 1.0 else (self.leaked, "J")
@@ -41,7 +42,7 @@ class Cell:
 
     @property
     def share(self) -> str:
-        """Felt share of the contact force at the worst leaf; "" if unstable."""
+        """Displayed share of the contact force at the worst leaf, as text; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
@@ -72,7 +73,7 @@ def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
 
 
 def _motion_in_hold(run: Mapping[str, Any]) -> str:
-    """Return how a run moves in its hold: the larger of both at the tool's tip."""
+    """Return a run's motion in the hold as text: displacement, or rotation if larger at the tip."""
     if run["stable"]:
         return "at rest"
     if run["hunting"] is None:

@@ -1,7 +1,7 @@
 """Task of the whole station for each method and network: swing, press on a leaf, hold, rest.
 
-Its times grow with the network's round trip, so that every station has equally many round trips to
-come to rest.
+The times of the task grow with the network's round trip, so that every station has equally many
+round trips to come to rest.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def task_for_round_trip(round_trip: float) -> Task:
 def delayed_contact(
     base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
 ) -> tuple[Scenario, Task]:
-    """Return the scenario of the task, from a base with rates, sensor, scales and grip."""
+    """Return scenario and times of the task; `base` has rates, sensor, scales and grip."""
     task = task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
     swing = Sine(
@@ -87,7 +87,7 @@ def delayed_contact(
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
     """Return the figures of a run: vertical motion and force, and the rotation of the tool.
 
-    Its energy is `energy_between`.
+    The energy in the figures is `energy_between`.
     """
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
@@ -104,7 +104,7 @@ def station_figures(result: SimulationResult, scenario: Scenario, task: Task) ->
 
 
 def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """Return t [s], forces in the master's units [N] and energy [J] for pictures."""
+    """Return a run's t [s], forces in the master's units [N] and energy [J] for pictures."""
     scaling = scenario.force_scaling
     return {
         "t": result.t,
@@ -115,9 +115,9 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """Return (N,) the energy from hand and environment and the stores' energy at the start [J].
+    """Return the energy (N,) from hand and environment plus the stores' energy at the start [J].
 
-    It is never negative if the station is passive between the hand, with held force, and the
+    The sum is never negative if the station is passive between the hand, with held force, and the
     slave's actual motion, where contact and (with sigma > 0) load act.
     """
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
@@ -129,7 +129,7 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
 def _slave_motion(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return height of So [m] and (N, 3) rotation vector from the start [rad]."""
+    """Return the height of So [m] and the rotation vector (N, 3) from the start [rad]."""
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
     poses = _poses(arm.table, q)

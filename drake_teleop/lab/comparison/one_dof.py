@@ -1,9 +1,9 @@
 """One degree of freedom of the station: plant, task and figures, for thousands of runs.
 
 The equations are those of `OneDof`. The station's own `channel_step` connects hand and slave along
-x at 1 kHz. Its forces are held for a period; the masses take 20 integration steps in it. The
-operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a given
-intent.
+x at 1 kHz. The channel's forces are held for a period, in which the masses take 20 integration
+steps. The operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a
+given intent.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from drake_teleop.station.passivity.memory import LEDGER
 from drake_teleop.station.passivity.methods import AT_THE_MOTOR, PassivityConfig
 from drake_teleop.station.passivity.packet import PACKET_SIZE
 
-PERIOD = 1e-3  #: s, of the channel
+PERIOD = 1e-3  #: period of the channel [s]
 _SUBSTEPS = 20
 _FRICTION_SPEED = 5e-3  # m/s, regularisation of the device's Coulomb friction
-_SLAVE_FRICTION_SPEED = 1e-3  # m/s, likewise of the slave
+_SLAVE_FRICTION_SPEED = 1e-3  # m/s, regularisation of the slave's friction
 HAND, COMMAND, MOTOR, ACTUAL = range(4)  #: places of the energy balances
 
 _FREQUENCIES = np.geomspace(0.01, 0.5 / PERIOD, 20000) * 2 * np.pi  # rad/s
 _MAX_MOTION_AT_REST = 0.5e-3  # m, peak to peak at rest
 TIP = 0.2  #: m, from the wrist to the tool's tip
-_REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest, and intended depth
+_REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intended depth
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Task:
     release: float = 11.5
     released: float = 12.5
     end: float = 17.0
-    judged: float = 1.9  #: length of the windows of required rest
+    judged: float = 1.9  #: length of the windows in which rest is required
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,18 +67,18 @@ class OneDof(Axis):
         (m_h + m_m) a = K_h (x_i - x) + B_h (v_i - v) - f_c tanh(v / v_c) + f    hand and device
         m_s a_s = K (x_cmd - x_s) - D v_s + f_w          slave, K = D k_p, D = m_s k_v
         f_w = -max(k_e (x_s - x_w) + b_e (v_s - v_w), 0) where x_s > x_w         wall
-        f_e = k_f (gamma f_w - sigma m_t a_s)                                    sent back
+        f_e = k_f (gamma f_w - sigma m_t a_s)                       force sent to the master
     """
 
     device_friction: float = 0.05  #: N, Coulomb
     slave_friction: float = 0.0  #: N, Coulomb, of the arm
     wall_damping: float = 0.0  #: N s/m
     motor_lag: float = 0.0  #: s, time constant of the motor force
-    master_resolution: float = 0.0  #: m, of the encoder; 0: exact
-    slave_resolution: float = 0.0  #: m, likewise
+    master_resolution: float = 0.0  #: m, of the master's encoder; 0: exact
+    slave_resolution: float = 0.0  #: m, of the slave's encoder; 0: exact
     wrench_noise: float = 0.0  #: N, standard deviation of the wrist's force
     believed_stiffness: float = 1.0  #: configured servo stiffness over the true one
-    believed_damping: float = 1.0  #: likewise
+    believed_damping: float = 1.0  #: configured servo damping over the true one
     believed_mass: float = 1.0  #: configured slave mass over the true one
 
 
@@ -91,8 +91,8 @@ REFERENCE = OneDof(
 )
 """Model of the figures in docs/delay.md, notebook 02 and benchmarks/README.md.
 
-Its servo is softer than the station's and critically damped: 207 instead of 502 kN/m, -3 dB at 12
-instead of 14 Hz, delay 17 instead of 13 ms.
+The model's servo is softer than the station's and critically damped: 207 instead of 502 kN/m, -3 dB
+at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 """
 
 
@@ -100,8 +100,8 @@ instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run, one entry for each period.
 
-    `accounts` (N, 4) is the energy that entered the station so far, in the master's power units
-    [J]. In a passive station the hand's plus any other one never falls below -start_energy::
+    `accounts` (N, 4) is the energy that entered the station so far, scaled to the master's power
+    [J]. In a passive station, HAND plus any other place never falls below -start_energy::
 
         HAND      -sum f_(k-1) (x_k - x_(k-1))   held force, exact
         COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port,
@@ -109,7 +109,8 @@ class OneDofRun:
         MOTOR     -integral k_f gamma f_m dx_s   servo's force, to half an integration step
         ACTUAL     integral k_f gamma f_w dx_s   wall's force, exact for a spring
 
-    MOTOR and ACTUAL exclude the inertia that sigma leaves in f_e: it is no part of the environment.
+    MOTOR and ACTUAL exclude the inertia that sigma leaves in f_e, which is no part of the
+    environment.
     """
 
     t: NDArray[np.float64]  #: s
@@ -131,17 +132,17 @@ class OneDofRun:
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures of a run."""
+    """Measures of a run."""
 
-    #: At rest in hold and end: within 0.5 mm about a parabola, also at the tip of a rotating tool.
+    #: True: at rest in hold and end, within 0.5 mm about a parabola, also at a rotating tool's tip.
     stable: bool
-    hunting: float  #: this peak to peak, the larger of the two [m]
-    turning: float  #: likewise of the orientation [rad]
-    felt_force: float  #: on the hand in the hold, mean [N]
-    chatter: float  #: its standard deviation [N]
-    force_error: float  #: relative to the scaled contact force, in the hold
+    hunting: float  #: largest peak-to-peak motion in hold and end [m]
+    turning: float  #: largest peak-to-peak rotation in hold and end [rad]
+    felt_force: float  #: mean force on the hand in the hold [N]
+    chatter: float  #: standard deviation of this force [N]
+    force_error: float  #: relative error of felt_force to the scaled contact force
     drift: float  #: slave minus master, 2 s after contact [m]
-    free_force: float  #: on the hand in free motion, rms [N]
+    free_force: float  #: rms force on the hand in free motion [N]
     rise_delay: float  #: from contact force to felt force at half the steady felt force [s], or NaN
     least_energy: float  #: least energy from both ends into the channel [J]; negative: active
 
@@ -159,12 +160,12 @@ def run_one_dof(
     wall: NDArray[np.float64] | None = None,
     delays: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None,
 ) -> OneDofRun:
-    """Simulate one run.
+    """Simulate one run in one degree of freedom.
 
     Args:
-        passivity: the method.
-        forward, backward: the network; backward default: as forward.
-        timeout: of the safe state [s].
+        passivity: configuration of the passivity method.
+        forward, backward: networks from and to the master; backward default: as forward.
+        timeout: time without packets before the safe state [s].
         intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
         grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
             go; default: the model's.
@@ -224,7 +225,7 @@ def run_one_dof(
 
 
 def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
-    """Return (N, 2) intended position [m] and velocity [m/s]; the wall is at 0."""
+    """Return intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
@@ -241,7 +242,7 @@ def _ramp(t: NDArray[np.float64], start: float, length: float) -> NDArray[np.flo
 
 
 def figures(run: OneDofRun, model: OneDof, task: Task = Task()) -> Figures:
-    """Return the figures of a run."""
+    """Return the measures of a run of `run_one_dof`."""
     return figures_of(
         t=run.t,
         master=run.master,
@@ -264,9 +265,10 @@ def figures_of(
     task: Task,
     turned: NDArray[np.float64] | None = None,
 ) -> Figures:
-    """Return the figures of a run of the task; all arrays (N,), equidistant.
+    """Return the measures of a run of the task; all arrays (N,), equidistant.
 
     Args:
+        t: times [s].
         master, slave: positions in the direction of pressing [m].
         felt: force on the hand [N].
         pressed: force of the environment, scaled to the hand [N].
@@ -301,7 +303,7 @@ def figures_of(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the least device damping that makes it passive with delay and slave [N s/m] (T43)."""
+    """Return the least device damping that makes the displayed impedance passive [N s/m] (T43)."""
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 
@@ -319,7 +321,7 @@ def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
 
 
 def _peak_to_peak(x: NDArray[np.float64]) -> float:
-    """Return the peak to peak about the best parabola; infinite if not finite."""
+    """Return the peak-to-peak deviation from the best parabola; infinite if not finite."""
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -421,7 +423,6 @@ def _quantise(x, resolution):
 
 @njit(cache=True)
 def _wall_push(stiffness, damping, depth, speed):
-    """Return the wall's outward force; negative: no contact."""
     return stiffness * depth + (damping * speed if depth > 0.0 else 0.0)
 
 

@@ -1,8 +1,8 @@
 """A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`).
 
-Medium grip and servo of the station, wall of 5.1 kN/m, network as it is.
+The grip is medium, the servo is the station's, the wall has 5.1 kN/m, and the network is a preset.
 
-* Let go: after some round trips of pressing only the device of 0.15 kg remains on the held force.
+* Let go: after some round trips of pressing, the held force moves the device of 0.15 kg alone.
 * Taps: eight of 30 mm at each of `TAP_RATES`. The displayed force is late, or comes from the
   method's memory of the wall.
 """
@@ -34,11 +34,11 @@ _EVALUATED_S = 2.0  # s, evaluated after letting go
 
 @dataclass(frozen=True)
 class ReleaseAndTaps:
-    """Result of one method over one network; no value is negative."""
+    """Measures of one method over one network after release and during taps, all >= 0."""
 
-    release_force: float  #: mean on the hand in the last 0.1 s before it lets go [N]
-    release_speed: float  #: largest of the device in 2 s after that [m/s]
-    release_way: float  #: largest displacement in them [m]
+    release_force: float  #: mean force on the hand in the last 0.1 s before release [N]
+    release_speed: float  #: largest speed of the device in the 2 s after release [m/s]
+    release_way: float  #: largest displacement of the device in these 2 s [m]
     tap_shares: tuple[float, ...]  #: displayed impulse over the wall's, for each of `TAP_RATES`
     leaked: float  #: largest energy out between hand and actual motion, beyond the stores' [J]
 
@@ -89,9 +89,10 @@ def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
 
 
 def _displayed_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
-    """Return the displayed impulse over the wall's, without the first contact.
+    """Return the displayed impulse over the wall's impulse, without the first contact.
 
-    `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` one way [s].
+    `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` the one-way delay
+    [s].
     """
     first = int(np.argmax(run.wall < 0.0))
     second = first + round(0.75 / rate / PERIOD)  # between first and second contact

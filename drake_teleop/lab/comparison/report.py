@@ -38,7 +38,7 @@ VERDICTS = {
     LEFT_BEHIND: ("↷", "#F0B878", BLACK),
     UNSTABLE: ("✗", "#565C66", "white"),
 }
-_MARKERS = "os^Dv"  # of the networks
+_MARKERS = "os^Dv"  # marks of the networks
 _CENTRED: dict[str, Any] = {"ha": "center", "va": "center"}
 
 Traces = Mapping[tuple[str, str], Mapping[str, NDArray[np.float64]]]
@@ -68,7 +68,7 @@ def write_report(summary: Mapping[str, Any], traces: Traces, out: Path) -> None:
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """Return the figures of one run of the station, as text."""
+    """Return the table cells of one run of the station, as text."""
     return [
         # Adding 0 removes the sign of -0.
         "–" if row[key] is None else f"{round(factor * row[key], decimals) + 0.0:.{decimals}f}"
@@ -116,7 +116,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """Draw letting go and taps: a row for each method, a mark for each network."""
+    """Draw release and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
@@ -167,7 +167,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the energy from hand and environment, with the initial one, over time."""
+    """Draw the energy from hand and environment plus the stores' initial energy, over time."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)

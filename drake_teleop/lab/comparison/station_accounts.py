@@ -1,15 +1,15 @@
 """Energy balances of a station's run, from its recorded signals.
 
-They are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately, in the
-master's power units, positive inwards [J]. With c = k_f gamma over the kinematic scale::
+The balances are those of `one_dof.OneDofRun.accounts`, for translation and rotation separately,
+scaled to the master's power, positive inwards [J]. With c = k_f gamma over the kinematic scale::
 
     HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel: exact
     COMMAND    sum w_k . dc_k           sent wrench along the command: exact; no physical port
     MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
     ACTUAL     integral c f_w . dx_s    true contact wrench at So
 
-The channel sums the first two (signal `ports`). The others use the log's rows: a held torque is
-exact if none is between two rows; a contact is exact for a spring, otherwise of second order.
+The channel sums the first two (signal `ports`). The others use the log's rows: MOTOR is exact if
+the torque is constant between two rows; ACTUAL is exact for a spring, otherwise of second order.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy that entered the station at its four places, up to each row.
+    """Return the energy that entered the station at its four places, up to each row of the log.
 
     Returns:
         (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J], zero
-        in the first row. Hand and command lack the last row's period. `MOTOR` is NaN if the log is
-        slower than the joint control.
+            in the first row. Hand and command lack the last row's period. `MOTOR` is NaN if the log
+            is slower than the joint control.
 
     Raises:
-        DrakeTeleopError: the result lacks a signal.
+        DrakeTeleopError: if the result lacks a signal.
     """
     if missing := [name for name in _REQUIRED_SIGNALS if name not in result]:
         raise DrakeTeleopError(
@@ -60,7 +60,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     power = scenario.force_scaling.force_scale * gamma / _motion_scale(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
-    # A row contains the torque before it.
+    # A row contains the torque of the period before the row.
     has_torques = rates.log_hz >= rates.joint_control_hz
     accounts[:, MOTOR] = -power * port_work(motor, poses, "backward") if has_torques else np.nan
     accounts[:, ACTUAL] = power * port_work(contact, poses, "mean")
@@ -76,10 +76,11 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     """Return the displayed work of weight and inertia of the slave's load along its actual motion.
 
-    With sigma > 0 it belongs to the environment like the contact; `ACTUAL` does not contain it.
+    With sigma > 0 this work belongs to the environment like the contact; `ACTUAL` does not contain
+    it.
 
     Returns:
-        (N, 2) by translation and rotation [J], zero in the first row.
+        (N, 2) work by translation and rotation [J], zero in the first row.
     """
     arm, t, joints = slave_arm(scenario), result.t, slave_arm(scenario).num_joints
     q, v = np.split(np.ascontiguousarray(result["slave_state"]), [joints], axis=1)
@@ -99,7 +100,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return (2,) E_0, the initial energy of the method's stores, by group [J]."""
+    """Return the initial energy E_0 (2,) of the method's stores, by group [J]."""
     scales = _motion_scale(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.parameters(scenario.passivity, list(power), list(scales))
@@ -108,16 +109,16 @@ def start_energy(scenario: Scenario) -> Array:
 
 
 def _motion_scale(scenario: Scenario) -> Array:
-    """Return (2,) slave over master, of translation and rotation; 1 where it is zero."""
+    """Return slave over master (2,), of translation and rotation; 1 for a zero scale."""
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return np.where(scales > 0.0, scales, 1.0)
 
 
 def _motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """Return (N, 7) X_WS and (N, 6) the motors' wrench at So in W without the weight.
+    """Return poses X_WS (N, 7), and the motors' wrench (N, 6) at So in W without the weight.
 
-    For a redundant arm it is the nearest one: other torques only cause null-space motion.
+    For a redundant arm it is the least-squares wrench: other torques only cause null-space motion.
     """
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)

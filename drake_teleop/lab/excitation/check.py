@@ -18,7 +18,7 @@ from drake_teleop.lab.excitation.limits import LIMITS
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
-#: Sample rate [Hz].
+#: Sample rate of the check [Hz].
 RATE = 1000.0
 _SENSOR_NORMS = ("force", "torque", "specific force", "angular acceleration")
 # Step of finite differences [s]; errors of 1e-7 rad/s and 1e-6 rad/s^2 at 30 rad/s^2.
@@ -29,12 +29,12 @@ _SEARCH_MARGIN_M = 0.01
 
 @dataclass(frozen=True)
 class Use:
-    """Largest use of one limit.
+    """Largest use of one limit by a motion.
 
     Attributes:
-        share: largest |value| over the limit; above 1 violates it.
-        time: of the largest value [s].
-        what: joint, axis or pair of shapes.
+        share: largest |value| over the limit; above 1 violates the limit.
+        time: time of this value [s].
+        what: joint, axis or pair of shapes with this value.
     """
 
     limit: str
@@ -52,7 +52,7 @@ def check(
     trajectory: FourierTrajectory,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Use]:
-    """Return the use of every limit by one period, largest first."""
+    """Return the use of every limit by one period of a trajectory, largest first."""
     t = np.linspace(0, trajectory.period, round(trajectory.period * RATE) + 1)
     before, q, after = (trajectory.evaluate(t + step)[0] for step in (-_STEP_S, 0.0, _STEP_S))
     qd, qdd = (after - before) / (2 * _STEP_S), (after - 2 * q + before) / _STEP_S**2
@@ -70,8 +70,8 @@ def check_motion(
     """Return the use of every limit by a sampled motion, largest first.
 
     Args:
-        t: (T,) [s].
-        q, qd, qdd: (T, n) [rad, s].
+        t: (T,) times [s].
+        q, qd, qdd: (T, n) joint positions, velocities and accelerations [rad, s].
     """
     names, limits = robot.arm.joint_names, robot.limits
     motion = _evaluate_bodies(robot, q, qd, qdd, progress)
@@ -97,14 +97,14 @@ def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) ->
 
 @dataclass(frozen=True)
 class _Motion:
-    """Values of (T,) samples of a motion.
+    """Values of T samples of a motion.
 
     Attributes:
-        torque: (T, n) of the joints.
-        sensor: (T, 4) norms at the sensor.
-        workspace: (T, 3 P) use of the box.
-        clearance: (T,) clearance over distance.
-        nearest: names of the nearest shapes.
+        torque: (T, n) joint torques.
+        sensor: (T, 4) norms of force, torque, s and alpha at the sensor.
+        workspace: (T, 3 P) use of the box by P points.
+        clearance: (T,) required clearance over distance.
+        nearest: names of the nearest bodies.
     """
 
     torque: Array
@@ -158,7 +158,7 @@ def _evaluate_bodies(
 
 
 def _sensor_norms(M_S: SpatialInertia, s: Array, omega: Array, alpha: Array) -> Array:
-    """Return (T, 4) norms of force, torque, s, alpha in S (Newton-Euler)."""
+    """Return norms (T, 4) of force, torque, s, alpha in S (Newton-Euler)."""
     mass, com = M_S.get_mass(), M_S.get_com()
     inertia = M_S.CalcRotationalInertia().CopyToFullMatrix3()
     force = mass * (s + np.cross(alpha, com) + np.cross(omega, np.cross(omega, com)))
@@ -175,7 +175,6 @@ def _outboard_bodies(plant: MultibodyPlant, frame_S: Frame) -> list[BodyIndex]:
 
 
 def _nearest(robot: Robot, query: QueryObject, reach: float) -> tuple[float, str]:
-    """Return the smallest distance [m], at most `reach`, and body names."""
     found = query.ComputeSignedDistancePairwiseClosestPoints(reach)
     if not found:
         return reach, "all shapes are farther"

@@ -64,7 +64,7 @@ class Capsule:
 
 
 def bounding_capsule(shape: Shape) -> Capsule:
-    """Return a small capsule around a shape, in its frame."""
+    """Return a small capsule around a shape, in the shape's frame."""
     if isinstance(shape, Sphere):
         return Capsule(np.zeros((2, 3)), shape.radius())
     if isinstance(shape, CapsuleShape):
@@ -112,8 +112,8 @@ def _distances(ends: Array, points: Array) -> Array:
 
 #: Minimum distance between links, and to other bodies [m] (RX90: flange to forearm 6 mm).
 CLEARANCE = 0.005
-# Neighbours by design: pairs below the clearance in this share of random postures, or with a
-# smaller variation of distance than this [m].
+# Neighbours by design: pairs that are closer than the clearance in this share of random postures,
+# or whose distance varies by less than this [m].
 _NEIGHBOUR_SHARE, _MIN_VARIATION_M = 0.95, 1e-3
 # Distances of shapes near contact [m]; quantile of the capsules' excess there; share of free
 # postures that capsules may block.
@@ -138,7 +138,7 @@ class Scene:
     """Plant and scene graph of the arm with its heaviest load.
 
     Args:
-        reserve: (10,) phi of an additional load on the sensor.
+        reserve: (10,) parameters phi of an additional load on the sensor.
         visuals_count: True: visual shapes also count as collision shapes.
 
     Raises:
@@ -161,7 +161,7 @@ class Scene:
         self._rows = self._link_rows()
 
     def _link_rows(self) -> dict[BodyIndex, int]:
-        """Return the link of every body, a row of `link_motions` (-1: world)."""
+        """Return the link of every body, as a row of `link_motions` (-1: world)."""
         rows = {BodyIndex(k): -1 for k in range(self.plant.num_bodies())}
         for row, name in enumerate(self.arm.joint_names):
             joint = self.plant.GetJointByName(name, self.sensor_frame.model_instance())
@@ -172,14 +172,15 @@ class Scene:
     def without_neighbours(
         self, postures: Array, start: Array | None
     ) -> tuple[dict[_Pair, Array], list[str]]:
-        """Return pairs of shapes that may collide, with distances in each posture (inf: far).
+        """Return the pairs of shapes that may collide, with distances in each posture (inf: far).
 
-        Excluded are pairs on one link, always near or at a constant distance. Shapes that touch in
-        the start posture are excluded too, and their bodies are returned.
+        Excluded are pairs on one link, pairs that are always near, and pairs at a constant
+        distance. Shapes that touch in the start posture are excluded too; the names of their bodies
+        are returned.
 
         Args:
-            postures: (T, n).
-            start: (n,), if known.
+            postures: (T, n) joint positions.
+            start: (n,) start posture, if known.
         """
         manager = self.scene_graph.collision_filter_manager()
         for link in set(self._rows.values()):
@@ -227,9 +228,9 @@ class Scene:
     def capsules(
         self, candidates: dict[_Pair, Array], postures: Array
     ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64], Array]:
-        """Return rows, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
+        """Return links, ends, radii, pairs and minimum distances of the capsules, see `Limits`.
 
-        Excluded are pairs inside larger capsules, and pairs whose capsules are near regardless of
+        Excluded are capsules inside larger ones, and pairs whose capsules are near regardless of
         their shapes.
         """
         inspector = self.scene_graph.model_inspector()
@@ -299,7 +300,6 @@ def _number(shape: GeometryId) -> int:
 
 
 def _outermost(shape: GeometryId, capsules: dict[GeometryId, tuple[int, Capsule]]) -> GeometryId:
-    """Return the shape of the largest capsule around that of `shape` on its link."""
     row, capsule = capsules[shape]
     holding = [
         (other.radius, -_number(name), name)
@@ -327,7 +327,7 @@ def _add_load(
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph, visuals_count: bool) -> None:
-    """Add visual shapes where needed; replace half spaces by plates."""
+    """Add visual shapes as collision shapes where needed; replace half spaces by plates."""
     inspector = scene_graph.model_inspector()
     for index in range(plant.num_bodies()):
         body = plant.get_body(BodyIndex(index))

@@ -1,7 +1,7 @@
 """Criteria of an excitation: condition numbers, A- and D-optimality of the information (T45).
 
 =========== ====================================================================================
-kappa_w10   10 columns, rows / sigma, columns times diag(1, L, L, L, L^2 ...). The default.
+kappa_w10   10 columns of V, rows / sigma, columns times diag(1, L, L, L, L^2 ...). The default.
 kappa10     10 columns of V in SI units; at least sqrt(8/3).
 kappa16     16 columns of [1 V] in SI units; at least 9.81 from rest to rest.
 A16         rms of the 10 predicted errors of phi over acceptable errors.
@@ -39,8 +39,8 @@ class Scales(NamedTuple):
     """Scales of the criteria.
 
     Attributes:
-        noise: (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
-        length: L [m] of kappa_w10.
+        noise: standard deviations (sigma_f [N], sigma_tau [N m]) of the wrench, white at 1 kHz.
+        length: characteristic length L [m] of kappa_w10.
         phi: (10,) nominal load about the origin of S, for A16 and D16.
     """
 
@@ -50,7 +50,7 @@ class Scales(NamedTuple):
 
 
 def characteristic_length(phi: Array) -> float:
-    """Return L [m]: 0.1 or the radius of gyration about So, if smaller."""
+    """Return the length L [m]: the load's radius of gyration about So, at most 0.1."""
     trace = phi[4] + phi[7] + phi[9]
     return float(min(0.1, np.sqrt(trace / (2 * phi[0]))))
 
@@ -82,7 +82,7 @@ class Criterion:
         self._columns = columns
 
     def information(self, s: Array, omega: Array, alpha: Array) -> tuple[Array, Array]:
-        """Return scaled regression rows (6 T, c) and their mean product (c, c)."""
+        """Return scaled regression rows (6 T, c) and the information (c, c) per sample."""
         V = regressor(s, omega, alpha)
         if self.with_offsets:
             V = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
@@ -90,7 +90,7 @@ class Criterion:
         return rows, rows.T @ rows / len(V)
 
     def value(self, s: Array, omega: Array, alpha: Array, duration: float) -> float:
-        """Return the criterion of (T, 3) samples over `duration` [s]; inf if singular."""
+        """Return the criterion of samples (T, 3) over `duration` [s]; inf if singular."""
         _, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
         if eigenvalues[0] <= _MIN_EIGENVALUE_RATIO * eigenvalues[-1]:
@@ -104,7 +104,7 @@ class Criterion:
         """Return the logarithm of the criterion and its gradient by V (T, 6, 10).
 
         Log-sum-exps replace extreme eigenvalues: at an optimum the smallest one is multiple and its
-        gradient is not unique. A16 and D16 are those of a mean sample.
+        gradient is not unique. A16 and D16 are for one mean sample.
         """
         rows, gram = self.information(s, omega, alpha)
         eigenvalues, vectors = np.linalg.eigh(gram)
@@ -120,7 +120,7 @@ class Criterion:
     def _log_and_gradient(
         self, eigenvalues: Array, vectors: Array, sharpness: float
     ) -> tuple[float, Array]:
-        """Return the logarithm and its gradient by eigenvalues (A16: by the Gram matrix)."""
+        """Return log criterion and gradient by eigenvalues (A16: by the Gram matrix)."""
         if self.name == "D16":
             n = len(eigenvalues)
             return float(-0.5 * np.log(eigenvalues).mean()), -0.5 / (n * eigenvalues)
@@ -137,7 +137,7 @@ class Criterion:
 
 @njit(cache=True)
 def regressor_gradient(omega, g_V, g_s, g_omega, g_alpha):
-    """Fill dJ/ds, dJ/domega, dJ/dalpha (3,) from dJ/dV (6, 10)."""
+    """Fill the gradients dJ/ds, dJ/domega, dJ/dalpha (3,) of a scalar J from dJ/dV (6, 10)."""
     g_s[0] = g_V[0, 0] + g_V[4, 3] - g_V[5, 2]
     g_s[1] = g_V[1, 0] - g_V[3, 3] + g_V[5, 1]
     g_s[2] = g_V[2, 0] + g_V[3, 2] - g_V[4, 1]

@@ -27,7 +27,7 @@ from drake_teleop.load.trajectory import FourierTrajectory
 
 # Scale factors of trajectories that exceed a limit between the optimiser's samples.
 _SHRINK_FACTORS = (1.0, 0.995, 0.99, 0.98)
-# Factor of the criterion between candidates of one descent; largest number of checks.
+# Smallest ratio of the criteria of successive candidates of one descent; maximum number of checks.
 _CANDIDATE_RATIO, _MAX_CHECKS = 1.05, 30
 _HULL_ADVICE = (
     "; or, if the convex hulls of meshes touch, excite a station (drake-teleop new): shapes that"
@@ -40,9 +40,9 @@ class Excitation:
     """Trajectory that passed the check.
 
     Attributes:
-        values: every criterion over one period at 1 kHz.
-        deviations: (16,) predicted standard deviations with the heaviest load.
-        uses: of every limit, largest first.
+        values: value of every criterion over one period at 1 kHz.
+        deviations: (16,) predicted standard deviations of offsets and phi with the heaviest load.
+        uses: use of every limit, largest first.
         history: (K, 2) number of evaluations, best criterion so far.
         seconds: thread CPU time of the design [s].
     """
@@ -71,10 +71,11 @@ def excite(
     """Design an excitation trajectory and check it.
 
     Args:
-        period: [s].
-        harmonics: N of Eq. (9), at least 2.
+        criterion: name in `CRITERIA`.
+        period: duration of the trajectory [s].
+        harmonics: number N of harmonics in Eq. (9), at least 2.
         seed, starts, seconds: see `design`.
-        progress: True shows progress bars; a `Stage` receives the progress.
+        progress: True shows progress bars; or a `Stage` that receives the progress.
 
     Raises:
         DrakeTeleopError: if no trajectory respects all limits.
@@ -108,7 +109,7 @@ def checked_excitation(
     trajectory: FourierTrajectory,
     uses: list[Use],
 ) -> Excitation:
-    """Return a checked trajectory with its criteria, predicted deviations and history."""
+    """Return a checked trajectory with criteria, the load's predicted deviations and history."""
     best = accumulate((iterate.value for iterate in found), min)
     return Excitation(
         robot,
@@ -127,10 +128,10 @@ def checked_excitation(
 def best_checked(
     robot: Robot, found: list[Iterate], progress: Callable[[float], None] = lambda done: None
 ) -> tuple[FourierTrajectory, list[Use]]:
-    """Return the best trajectory that passes the check, and its use of limits.
+    """Return the best trajectory that passes the check, and its use of the limits.
 
     Raises:
-        DrakeTeleopError: if none passes.
+        DrakeTeleopError: if no trajectory passes.
     """
     worst: Use | None = None
     for trajectory in _candidates(found, robot):
@@ -149,7 +150,7 @@ def best_checked(
 
 
 def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]:
-    """Return every criterion over one period at 1 kHz."""
+    """Return the value of every criterion over one period at 1 kHz."""
     motion = sensor_motion(robot, trajectory)
     return {
         name: Criterion(name, robot.scales).value(*motion, trajectory.period) for name in CRITERIA
@@ -157,7 +158,7 @@ def criteria_of(robot: Robot, trajectory: FourierTrajectory) -> dict[str, float]
 
 
 def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, Array, Array]:
-    """Return s, omega, alpha of S in S, (T, 3) each, over one period at 1 kHz."""
+    """Return s, omega, alpha (T, 3) of the sensor, in S, over one period at 1 kHz."""
     joints = trajectory.evaluate(np.arange(0.0, trajectory.period, 1 / RATE))
     motions = empty_motions(*joints[0].shape)
     motions_of(robot.arm.table, *joints, motions)
@@ -170,7 +171,7 @@ def sensor_motion(robot: Robot, trajectory: FourierTrajectory) -> tuple[Array, A
 def _candidates(found: list[Iterate], robot: Robot) -> Iterator[FourierTrajectory]:
     """Yield trajectories within the limits at 1 kHz, best first.
 
-    A descent may end too close to a true shape, so its next candidate is worse by
+    A descent may end too close to a true shape, so the next candidate of this descent is worse by
     `_CANDIDATE_RATIO`.
     """
     ranked = sorted(found, key=lambda iterate: iterate.value)

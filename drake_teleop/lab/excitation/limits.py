@@ -1,4 +1,4 @@
-"""Limits of arm, sensor and workspace; their use by a motion, with gradients (T47)."""
+"""Limits of arm, sensor and workspace, and their use by a motion, with gradients (T47)."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from drake_teleop.station.slave.arm import MOTION_SIZE, inverse_dynamics, link_m
 
 LIMITS = ("position", "velocity", "acceleration", "torque", "sensor", "workspace", "clearance")
 
-#: Distance beyond the clearance at which its use is 0 [m].
+#: Distance beyond the clearance at which the use of the clearance is 0 [m].
 CLEARANCE_SCALE = 0.1
 # Smallest weight in the gradient of a smooth maximum.
 _MIN_WEIGHT = 1e-7
-# Value of all distances beyond clearance plus scale [m].
+# Value that replaces all distances above clearance plus scale [m].
 _FAR_DISTANCE_M = 1.0
 
 
 class Limits(NamedTuple):
-    """Limits of an excitation; a use of 1 is all of a limit.
+    """Limits of an excitation. The use of a limit is a share; a use of 1 reaches the limit.
 
     Attributes:
-        q_middle, q_half: (n,) of the joint ranges [rad].
-        velocity, acceleration, effort: (n,) [rad/s], [rad/s^2], [N m]; may be inf.
+        q_middle, q_half: (n,) middle and half of the joint ranges [rad].
+        velocity, acceleration, effort: (n,) joint limits [rad/s], [rad/s^2], [N m]; may be inf.
         phi: (10,) heaviest expected load about the origin of S.
-        sensor: (4,) norms of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
-        points_S: (P, 3) points that remain in the box [m].
-        box_middle, box_half: (3,) in W [m]; half may be inf.
-        capsule_row: (C,) link, a row of `link_motions`; -1 is the world.
-        capsule_ends: (C, 2, 3) in the link's frame [m].
-        capsule_radius: (C,) [m].
-        pairs: (K, 2) capsules with a minimum distance.
-        distances: (K,) [m]; negative where capsules are much larger than shapes.
+        sensor: (4,) largest norms of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
+        points_S: (P, 3) points in S that remain in the box [m].
+        box_middle, box_half: (3,) middle and half size of the box in W [m]; half may be inf.
+        capsule_row: (C,) link of each capsule, a row of `link_motions`; -1 is the world.
+        capsule_ends: (C, 2, 3) end points of each capsule in the link's frame [m].
+        capsule_radius: (C,) radii [m].
+        pairs: (K, 2) pairs of capsules with a minimum distance.
+        distances: (K,) these distances [m]; negative where capsules are much larger than shapes.
         clearance: minimum distance of the true shapes [m].
     """
 
@@ -71,14 +71,14 @@ class Limits(NamedTuple):
 
 @njit(cache=True)
 def motions_of(table, q, qd, qdd, motions):
-    """Fill (T, n+1, 21) with `link_motions` of (T, n) samples."""
+    """Write `link_motions` of T samples (q, qd, qdd (T, n)) into `motions` (T, n+1, 21)."""
     for t in range(len(q)):
         link_motions(table, q[t], qd[t], qdd[t], motions[t])
 
 
 @njit(cache=True)
 def sensor_vectors(motions, out):
-    """Fill (3, T, 3) with s, omega, alpha of S in S."""
+    """Write s, omega, alpha of the sensor, in S, into `out` (3, T, 3)."""
     for t in range(len(motions)):
         motion = motions[t, -1]
         for k in range(3):
@@ -88,7 +88,7 @@ def sensor_vectors(motions, out):
 
 @njit(cache=True)
 def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
-    """Add dJ/d(q, qd, qdd) to `gradient` (3, T, n), from dJ/dV (T, 6, 10)."""
+    """Add dJ/d(q, qd, qdd) of a scalar J to `gradient` (3, T, n), from dJ/dV (T, 6, 10)."""
     rows = motions.shape[1]
     seeds = np.zeros((rows, SEED_SIZE))
     c, virtual = np.zeros(rows - 1), np.zeros((rows, 6))
@@ -108,13 +108,13 @@ def criterion_gradient(table, motions, qd, qdd, g_V, gradient):
 
 @njit(cache=True)
 def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, gradient):
-    """Calculate the largest use of each of `LIMITS` over all samples, with gradients (T47).
+    """Write the largest use of each of `LIMITS` over all samples, with gradients (T47).
 
     Args:
-        q, qd, qdd: (T, n).
+        q, qd, qdd: (T, n) joint positions, velocities and accelerations.
         motions: (T, n+1, 21) from `motions_of`.
         smooth, largest: (7,) outputs: smooth and exact maximum.
-        gradient: (7, 3, T, n) output: of the smooth uses by q, qd, qdd.
+        gradient: (7, 3, T, n) output: gradient of the smooth uses by q, qd, qdd.
     """
     gradient[:] = 0.0
     T, n = q.shape
@@ -141,7 +141,7 @@ def limit_uses(table, q, qd, qdd, motions, limits, sharpness, smooth, largest, g
 
 @njit(cache=True)
 def _smooth_maximum(use, sharpness):
-    """Return exact and smooth maximum of `use` (T, m), which becomes the gradient."""
+    """Return exact and smooth maximum of `use` (T, m); replace `use` by the gradient."""
     top = use.max()
     total = 0.0
     for t in range(use.shape[0]):
@@ -297,7 +297,7 @@ def _clearance(table, qd, qdd, motions, limits, sharpness, smooth, largest, grad
 
 @njit(cache=True)
 def capsule_distances(motions, rows, ends, radii, pairs):
-    """Return (T, K) distances of capsule pairs [m]."""
+    """Return the distances (T, K) of capsule pairs [m]."""
     distances = np.empty((len(motions), len(pairs)))
     placed, nearest = np.empty(ends.shape), np.empty(5)
     for t in range(len(motions)):
@@ -323,7 +323,7 @@ def _transform_capsules(motions, rows, ends, placed):
 
 @njit(cache=True)
 def _is_far(first, second, enough):
-    """Return True only if segments (2, 3) are farther apart than `enough` [m]."""
+    """Return True only if two segments (2, 3) are farther apart than `enough` [m]."""
     between = length_a = length_b = 0.0
     for i in range(3):
         d = 0.5 * (first[0, i] + first[1, i] - second[0, i] - second[1, i])
@@ -370,5 +370,5 @@ def _segment_distance(first, second, nearest):
 
 
 def empty_motions(samples: int, joints: int) -> Array:
-    """Allocate the output of `motions_of`."""
+    """Return an uninitialised array for the output of `motions_of`."""
     return np.empty((samples, joints + 1, MOTION_SIZE))

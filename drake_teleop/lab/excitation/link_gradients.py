@@ -24,26 +24,26 @@ from drake_teleop.common.vectors import (
 )
 from drake_teleop.station.slave.arm import MOTION_SIZE, SLIDES
 
-#: Seeds of a link: s, omega, alpha, p, theta, and v, w of virtual power.
+#: Size of a link's seed: derivatives by s, omega, alpha, p, theta, and v, w of virtual power.
 SEED_SIZE = 21
 _S, _OMEGA, _ALPHA, _P, _THETA, _V, _W = 0, 3, 6, 9, 12, 15, 18
 
 
 @njit(cache=True)
 def to_world(motion, a):
-    """Return R a, with R of a motion (21,); a is a triple."""
+    """Return a triple `a` of the link's frame, in W; `motion` (21,) contains the rotation R."""
     return apply(nine(motion, 12), a)
 
 
 @njit(cache=True)
 def to_link(motion, a):
-    """Return R^T a."""
+    """Return a triple `a` of W, in the link's frame."""
     return apply(transposed(nine(motion, 12)), a)
 
 
 @njit(cache=True)
 def seed_vector(motion, place, gradient, seed):
-    """Add the seed of s, omega or alpha (`place` 0, 3, 6) in the link's frame."""
+    """Add a derivative by s, omega or alpha (`place` 0, 3, 6), in the link's frame, to `seed`."""
     g = to_world(motion, gradient)
     add_into(seed, place, g)
     add_into(seed, _THETA, cross(g, three(motion, place)))
@@ -51,18 +51,19 @@ def seed_vector(motion, place, gradient, seed):
 
 @njit(cache=True)
 def seed_point(motion, point, gradient, seed):
-    """Add the seed of a point (3,) fixed to the link; `gradient` is in W."""
+    """Add a derivative, in W, by the position of a point (3,) fixed to the link to `seed`."""
     add_into(seed, _P, gradient)
     add_into(seed, _THETA, cross(to_world(motion, point), gradient))
 
 
 @njit(cache=True)
 def seed_wrench(motion, phi, g_force, g_torque, seed):
-    """Add the seed of the wrench, Eqs. (1)-(2), of `phi` about the link's origin.
+    """Add derivatives by the wrench of a load, Eqs. (1)-(2), about the link's origin to a seed.
 
     Args:
-        g_force, g_torque: triples in the link's frame.
-        seed: (21,), added to.
+        phi: (10,) parameters of the load.
+        g_force, g_torque: derivatives by force and torque, triples in the link's frame.
+        seed: (21,) the link's seed, added to.
     """
     s = to_link(motion, three(motion, _S))
     w = to_link(motion, three(motion, _OMEGA))
@@ -82,12 +83,12 @@ def seed_wrench(motion, phi, g_force, g_torque, seed):
 
 @njit(cache=True)
 def seed_joint_torque(table, motions, c, virtual, seeds):
-    """Add the seeds of J = c . tau without rotor inertia and damping.
+    """Add the seeds of J = c . tau, with joint torques tau without rotor inertia and damping.
 
     Args:
-        c: (n,) weights.
-        virtual: (n+1, 6) output: velocities under c, for `pull_back`.
-        seeds: (n+1, 21), added to.
+        c: (n,) weights of the joint torques.
+        virtual: (n+1, 6) output: link velocities for joint velocities c, for `pull_back`.
+        seeds: (n+1, 21) seeds of the links, added to.
     """
     n = motions.shape[0] - 1
     v = w = p = (0.0, 0.0, 0.0)
@@ -120,12 +121,12 @@ def seed_joint_torque(table, motions, c, virtual, seeds):
 
 @njit(cache=True)
 def pull_back(table, motions, qd, qdd, c, virtual, seeds, g_q, g_qd, g_qdd):
-    """Add the gradients of the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
+    """Add the gradients that belong to the seeds to `g_q`, `g_qd`, `g_qdd`, (n,) each.
 
     Args:
         motions: (n+1, 21), `link_motions` at (q, qd, qdd).
         c, virtual: (n,), (n+1, 6) as in `seed_joint_torque`, or zeros.
-        seeds: (n+1, 21).
+        seeds: (n+1, 21) seeds of the links.
     """
     n = motions.shape[0] - 1
     gs = gw = ga = gp = gt = gv = go = (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""3D replay of an excitation."""
+"""3D replay of an excitation trajectory."""
 
 from __future__ import annotations
 
@@ -101,7 +101,6 @@ def _AddLinks(meshcat: Meshcat, robot: Robot, context: Context) -> None:
 
 
 def _joint_positions(robot: Robot, context: Context, body: RigidBody) -> Iterator[Array]:
-    """Yield (3,) p_BJ of joints on a body and of S [m]."""
     plant = robot.plant
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     frames = [joint.frame_on_parent() for joint in joints if joint.parent_body() is body]

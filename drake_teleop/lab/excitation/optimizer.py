@@ -1,7 +1,7 @@
 """Optimiser of excitation trajectories.
 
-Penalties with L-BFGS lead random candidates to the limits; SLSQP then minimises. All improving
-feasible iterates are recorded, because SLSQP often ends on an infeasible one.
+L-BFGS with penalties moves random candidates to the limits; SLSQP then minimises the criterion. All
+improving feasible iterates are recorded, because SLSQP often ends on an infeasible one.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _RELATIVE_SIZE = 0.35
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Specification of a design.
+    """Specification of a trajectory design.
 
     Args:
         table: `ArmModel.table`, with the heaviest load.
         home: (n,) posture around which half of the candidates are drawn [rad].
-        period: [s].
-        harmonics: N of Eq. (9), at least 2.
+        period: duration of the trajectory [s].
+        harmonics: number N of harmonics in Eq. (9), at least 2.
     """
 
     table: Array
@@ -61,7 +61,7 @@ class Evaluation:
     Attributes:
         log_criterion: smooth logarithm of the criterion.
         uses: (7,) smooth largest use of each of `LIMITS`.
-        gradients: (8, unknowns) of both, the criterion first.
+        gradients: (8, unknowns) gradients of criterion (first) and uses.
         largest_use: exact largest use of any limit.
     """
 
@@ -72,7 +72,7 @@ class Evaluation:
 
 
 class Problem:
-    """Problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
+    """Design problem with the unknowns x = [q0, sine, cosine] of `FourierTrajectory.at_rest`."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -95,7 +95,7 @@ class Problem:
         return FourierTrajectory.at_rest(x[:n], sine, cosine, 1 / self.task.period)
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return a random motion around the home or a random posture."""
+        """Return the unknowns of a random motion around the home or a random posture."""
         task, limits = self.task, self.task.limits
         rate = 2 * np.pi / task.period * np.sqrt(task.harmonics)
         size = np.minimum(limits.velocity / rate, limits.acceleration / rate**2)
@@ -108,7 +108,7 @@ class Problem:
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:
-        """Return the bounds of a descent from x; None: unbounded."""
+        """Return the bounds of the unknowns in a descent from x; None: unbounded."""
         return None
 
     def evaluate(self, x: Array, criterion_sharpness: float, limit_sharpness: float) -> Evaluation:
@@ -147,12 +147,12 @@ class Problem:
         return np.hstack([by_q0, by_coefficients])
 
 
-#: Share of each limit; the grid misses up to 0.9 % of a fifth harmonic's peak.
+#: Usable share of each limit; the time grid misses up to 0.9 % of a fifth harmonic's peak.
 MARGIN = 0.985
 # Largest use of a feasible iterate on the grid.
 _MAX_FEASIBLE_USE = 0.9885
 
-# Size of a batch of candidates, and number of followed ones.
+# Number of candidates in a batch, and number of them from which a descent starts.
 _NUM_CANDIDATES, _NUM_FOLLOWED = 128, 8
 # (sharpness of the criterion, of the maxima, weight of the penalty, iterations) of L-BFGS.
 _LBFGS_STAGES = ((1.0, 100.0, 20.0, 20), (12.0, 150.0, 50.0, 15))
@@ -168,7 +168,7 @@ _MIN_IMPROVEMENT = 0.995
 
 @dataclass(frozen=True)
 class Iterate:
-    """Best feasible trajectory of its start so far; `seconds` is thread CPU time."""
+    """Feasible trajectory, the best of its start when found after `seconds` of thread CPU time."""
 
     seconds: float
     evaluations: int
@@ -185,11 +185,11 @@ def design(
     seconds: float | None = None,
     progress: Callable[[float, float], None] = lambda done, best: None,
 ) -> list[Iterate]:
-    """Minimise the criterion within the limits; return feasible iterates in order.
+    """Minimise the criterion within the limits; return the improving feasible iterates in order.
 
     Args:
-        seed: of the candidates; without `seconds` the result is reproducible.
-        starts: number of followed candidates.
+        seed: seed of the candidates; without `seconds` the result is reproducible.
+        starts: number of candidates from which a descent starts.
         seconds: thread CPU time; replaces `starts`.
         progress: called with completed share and best criterion.
     """
@@ -204,12 +204,10 @@ def design(
     return search.found
 
 
-class _TimeOutError(Exception):
-    """Ends all optimisers."""
+class _TimeOutError(Exception): ...
 
 
-class _InfeasibleStartError(Exception):
-    """Ends a start that does not become feasible."""
+class _InfeasibleStartError(Exception): ...
 
 
 class _Search:
@@ -237,7 +235,7 @@ class _Search:
         self._start_time = time.thread_time()
 
     def candidates(self, rng: np.random.Generator) -> Iterator[Array]:
-        """Yield random motions, the best of each batch first."""
+        """Yield the best random motions of each batch, best first."""
         while True:
             batch = [
                 self._problem.candidate(rng, near_home=k % 2 == 0) for k in range(_NUM_CANDIDATES)
@@ -251,7 +249,6 @@ class _Search:
                 yield batch[k]
 
     def follow(self, x: Array) -> None:
-        """Descend from x."""
         self._evaluations, self._best_of_start = 0, float("inf")
         for criterion_sharpness, limit_sharpness, weight, iterations in _LBFGS_STAGES:
             options = {"maxiter": iterations}
@@ -299,7 +296,7 @@ class _Search:
     def _evaluate_once(
         self, x: Array, criterion_sharpness: float, limit_sharpness: float
     ) -> Evaluation:
-        """Evaluate a point; SLSQP requests its value, limits and gradients separately."""
+        """Evaluate a point once for SLSQP's separate requests."""
         key = np.array([*x, criterion_sharpness, limit_sharpness]).tobytes()
         if key != self._key:
             self._count_evaluation()

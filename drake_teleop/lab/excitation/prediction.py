@@ -27,11 +27,11 @@ class SensorNoise(NamedTuple):
 
     Attributes:
         weights: (6,) standard deviations by which the estimator divides the wrench [N, N m].
-        white: (12,) two-sided spectral densities [unit^2 s].
+        white: (12,) two-sided spectral densities of white noise [unit^2 s].
         walk: (12,) random walks: variance per second [unit^2 / s].
-        place: (3,) p_SoAo_S of the accelerometer [m].
-        filters: numerators and denominators in s from the channels' noise to s and alpha; None
-            without accelerometer.
+        place: (3,) position p_SoAo_S of the accelerometer [m].
+        filters: transfer functions (numerator, denominator) from the noise of s and of alpha to the
+            estimates; None without accelerometer.
     """
 
     weights: Array
@@ -44,7 +44,7 @@ class SensorNoise(NamedTuple):
 def sensor_noise(
     sensor: WristSensorConfig, estimation: MotionEstimationConfig, num_joints: int, period: float
 ) -> SensorNoise:
-    """Return the specified noise of a sensor."""
+    """Return the specified noise of a sensor with sample period `period` [s]."""
     std = np.concatenate([sensor.wrench_std(), sensor.motion_std()[[0, 1, 2, 6, 7, 8]]])
     walk = np.zeros(12) if sensor.ideal else sensor.random_walk()
     filters = None
@@ -60,19 +60,19 @@ def sensor_noise(
 def predicted_deviations(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return (16,) standard deviations, see `predicted_covariance`."""
+    """Return the standard deviations (16,) of offsets and phi, see `predicted_covariance`."""
     return np.sqrt(np.diag(predicted_covariance(s, omega, alpha, step, noise, phi)))
 
 
 def predicted_covariance(
     s: Array, omega: Array, alpha: Array, step: float, noise: SensorNoise, phi: Array
 ) -> Array:
-    """Return (16, 16) covariance of offsets and phi after the motion.
+    """Return the covariance (16, 16) of offsets and phi after the motion.
 
     Args:
         s, omega, alpha: (T, 3) samples of the motion, in S.
         step: sample period [s].
-        phi: (10,) the load.
+        phi: (10,) parameters of the load.
     """
     rows = np.concatenate([np.tile(np.eye(6), (len(s), 1, 1)), regressor(s, omega, alpha)], axis=2)
     weighted = rows / noise.weights[:, np.newaxis] ** 2
@@ -102,7 +102,6 @@ def _products(influence: Array, variances: Array) -> Array:
 
 
 def _error_filter(filter_: SteadyState, period: float) -> tuple[Array, Array]:
-    """Return the transfer function from acceleration noise to filtered error."""
     denominator = np.array([1.0, *(filter_.gains / period)])
     numerator = denominator * [1.0, 1.0, 1.0, 0.0]
     return numerator, denominator
@@ -117,6 +116,6 @@ def _backwards(polynomials: tuple[Array, Array], signals: Array, step: float) ->
 
 
 def spatial_inertia(phi: Array) -> Array:
-    """Return (6, 6) matrix from [s, alpha] of S to the wrench of phi."""
+    """Return the matrix (6, 6) from [s, alpha] of the sensor to the wrench of a load phi."""
     moment = cross_matrix(phi[1:4])
     return np.block([[phi[0] * np.eye(3), -moment], [moment, inertia_about_origin(phi)]])

@@ -1,4 +1,4 @@
-"""Arm with surroundings and limits for the design."""
+"""Arm with surroundings and limits, for the design of trajectories."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ _UNLIMITED = np.zeros(3), np.full(3, np.inf)
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Arm with its surroundings.
+    """Arm with surroundings, limits and sensor noise.
 
     Attributes:
-        plant: with the heaviest load.
-        sensor_frame: S.
+        plant: Drake's plant, with the heaviest load.
+        sensor_frame: frame S of the wrist sensor.
         home: (n,) start posture of the search [rad].
         assumptions: assumed values that the model lacks.
         folders: temporary folders with converted meshes.
@@ -128,7 +128,7 @@ def RobotFromModel(
         payload: mass of the heaviest load [kg], if the model lacks it.
 
     Raises:
-        DrakeTeleopError: if the model is unreadable or not such an arm.
+        DrakeTeleopError: if the model is unreadable or not a serial arm.
     """
     missing: list[str] = []
     folders: list[TemporaryDirectory[str]] = []

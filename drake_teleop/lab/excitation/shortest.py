@@ -1,12 +1,12 @@
 """Shortest motion that identifies a load within tolerances: `excite --until`.
 
-log T of the period is one more unknown and is minimised; the tolerance is one more limit,
+The logarithm of the period T is one more unknown and is minimised; the tolerance is one more limit,
 
     use = 1 + 1/2 log max_k (z d_k / tolerance_k),
 
-with standard deviations d_k after one period; z holds all tolerances together in `RELIABLE` of the
-records (Sidak). The optimiser models white noise. A factor for each number from `prediction.py`
-adds random walks and filters, and the search repeats with it.
+with standard deviations d_k after one period. With the factor z, all numbers are within their
+tolerances together in `RELIABLE` of the records (Sidak). The optimiser models white noise. A factor
+for each number, from `prediction.py`, adds random walks and filters; the search repeats with it.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _REGULARISATION = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class Shortest:
-    """Checked motion, and (k,) z d_k over the tolerances, at most 1."""
+    """Checked motion; `reached` (k,) is z d_k over the tolerances, at most 1."""
 
     excitation: Excitation
     reached: Array
@@ -89,12 +89,12 @@ def shortest(
     """Design and check the shortest motion that reaches a tolerance.
 
     Args:
-        harmonics: N of Eq. (9).
+        harmonics: number N of harmonics in Eq. (9).
         seed, progress: see `design`.
         starts: random starts of the first round.
 
     Raises:
-        DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches it.
+        DrakeTeleopError: if no motion up to `_MAX_PERIOD_S` reaches the tolerance.
     """
     errors = errors_of(tolerance, robot.limits.phi) * reliable_factor(len(tolerance.entries))
     factor = np.ones(len(errors))
@@ -147,16 +147,16 @@ def shortest(
 
 
 def reliable_factor(count: int) -> float:
-    """Return z for `count` numbers in `RELIABLE` of the records."""
+    """Return the factor z for `count` numbers, see `RELIABLE`."""
     return float(ndtri(0.5 + 0.5 * RELIABLE ** (1.0 / count)))
 
 
 class ShortestProblem(Problem):
-    """Problem with the unknowns x = [q0, sine, cosine, log T].
+    """Design problem with the unknowns x = [q0, sine, cosine, log T].
 
     Args:
-        task: with a period of 1 s; its criterion is not used.
-        errors: (k, 16) rows with required deviations of 1.
+        task: design task with a period of 1 s; its criterion is not used.
+        errors: (k, 16) combinations of offsets and phi, scaled to required deviations of 1.
         around: unknowns of an earlier motion, if any.
 
     Attributes:
@@ -179,7 +179,7 @@ class ShortestProblem(Problem):
         return replace(super().trajectory(x[:-1]), frequency=float(np.exp(-x[-1])))
 
     def candidate(self, rng: np.random.Generator, *, near_home: bool) -> Array:
-        """Return a random motion and period, or a variation of `around`."""
+        """Return the unknowns of a random motion and period, or a variation of `around`."""
         if self._around is not None and near_home:
             other = _COEFFICIENT_SPREAD * rng.uniform() * np.abs(self._around[:-1]).mean()
             x = self._around + np.append(other * rng.standard_normal(len(self._around) - 1), 0.0)
@@ -193,7 +193,7 @@ class ShortestProblem(Problem):
         return np.append(x, np.log(period))
 
     def bounds(self, x: Array) -> Bounds:
-        """Return bounds of log T near x."""
+        """Return the bounds of the unknowns near x, of log T only."""
         shortest_period, largest = np.log(self._shortest), np.log(2.0 * _MAX_PERIOD_S)
         around = (
             np.clip(x[-1] + step, shortest_period, largest)
@@ -247,21 +247,20 @@ class ShortestProblem(Problem):
         return self._period
 
     def deviations(self, motion: tuple[Array, Array, Array], period: float) -> Array:
-        """Return (k,) standard deviations in white noise."""
+        """Return the standard deviations (k,) in white noise, over the required ones."""
         return np.sqrt(self._variances(self._rows(*motion), period)[0])
 
     def _rows(self, s: Array, omega: Array, alpha: Array) -> Array:
-        """Return (T, 6, 16) regression rows over root densities of the wrench noise."""
         V = regressor(s, omega, alpha)
         rows = np.concatenate([np.broadcast_to(np.eye(6), (len(V), 6, 6)), V], axis=2)
         return rows / self._roots[:, np.newaxis]
 
     def _variances(self, rows: Array, period: float) -> tuple[Array, Array, Array]:
-        """Return (k,) variances d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
+        """Return variances (k,) d_k^2 = v_k^T B v_k, v_k = G^-1 e_k and u_k = G^-1 B v_k.
 
-        G = sum of R^T R period / samples is the information of weighted least squares;
-        B = sum of R^T S R period / samples contains the noise densities S (sandwich, White,
-        Econometrica 1980).
+        e_k is a row of `errors`; G = sum of R^T R period / samples is the information of weighted
+        least squares; B = sum of R^T S R period / samples contains the noise densities S (sandwich,
+        White, Econometrica 1980).
         """
         share, flat = period / len(rows), rows.reshape(-1, rows.shape[2])
         G = share * (flat.T @ flat)
@@ -274,7 +273,7 @@ class ShortestProblem(Problem):
         return np.einsum("ki,ki->k", v, Bv), v, Bv @ inverse
 
     def _tolerance_use(self, sharpness: float) -> tuple[float, float, Array]:
-        """Return smooth and exact use of the tolerance, and the gradient of the smooth one by V.
+        """Return smooth and exact use of the tolerance, and the gradient of the smooth use by V.
 
         With weights w_k, d log d_k = (v^T dB v - 2 u^T dG v) / (2 d_k^2), half of it in the use.
         """
@@ -291,7 +290,7 @@ class ShortestProblem(Problem):
 
 
 def white_noise(noise: SensorNoise, phi: Array) -> Array:
-    """Return (6, 6) white noise densities of wrench and of motion times load.
+    """Return the white noise densities (6, 6) of wrench and of motion times load.
 
     They are relative to the wrench's own densities, and do not include filters.
     """

@@ -26,7 +26,7 @@ _THRESHOLD_OVER_FREE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """Free movement with its wrench for each sigma (N, 6)."""
+    """Free movement, with the scaled wrench (N, 6) at the slave for each sigma."""
 
     scenario: Scenario
     result: SimulationResult
@@ -38,9 +38,10 @@ class ContactMotion:
     """Contact transition, and the same movement without the sheet spring.
 
     Attributes:
-        raw, calculated: (N, 6) F - F_o and contact wrench.
-        contact: (N,) true contact.
-        threshold: of the detection [N].
+        raw: (N, 6) measured wrench without offsets, F - F_o.
+        calculated: (N, 6) calculated contact wrench.
+        contact: (N,) True in true contact.
+        threshold: force threshold of the contact detection [N].
     """
 
     scenario: Scenario
@@ -55,14 +56,14 @@ class ContactMotion:
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Run a free movement; calculate its wrench for each sigma."""
+    """Run a free movement and calculate the scaled wrench for each sigma."""
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Run the contact transition with and without the sheet."""
+    """Run the contact transition with and without the sheet spring."""
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
     free = _simulate(without_sheet(scenario), estimate, free_stage)
@@ -81,13 +82,14 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
 
 
 def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
-    """Run a free movement with an ideal sensor; eliminate the true load from the reaction force.
+    """Run a free movement with an ideal sensor; subtract the true load from the reaction wrench.
 
-    The ideal sensor samples V phi. Drake's reaction force of the tool's weld does not use V, so it
-    is an independent check.
+    The ideal sensor samples V phi. Drake's reaction wrench of the tool's weld does not use the
+    regressor V, so it is an independent check of V.
 
     Returns:
-        (N, 6) F - V phi [N, N m] after the settling time; only rounding errors if V is correct.
+        (N, 6) reaction wrench minus the load's wrench, F - V phi [N, N m], after the settling time;
+            only rounding errors if V is correct.
     """
     rate, simulation = scenario.rates.log_hz, scenario.simulation
     phi = slave_arm(scenario).phi_load
@@ -116,11 +118,11 @@ def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
 
 
 def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Values:
-    """Return the values of Figs. 6 and 7 for one component of the wrench.
+    """Return the values of Fig. 6 or Fig. 7 for one component of the wrench.
 
     Args:
-        ideal: (N, 6) from `eliminated_reaction`.
-        unit: suffix of the names.
+        ideal: (N, 6) result of `eliminated_reaction`.
+        unit: unit, as suffix of the values' names.
     """
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
     vector = slice(0, 3) if component < 3 else slice(3, 6)
@@ -138,7 +140,7 @@ def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Val
 
 
 def contact_values(run: ContactMotion) -> Values:
-    """Return the values of Fig. 8."""
+    """Return the values of Fig. 8 by name."""
     t, force_norm = run.touched.t, _force_norm(run.calculated)
     detected = force_norm > run.threshold
     window = _contact_window(run)
@@ -160,7 +162,7 @@ def contact_values(run: ContactMotion) -> Values:
 
 
 def raw_excess(run: ContactMotion) -> Array:
-    """Return (4,) excess of f_x, f_y, f_z, |f| over the free range [N]."""
+    """Return the excess (4,) of f_x, f_y, f_z, |f| in contact over the contact-free range [N]."""
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
         for raw in (run.raw[_contact_window(run)], run.raw_free)
@@ -173,7 +175,7 @@ def raw_excess(run: ContactMotion) -> Array:
 
 
 def identification_values(load: LoadIdentification, scenario: Scenario) -> Values:
-    """Return errors and expected accuracy of the estimate."""
+    """Return errors and expected accuracy of the load estimate."""
     truth = true_parameters(scenario)
     error = load.estimate - truth
     mass, moment = load.estimate[6], load.estimate[7:10]
@@ -205,7 +207,7 @@ def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> Simula
 
 
 def true_parameters(scenario: Scenario) -> Array:
-    """Return (16,) true offsets and phi, Eq. (7)."""
+    """Return the true offsets and phi (16,) of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 
@@ -217,7 +219,6 @@ def _scaled(result: SimulationResult, estimate: Array, sigma: float) -> Array:
 
 
 def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
-    """Return (N,) from first contact to FILTER_TAIL_S after the last."""
     t = run.touched.t
     if not run.contact.any():
         return run.contact
@@ -226,7 +227,7 @@ def _contact_window(run: ContactMotion) -> NDArray[np.bool_]:
 
 
 def reversal_without_contact(run: ContactMotion) -> float | None:
-    """Return the time of the largest raw force after the contact [s]."""
+    """Return the time of the largest raw force after the contact [s]; None without contact."""
     t, force_norm = run.touched.t, _force_norm(run.raw)
     window = _contact_window(run)
     if not window.any():

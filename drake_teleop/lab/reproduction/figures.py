@@ -1,4 +1,4 @@
-"""Figures of the paper from plain arrays, with its layout and equal scales in all subplots."""
+"""Figs. 6 to 8 from plain arrays, with the paper's layout and equal scales in all subplots."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def scaling_figure(
     unit: str,
     downscaling: float,
 ) -> Figure:
-    """Draw Figs. 6 and 7: one component at the slave for each sigma; right axes at the master.
+    """Draw Fig. 6 or 7: one component at the slave for each sigma; right axes at the master.
 
     Args:
-        t: (N,) [s].
-        values: for each sigma (N,) the scaled component at the slave, in `unit`.
-        symbol: matplotlib text of the component.
+        t: (N,) times [s].
+        values: for each sigma, the scaled component (N,) at the slave, in `unit`.
+        symbol: matplotlib text of the component's symbol.
         unit: "N" or "N m".
-        downscaling: slave over master, 17.5 in the paper.
+        downscaling: force at the slave over force at the master, 17.5 in the paper.
     """
     time, time_unit = _time(t)
     traces = [np.asarray(trace, float) for trace in values]
@@ -75,13 +75,13 @@ def contact_figure(
     """Draw Fig. 8: measured force and calculated contact force, with shaded contact.
 
     Args:
-        t: (N,) [s].
-        measured, contact_force: (N,) [N], at the slave.
-        symbol: matplotlib text of the component.
-        contact: (N,) true contact.
+        t: (N,) times [s].
+        measured, contact_force: (N,) components of these forces at the slave [N].
+        symbol: matplotlib text of the component's symbol.
+        contact: (N,) True in true contact.
         detected_s: time of the detection [s].
-        threshold: of the detection [N].
-        turning_s: marked reversal without contact [s].
+        threshold: force threshold of the detection [N].
+        turning_s: time of the reversal without contact, which is marked [s].
     """
     time, time_unit = _time(t)
     per_second = 1e3 if time_unit == "ms" else 1.0

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drake_teleop.common.files import write_text
 from drake_teleop.common.html import embedded, render
 
-# Eq. (7): symbol, index, printed unit, factor from the SI unit.
+# Parameters of Eq. (7): symbol, index, printed unit, factor from the SI unit.
 _PARAMETERS = (
     *(("f", f"o,{axis}", "N", 1.0) for axis in "xyz"),
     *(("τ", f"o,{axis}", "N m", 1.0) for axis in "xyz"),
@@ -27,7 +27,7 @@ _PARAMETERS = (
 
 
 _NOT_REPORTED = "not reported"
-# Verdicts for accepted and not accepted values.
+# Pairs of verdicts: for an accepted value, for an unaccepted value.
 _AS_SET = ("as set", "not as set")
 _WITHIN_BOUND = ("within our bound", "beyond our bound")
 _AGREES = ("agrees", "differs")
@@ -35,12 +35,12 @@ _AGREES = ("agrees", "differs")
 
 @dataclass(frozen=True)
 class Comparison:
-    """Row of the table of paper and reproduction.
+    """Row of the table that compares paper and reproduction.
 
     Args:
-        origin: "set" if the scenario was chosen to match the paper; else "found".
-        accepted: accepted range; empty if not comparable.
-        holds: True if accepted; None if not comparable.
+        origin: "set" if the scenario was chosen to match the paper's value; else "found".
+        accepted: accepted range as text; empty if the value is not comparable.
+        holds: True if the value is accepted; None if it is not comparable.
     """
 
     what: str
@@ -52,7 +52,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Verdict; "agrees" or "differs" only for found values that the paper reports."""
+        """Verdict in words; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
         words = _AS_SET if self.origin == "set" else _AGREES
@@ -70,7 +70,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """Figure with title and caption."""
+    """Figure of the report, with title and caption."""
 
     title: str
     png: Path
@@ -79,7 +79,7 @@ class ReportFigure:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Identified parameter beside its true value, all in `unit`."""
+    """Row of the identification table: identified and true value of a parameter, in `unit`."""
 
     symbol: str
     index: str
@@ -91,10 +91,10 @@ class ParameterRow:
 
 
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
-    """Return the table of paper and reproduction.
+    """Return the rows of the table that compares paper and reproduction.
 
     Args:
-        summary: values by full name ("free_force.peak_raw_N").
+        summary: values by full name, such as "free_force.peak_raw_N".
     """
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
@@ -136,7 +136,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the table rows that are not accepted, for the summary of `reproduce_command`."""
+    """Return the rows with unaccepted values as text, from a summary of `reproduce_command`."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(flat(summary))
@@ -145,7 +145,7 @@ def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def flat(summary: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
+    """Return all values by full name: ``{"contact.true_s": 0.22, ...}``; null becomes NaN."""
     return {
         f"{part}.{name}": math.nan if value is None else value
         for part, figures in summary.items()
@@ -188,10 +188,11 @@ def captions(summary: Mapping[str, Any]) -> dict[str, str]:
 def parameter_rows(
     true: ArrayLike, estimate: ArrayLike, deviation: ArrayLike
 ) -> list[ParameterRow]:
-    """Return the identification table.
+    """Return the rows of the identification table.
 
     Args:
-        true, estimate, deviation: (16,) each, offsets then phi as in Eq. (7), SI units.
+        true, estimate, deviation: (16,) true values, estimates and standard deviations of the
+            offsets, then phi, as in Eq. (7), SI units.
     """
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
@@ -220,10 +221,10 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures. Without a date, equal runs give equal pages.
+    """Write the HTML page with embedded figures; without a date, so equal runs give equal pages.
 
     Args:
-        setup: description of the run, name to text.
+        setup: description of the run: name -> text.
         summary: values by full name.
         replay: file name of the 3D replay beside the page, if any.
     """

@@ -1,8 +1,8 @@
 """`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order.
 
-1. Identification (section IV) by the recursive estimator in the loop.
+1. Identification of the load (section IV) by the recursive estimator in the loop.
 2. Figs. 6 and 7: free movements with sigma = 0; curves of all sigmas from the recorded samples.
-3. The same movements with the plant's own reaction force.
+3. The same movements with the reaction force of Drake's plant instead of the sensor.
 4. Fig. 8: contact, and the same movement without the sheet spring.
 """
 
@@ -69,11 +69,12 @@ def reproduce_command(
     """Repeat the paper's experiments; write figures, logs and a report into a folder.
 
     Args:
-        seed: of all noise; None: 0.
-        progress: False: no progress bars; `quiet`: no tables either.
+        seed: first seed of the noise; None: 0.
+        quiet: True hides progress bars and tables.
+        progress: False hides the progress bars.
 
     Returns:
-        The summary, and the speed (not reproducible).
+        The summary and the speed, which is not reproducible.
     """
     seed = seed or 0
     make_folder(out)  # fail early for a bad path

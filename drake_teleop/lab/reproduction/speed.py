@@ -19,7 +19,10 @@ _RUN_S = 0.1  # simulated time of one measurement [s]
 
 
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
-    """Return arm and tool under holding torque; `touching` adds surroundings."""
+    """Return a simulator of arm and tool under constant holding torque.
+
+    With `touching`, the plant also contains the scenario's surroundings.
+    """
     builder = DiagramBuilder()
     surroundings = scenario.surroundings if touching else None
     slave = AddSlavePlant(builder, scenario.slave, surroundings)
@@ -36,7 +39,7 @@ def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
 
 
 def MakeMovingStation(scenario: Scenario) -> Simulator:
-    """Return a station after its settling time."""
+    """Return a simulator of the station at the end of its settling time."""
     # The value of the estimate does not change the cost.
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -51,9 +54,9 @@ def cpu_seconds(
     repetitions: int = 11,
     progress: Progress = lambda done: None,
 ) -> dict[str, float]:
-    """Return thread CPU seconds for each simulated second, by interleaved runs.
+    """Return the thread CPU time per simulated second of each simulator, by interleaved runs.
 
-    Other load of the machine can only add time, so the minimum counts (as in `timeit`).
+    Other load of the machine can only add time, so the result is the minimum (as in `timeit`).
     """
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for k in range(repetitions):

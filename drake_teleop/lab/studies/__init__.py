@@ -1,1 +1,1 @@
-"""Studies: designs over scenario fields, their runs, store and statistics."""
+"""Studies: designs of experiments over scenario fields, with runs, storage and statistics."""

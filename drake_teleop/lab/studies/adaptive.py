@@ -1,6 +1,7 @@
-"""Next points of an adaptive design: expected improvement (Jones 1998).
+"""Choice of the next points of an adaptive design by expected improvement (Jones 1998).
 
-A batch uses predicted values ("kriging believer", Ginsbourger 2010).
+Within a batch, the predicted mean of a chosen point replaces its unknown value ("kriging believer",
+Ginsbourger 2010).
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e
 
 
 def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
-    """Return indices of `count` candidates with the largest expected improvement.
+    """Return the indices of `count` candidates with the largest expected improvement.
 
     Args:
-        places: (n, d) evaluated points, from 0 to 1.
-        objective: (n,) to minimise; nan counts as the worst value.
-        candidates: (m, d), m >= count.
+        places: (n, d) coordinates of the evaluated points, from 0 to 1.
+        objective: (n,) values to minimise; nan counts as the worst value.
+        candidates: (m, d) coordinates of the possible points, m >= count.
     """
     y = np.array(objective, dtype=float)
     if not np.isfinite(y).any():
@@ -49,7 +50,7 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
 
 
 def _fit(places: Array, y: Array) -> tuple[Array, float]:
-    """Return length scales (d,) and noise variance (maximum likelihood)."""
+    """Return length scales (d,) and noise variance of the Gaussian process (maximum likelihood)."""
 
     def misfit(x: Array) -> float:
         K = _kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
@@ -66,7 +67,6 @@ def _fit(places: Array, y: Array) -> tuple[Array, float]:
 
 
 def _predict(places: Array, y: Array, queries: Array, noise: float) -> tuple[Array, Array]:
-    """Return mean and standard deviation at `queries`."""
     K = _kernel(places, places)
     K[np.diag_indices_from(K)] += noise
     lower, _ = cho_factor(K, lower=True)

@@ -1,4 +1,4 @@
-"""Study file, and the design points that follow from it."""
+"""Content of a study file, and the design points that follow from it."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import itertools
@@ -19,9 +19,9 @@ Values: TypeAlias = dict[str, Value]
 """Values of the factors at one point, by field."""
 
 MANY_RUNS = 10**5
-"""More runs take days or weeks and require consent."""
+"""Number of runs above which a study takes days or weeks and requires consent."""
 MAX_RUNS = 10**6
-"""Maximum number of runs; their design needs 1 GB."""
+"""Maximum number of runs; their design needs 1 GB of memory."""
 
 # Number of candidates of an adaptive design (a power of two).
 _NUM_CANDIDATES = 1024
@@ -42,7 +42,7 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed(self) -> Sequence[Value]:
-        """Return the values of a factorial design."""
+        """Return the values that a factorial design uses."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
@@ -57,7 +57,8 @@ class Factor:
     def coordinates(self, value: Value) -> list[float]:
         """Return the coordinates of a value, each from 0 to 1.
 
-        Words, flags and vectors have one for each value.
+        A number has one coordinate. Words, flags and vectors have one coordinate for each listed
+        value.
         """
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
@@ -69,10 +70,10 @@ class Factor:
         return [(value - low) / (high - low) if high > low else 0.0]
 
     def check(self, where: str) -> None:
-        """Check the factor without the scenario.
+        """Check the factor's values without the scenario.
 
         Raises:
-            DrakeTeleopError: with `where`.
+            DrakeTeleopError: if the values are invalid; the message contains `where`.
         """
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
@@ -96,7 +97,7 @@ class Factor:
 @settings
 @dataclass
 class Study:
-    """Factors, design and measures of a study."""
+    """Content of a study file: factors, design and measures."""
 
     description: str = plain("", "purpose of the study")
     scenario: str = plain(
@@ -123,7 +124,7 @@ class Study:
         """Check the study without the scenario.
 
         Raises:
-            DrakeTeleopError: with `where` and the field.
+            DrakeTeleopError: if a field is invalid; the message contains `where` and the field.
         """
         check_ranges(self, where)
         for name in self.measures:
@@ -160,16 +161,16 @@ class Study:
             )
 
     def size(self) -> int:
-        """Return the number of points."""
+        """Return the number of points of the design."""
         if self.design == "factorial":
             return math.prod(len(factor.listed()) for factor in self.factors)
         return self.samples
 
     def check_size(self, where: str, yes: bool | Callable[[str], bool]) -> None:
-        """Refuse a study that is too large, before its design is created.
+        """Refuse a study with too many runs, before its design is created.
 
         Raises:
-            DrakeTeleopError: above `MAX_RUNS`, or above `MANY_RUNS` without consent (`yes`).
+            DrakeTeleopError: above `MAX_RUNS` runs, or above `MANY_RUNS` without consent (`yes`).
         """
         runs = self.size() * self.repeats
         what = f"{runs:,} runs" if runs < 10**15 else f"10^{math.log10(runs):.1f} runs"
@@ -183,7 +184,7 @@ class Study:
             raise DrakeTeleopError(f"{what} need a confirmation", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
-        """Return all points; for an adaptive design, the first ones."""
+        """Return all points of the design; for an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
             combinations = itertools.product(*(factor.listed() for factor in self.factors))
@@ -195,10 +196,11 @@ class Study:
         return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
-        """Return the next points of an adaptive design.
+        """Return the next points of an adaptive design; none at its end.
 
         Args:
-            objective: (n,) at the n points; nan if failed.
+            points: the n evaluated points.
+            objective: (n,) values at these points; nan where the runs failed.
         """
         count = min(self.batch, self.samples - len(points))
         if self.design != "adaptive" or count <= 0:
@@ -217,9 +219,9 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return runs without measures; `first` numbers the first point.
+        """Return a row without measures for each run; `first` is the number of the first point.
 
-        Every second seed is reserved for the identification.
+        Every second seed is reserved for the load identification.
         """
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [

@@ -1,7 +1,7 @@
 """Effects of factors with confidence intervals, and the Pareto front.
 
-Factorial designs have plain means with Student's intervals over seeds, differences within each
-seed; other designs a regression. Without interval the half width is nan.
+In factorial designs, means are averages with Student's intervals over seeds, and effects are
+differences within each seed. Other designs use a regression. An undefined half width is nan.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Factorial:
-    """Points of a factorial design that have a measure.
+    """Points of a factorial design at which a measure has values.
 
     Attributes:
-        levels: (n,) of each factor.
+        levels: for each factor, the level (n,) of each point.
         counts: number of levels of each factor.
-        seen: (n, seeds) True for measured values.
+        seen: (n, seeds) True where a point has a value with a seed.
     """
 
     levels: list[NDArray[np.int64]]
@@ -48,11 +48,12 @@ class Factorial:
     seen: Flags
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the comparable levels of a factor, or cells of two factors.
+        """Return the comparable levels of a factor, or the comparable cells of two factors.
 
         Returns:
-            (rows,) levels or cells; (columns,) combinations of others; (kept rows, n) matrix from
-            values to means.
+            (rows,) True for comparable levels or cells; (columns,) True for the combinations of
+                other levels in their means; (kept rows, n) matrix from the points' values to the
+                means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -68,13 +69,13 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return (kept levels,) effects and half widths of each factor."""
+        """Return effects and half widths (kept levels,) for each factor."""
         means = [self.compared(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        """Return (k,) sums with (k, n) weights, and half widths."""
+        """Return the sums (k,) of a table with weights (k, n), and their half widths."""
         mean, half = interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
@@ -86,7 +87,6 @@ class Factorial:
         return place, count
 
     def _missing_seed_widths(self, table: Array, weights: Array) -> Array:
-        """Return (k,) half widths due to missing seeds."""
         points, seeds = table.shape
         runs = self.seen.sum(axis=1)
         freedom = runs.sum() - points - seeds + 1
@@ -109,7 +109,7 @@ class Factorial:
 
 
 def filled(values: Array) -> Array:
-    """Replace nan in (n, seeds) by least squares sums."""
+    """Replace nan in values (n, seeds) by the least-squares sum of point and seed effect."""
     known = np.isfinite(values)
     if known.all():
         return values
@@ -121,7 +121,7 @@ def filled(values: Array) -> Array:
 
 
 def interval(table: Array) -> tuple[Array, Array]:
-    """Return (n,) means of (n, seeds) without nan, and half widths."""
+    """Return the means (n,) of a table (n, seeds) over seeds, ignoring nan, and half widths."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.nansum(table, axis=1) / count
@@ -137,11 +137,11 @@ PARETO = ("effort_Ns", "task_time_s", "contact_force_overshoot_N")
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Means over seeds with half widths of their intervals.
+    """Means over seeds at n levels, with half widths of their intervals.
 
     Attributes:
-        mean, half: (n,).
-        effect_half: (n,) for the difference from the mean of all n.
+        mean, half: (n,) mean and its half width.
+        effect_half: (n,) half width of the difference from the mean of all n levels.
     """
 
     mean: Array
@@ -154,13 +154,13 @@ class MainEffect:
     """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: of the n levels or parts of the range.
+        names: labels of the n levels, or of the n parts of a range.
         runs: (n,) number of runs with the measure.
-        mean, half: (n,) over other factors and seeds.
-        effect, effect_half: (n,) difference from the mean of all levels.
+        mean, half: (n,) mean over other factors and seeds, and its half width.
+        effect, effect_half: (n,) difference from the mean of all levels, and its half width.
         why: (n,) reason of a missing value.
-        compared, left_out: number of combinations of other levels.
-        fitted: True if a regression found it.
+        compared, left_out: number of used and of unused combinations of other levels.
+        fitted: True if the values are from a regression.
     """
 
     names: list[str]
@@ -177,10 +177,10 @@ class MainEffect:
 
 @dataclass(frozen=True, eq=False)
 class PairMeans:
-    """Means of a measure over two factors of n and m levels.
+    """Means of a measure over two factors with n and m levels.
 
     Attributes:
-        mean: (n, m) over other factors and seeds; nan if not comparable.
+        mean: (n, m) means over other factors and seeds; nan if not comparable.
         why: (n, m) reason of a missing value.
         compared, left_out, fitted: see `MainEffect`.
     """
@@ -197,7 +197,7 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the mean of each of `count` levels of (N,) values; nan is ignored."""
+    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -212,7 +212,7 @@ def estimated(
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects as a table."""
+    """Return the main effects on all measures as a table."""
     import polars as pl
 
     table = [
@@ -237,7 +237,7 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """Return the effect of each factor on a measure."""
+    """Return the effect of each factor on a measure, by field."""
     data = _MeasureData(study, rows, measure)
     return (
         {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
@@ -245,7 +245,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """Return the means of a measure over each pair of factors."""
+    """Return, for each pair of factors, the means of a measure at all pairs of levels."""
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
@@ -328,7 +328,7 @@ class _MeasureData:
 
 
 def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    """Return points, and (n, seeds) values; nan where missing."""
+    """Return the points, and a measure's values (n, seeds)."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
@@ -338,9 +338,9 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return every point with means of `PARETO`, or None without these measures.
+    """Return a table of all points with their means of `PARETO`; None without these measures.
 
-    Only points with all three measures at every run can be on the front.
+    Only points with all three measures in every run can be on the front.
     """
     import polars as pl
 
@@ -365,7 +365,10 @@ def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
 
 
 def front(values: Array, complete: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (n,) non-dominated complete points of (n, k) values; small is good."""
+    """Return (n,) booleans: True at complete points that no other complete point dominates.
+
+    The k columns of `values` (n, k) are minimised.
+    """
     found = complete.copy()
     for index in np.flatnonzero(complete):
         other = values[complete]
@@ -380,7 +383,7 @@ def varied(study: Study) -> list[Factor]:
 
 
 def numbers(rows: pl.DataFrame, measure: str) -> Array:
-    """Return (N,) a measure; nan where missing."""
+    """Return the values (N,) of a measure in all rows; nan where missing."""
     import polars as pl
 
     column: Array = rows[measure].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -1,9 +1,9 @@
-"""Effects from an unbalanced design: one regression with all factors (docs/studies.md).
+"""Effects from an unbalanced design by one regression with all factors (docs/studies.md).
 
-Terms with zero mean: each level (a range is cut into parts), position within a part, and products
-of pairs. Intervals contain residuals and seeds; points must be as good as random (Owen 1997).
-Failed cells are excluded: without success, or with less than half the share of success of other
-cells at the same levels. A randomly empty cell counts, except in adaptive designs.
+The terms have zero mean: levels (a range is cut into parts), position within a part, and products
+of pairs of factors. Intervals cover residuals and seeds; points must be as good as random (Owen
+1997). Failed cells are excluded: cells without success, or with less than half the success rate of
+other cells at the same levels. A cell that is empty by chance is kept, except in adaptive designs.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
     them have a successful run.
 
     Args:
-        there: (rows, columns) True where level and combination have a value.
+        there: (rows, columns) True where a level (row) has a value at a combination (column).
 
     Returns:
-        (rows,) the largest pattern of rows, the most frequent if several; (columns,) all columns
-        with these rows.
+        (rows,) True for the rows of the block: the largest pattern, the most frequent if several;
+            (columns,) True for all columns with these rows.
     """
     counts = there.sum(axis=0)
     patterns, times = np.unique(there[:, counts == counts.max()], axis=1, return_counts=True)
@@ -50,14 +50,14 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
 
 
 def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
-    """Return (n,) why levels or cells have no value; empty if `compared`."""
+    """Return for n levels or cells why they have no value; empty where `compared` (n,) is True."""
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
 
 CONFIDENCE = 0.95
-# Models by number of parts of a range and products of pairs. The first one that leaves half of the
-# points for the residuals is used, or else the last feasible one.
+# Models: number of parts of a range, and whether products of pairs are terms. The first one that
+# leaves half of the points for the residuals is used, or else the last feasible one.
 _MODELS = (*((parts, True) for parts in (5, 4, 3)), *((parts, False) for parts in (5, 4, 3, 2)))
 # Maximum number of combinations of levels of factors that are related to failures (40 MB).
 _MAX_COMBINATIONS = 50_000
@@ -65,14 +65,15 @@ _MAX_COMBINATIONS = 50_000
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels of a factor at some points.
+    """Levels of a factor at n points.
 
     Attributes:
         index: (n,) level of each point.
-        names: of the levels with a point.
-        within: (n,) position in its part of a range, -1/2 to 1/2; None for a list.
-        centred: (n, k) numbers, or indicators for all values but one; zero mean.
-        middles: (levels, k) the same at the middle of each level.
+        names: labels of the levels with a point.
+        within: (n,) position in the point's part of a range, -1/2 to 1/2; None for a list.
+        centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
+            one.
+        middles: (levels, k) these columns at the middle of each level.
     """
 
     index: NDArray[np.int64]
@@ -83,7 +84,7 @@ class Levels:
 
 
 def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
-    """Return the levels of (n,) values; ranges are cut into `parts`."""
+    """Return the levels of a factor's values (n,); a range is cut into `parts`."""
     listed = factor.listed()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
@@ -105,14 +106,14 @@ def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels
 
 @dataclass(frozen=True, eq=False)
 class LevelModel:
-    """Regression of measures at the points of a design.
+    """Linear regression of a measure on the levels of all factors.
 
     Attributes:
-        codes: for each factor (levels, k) its columns.
-        products: columns of each pair (i, j).
-        failed: (levels, levels) excluded cells of pairs; (i, i): levels.
-        X: (n, p) all columns, the mean first.
-        solve: (p, n) pseudo-inverse.
+        codes: for each factor, the columns (levels, k) of its levels.
+        products: columns of X for each pair (i, j) of factors.
+        failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
+        X: (n, p) design matrix; its first column is the mean.
+        solve: (p, n) pseudo-inverse of X.
     """
 
     factors: list[Levels]
@@ -123,11 +124,11 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the comparable levels of a factor, or cells of two factors.
+        """Return the comparable levels of a factor, or the comparable cells of two factors.
 
         Returns:
-            (rows,) levels or cells; (columns,) combinations of others that are related to failures;
-            (kept rows, p) matrix from coefficients to means.
+            As `Factorial.compared`, but only with combinations of factors related to failures, and
+                a matrix (kept rows, p) from coefficients to means.
         """
         others = sorted(set(itertools.chain(*self.failed)) - set(shown))
         factors = [*shown, *others]
@@ -142,9 +143,9 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return (kept levels,) effects and half widths of each factor.
+        """Return effects and half widths (kept levels,) for each factor.
 
-        The intervals hold together with `CONFIDENCE` (Bonferroni).
+        The intervals hold together with probability `CONFIDENCE` (Bonferroni).
         """
         means = [self.compared(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
@@ -158,7 +159,7 @@ class LevelModel:
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
-        """Return (kept levels,) means and half widths."""
+        """Return means and half widths (kept levels,) from a matrix of `compared`."""
         seeds = table.shape[1]
         each = terms @ self.solve @ table
         if seeds == 1:
@@ -167,7 +168,7 @@ class LevelModel:
         return each.mean(axis=1), np.hypot(self._design(table, 1) * self._spread(terms), over_seeds)
 
     def _terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
-        """Return (N, p) from coefficients to means at (N,) levels."""
+        """Return the matrix (N, p) from coefficients to the means at N combinations of levels."""
         count = len(next(iter(at.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
@@ -192,16 +193,14 @@ class LevelModel:
         return max(float(np.sum(residuals**2)) / (columns * self._freedom), least)
 
     def _spread(self, terms: Array) -> Array:
-        """Return (k,) standard deviations for unit residual variance."""
         return np.linalg.norm(terms @ self.solve, axis=1)
 
     def _design(self, table: Array, together: int) -> float:
-        """Return the half width due to the design, for unit spread."""
+        """Return the half width that the choice of points causes, for unit spread."""
         variance = self._variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
     def _seeds(self, table: Array, terms: Array) -> float:
-        """Return the half width due to seeds, beyond the residual noise."""
         seeds = table.shape[1]
         if seeds == 1:
             return 0.0
@@ -219,12 +218,15 @@ def level_model(
     *,
     by_chance: bool = True,
 ) -> LevelModel | None:
-    """Return the richest model that the points determine, or None.
+    """Return a regression model that the points determine, or None if there is none.
+
+    It is the first of `_MODELS` that leaves half the points for residuals, or the last feasible
+    one.
 
     Args:
-        columns: of each factor, (n,) values.
-        known: (n,) points with a value; None: all.
-        by_chance: True if empty cells are random.
+        columns: for each factor, its values (n,) at the points.
+        known: (n,) True where the measure has a value; None: everywhere.
+        by_chance: True if cells without points are empty by chance.
     """
     found, known = None, np.ones(len(columns[0]), bool) if known is None else known
     for parts, products in _MODELS:
@@ -265,7 +267,6 @@ def _model(
 def _failed_cells(
     factors: list[Levels], known: Flags, by_chance: bool
 ) -> dict[tuple[int, int], Flags]:
-    """Return excluded cells of pairs of factors."""
     found = {}
     for i, j in itertools.combinations_with_replacement(range(len(factors)), 2):
         a, b = factors[i], factors[j]
@@ -287,14 +288,13 @@ def _products(a: Array, b: Array) -> Array:
 
 
 def _codes(count: int, present: NDArray[np.int64]) -> Array:
-    """Return (count, k - 1) sum-to-zero codes of the k present levels."""
+    """Return sum-to-zero codes (count, k - 1) for the k levels in `present`."""
     codes = np.zeros((count, len(present) - 1))
     codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
     return codes
 
 
 def _quantile(together: int, freedom: int) -> float:
-    """Return Student's quantile for simultaneous intervals."""
     return float(stdtrit(freedom, 1 - (1 - CONFIDENCE) / 2 / together))
 
 

@@ -1,4 +1,4 @@
-"""Measures of a run of a study."""
+"""Measures of one run of a study."""
 
 from __future__ import annotations
 
@@ -55,22 +55,22 @@ _OF_EVERY_RUN: dict[str, Callable[[SimulationResult, float], float]] = {
 }
 
 
-#: All names; for those of tasks see `task_measures.py`.
+#: Names of all measures; for those of tasks see `task_measures.py`.
 MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
 
 
 def default_measures() -> list[str]:
-    """Return the default measures, which every run has."""
+    """Return the names of the default measures, which every run has."""
     return list(_OF_EVERY_RUN)
 
 
 def measured(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """Return the measures of one run by name.
+    """Return the requested measures of one run by name.
 
     Raises:
-        DrakeTeleopError: for a measure of a task in a scenario without task.
+        DrakeTeleopError: if a measure of a task is requested in a scenario without task.
     """
     own = [name for name in names if name in _OF_EVERY_RUN]
     found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}

@@ -1,4 +1,4 @@
-"""Pictures of a study."""
+"""Pictures of a study's results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW:
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
-    """Write the applicable pictures; remove earlier ones."""
+    """Write the pictures that apply to a study; remove those of an earlier run."""
     for old in out.glob("*.png"):
         old.unlink()
     measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]
@@ -54,7 +54,7 @@ def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measures: list[str]) -> Figure:
-    """Draw the mean of each measure at each level; bars are effect intervals."""
+    """Draw the mean of each measure at each level; bars are intervals of the effects."""
     factors, fitted, reasons = varied(study), False, set[str]()
     with plot_style():
         size = (1.2 + 2.3 * len(factors), 0.8 + 1.6 * len(measures))
@@ -118,7 +118,7 @@ def _legend(figure: Figure, reasons: Iterable[str]) -> None:
 
 
 def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | None:
-    """Draw the mean of a measure over pairs of factors, or return None."""
+    """Draw the mean of a measure over pairs of factors; return None without such means."""
     maps = [found for found in pair_means(study, rows, measure) if np.isfinite(found.mean).any()]
     if not maps:
         return None
@@ -148,7 +148,7 @@ def interactions(study: Study, rows: pl.DataFrame, measure: str) -> Figure | Non
 
 
 def pareto_front(study: Study, rows: pl.DataFrame) -> Figure | None:
-    """Draw effort over time and force overshoot, or return None."""
+    """Draw effort over time and over force overshoot; return None without complete points."""
     points = pareto(study, rows)
     if points is None or not points["complete"].any():
         return None

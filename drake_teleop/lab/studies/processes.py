@@ -1,7 +1,8 @@
-"""Execution of a study's runs by processes of this machine or Dask workers.
+"""Execution of a study's runs by processes of this machine or by Dask workers.
 
-A run that ends its process leaves the mark of its chunk. Its rows are then run alone; a row that
-ends its process again gets an error. With one job it ends the study.
+Before a chunk of runs starts, the store marks it. If a run crashes (ends its process), the mark
+remains; the chunk's rows are then run one by one. A row that crashes again gets an error. With one
+job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Run: TypeAlias = Callable[[Chunk], Chunk]
 
 @dataclass(frozen=True)
 class Processes:
-    """Executor; `rows_of` yields chunks in the order of completion."""
+    """Executor of runs; `rows_of` yields the chunks with results in the order of completion."""
 
     count: int
     rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
@@ -38,10 +39,10 @@ _PARENT_CHECK_S = 0.5  # period of the check for the parent process [s]
 
 @contextmanager
 def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processes]:
-    """Start processes for the duration of the context.
+    """Start the processes of a study for the duration of the context.
 
     Args:
-        jobs: processes as in joblib; 1 is this process.
+        jobs: number of processes as in joblib; 1 is this process.
         cluster: address of a Dask scheduler, or "local".
 
     Raises:
@@ -86,7 +87,7 @@ def _run_locally(run: Run, chunks: Sequence[Chunk], store: Store, jobs: int) -> 
 def _parallel(jobs: int) -> Any:
     from joblib import Parallel
 
-    # joblib also warns when it replaces grown processes; a crash raises an error.
+    # joblib also warns when it replaces processes that use much memory; a crash raises an error.
     warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
     return Parallel(
         n_jobs=jobs,
@@ -106,7 +107,6 @@ def _task(run: Run, chunk: Chunk, store: Store) -> Any:
 
 
 def _run_alone(run: Run, chunk: Chunk, store: Store) -> Chunk:
-    """Run the rows one by one while no other row runs."""
     found = []
     for row in chunk:
         try:
@@ -127,8 +127,6 @@ def _run_marked(run: Run, chunk: Chunk, store: Store) -> Chunk:
 
 
 def _end_with_parent(parent: int) -> None:
-    """End this process after a SIGKILL of its parent."""
-
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_PARENT_CHECK_S)
@@ -139,7 +137,6 @@ def _end_with_parent(parent: int) -> None:
 
 @contextmanager
 def _client(address: str, jobs: int) -> Iterator[Any]:
-    """Yield Dask's client; joblib's Dask backend hangs when a worker dies."""
     try:
         import dask
         from distributed import Client
@@ -154,7 +151,7 @@ def _client(address: str, jobs: int) -> Iterator[Any]:
         "dashboard_address": "127.0.0.1:0",
     }
     settings = {
-        # A dead worker must not take waiting chunks along.
+        # A worker that dies must hold no waiting chunks.
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.scheduler.allowed-failures": 1,
     }
@@ -179,7 +176,6 @@ def _run_on_cluster(run: Run, chunks: Sequence[Chunk], client: Any) -> Iterator[
 
 
 def _rows_of(future: Any, chunk: Chunk, run: Run, client: Any) -> Chunk:
-    """Return a future's rows; rerun those of a killed chunk one by one."""
     from distributed import KilledWorker
 
     try:

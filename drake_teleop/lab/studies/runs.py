@@ -1,4 +1,4 @@
-"""Runs of a study, from the design through the processes into the store."""
+"""Execution of a study: from the design through the processes into the store."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     import polars as pl
 
 Work: TypeAlias = Callable[[Values, int], dict[str, float]]
-"""Function from factor values and seed to measures, and optionally `ONE_TIME_COST`."""
+"""Function from factor values and seed to the run's measures and, optionally, `ONE_TIME_COST`."""
 
 ONE_TIME_COST = "seconds_once"
-"""Time of a run for work that most others do not repeat, such as an identification [s]."""
+"""Name of the time [s] for work that most other runs do not repeat, e.g. load identification."""
 _SECONDS = "seconds"
 
 # A chunk is one part of the store and the work of a process. Chunks are small, so that no process
@@ -52,15 +52,15 @@ def run_study(
     cluster: str | None = None,
     progress: bool = True,
 ) -> pl.DataFrame:
-    """Run all runs that the folder lacks; return all rows, sorted by run.
+    """Run all runs that `out` does not contain yet; return the rows of all runs, sorted by run.
 
     Args:
-        work: picklable function of one run.
-        basis: JSON data of all further inputs.
+        work: picklable function that executes one run.
+        basis: JSON data of all inputs of the rows besides the study.
 
     Raises:
-        DrakeTeleopError: as `study_command`.
-        KeyboardInterrupt: with the number of stored runs.
+        DrakeTeleopError: for the reasons of `study_command`.
+        KeyboardInterrupt: its message contains the number of stored runs.
     """
     points = study.points()
     first_rows = study.rows(points)
@@ -103,7 +103,6 @@ def _chunks(rows: Chunk, store: Store, counter: StudyProgress) -> list[Chunk]:
 
 
 def _objective(study: Study, store: Store, points: int) -> Array:
-    """Return (points,) mean objective; nan where missing."""
     if not study.objective:
         return np.empty(0)
     import polars as pl
@@ -115,7 +114,7 @@ def _objective(study: Study, store: Store, points: int) -> Array:
 
 
 class StudyProgress:
-    """Number of finished runs and remaining time of a study."""
+    """Progress of a study: number of finished runs and remaining time."""
 
     def __init__(self, total: int) -> None:
         self.total, self.done, self._num_timed = total, 0, 0
@@ -126,12 +125,12 @@ class StudyProgress:
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:
-        """Count runs of an earlier session."""
+        """Count runs that an earlier session has stored."""
         self.done += runs
         self._report()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs; the first ones without their one-time work."""
+        """Count finished runs and their times, at first without `ONE_TIME_COST`."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process

@@ -1,7 +1,8 @@
 """`drake-teleop scaling-study`: best force scales for the simulated operator.
 
-The merit of a point is its mean criterion relative to sigma = gamma = 1 over tasks. Bootstrap over
-seeds gives intervals and the share of draws in which a point is best (docs/scaling-study.md).
+The merit of a point (sigma, gamma) is the mean over tasks of its criteria, relative to sigma =
+gamma = 1. A bootstrap over seeds gives intervals, and the share of draws in which a point is best
+(docs/scaling-study.md).
 """
 
 from __future__ import annotations
@@ -46,11 +47,11 @@ _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Result for one selection of criteria, (s, g) for each sigma and gamma.
+    """Result for one selection of criteria; arrays (s, g) over s sigmas and g gammas.
 
     Attributes:
-        merit: nan with too many failures.
-        low, high: its 95 % interval.
+        merit: mean relative criterion; nan with too many failures.
+        low, high: limits of the merit's 95 % interval.
         best: share of draws in which the point is the best.
         failures: share of failed runs in the worst task.
     """
@@ -72,7 +73,7 @@ def scaling_study_command(
     quiet: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run the remaining runs of all studies; write and return the answer.
+    """Run the remaining runs of the scaling studies; write the best scales and return the summary.
 
     Args:
         jobs, cluster, repeats, yes, quiet, progress: as for `study_command`.
@@ -106,10 +107,11 @@ def scaling_study_command(
 
 
 def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> Answer:
-    """Return merits, bootstrap intervals and failures.
+    """Return merits, bootstrap intervals and failures for a selection of criteria.
 
     Args:
-        tables: for each task and criterion, and "success": (s, g, seeds), nan where failed.
+        tables: for each task, values (s, g, seeds) of each criterion (nan where failed) and of
+            "success".
     """
     # A task may have none of the selected criteria.
     counted = {task: [name for name in TASKS[task] if name in criteria] for task in tables}
@@ -138,7 +140,6 @@ def answer(tables: dict[str, dict[str, Array]], criteria: tuple[str, ...]) -> An
 
 
 def _relative_means(table: Array, weights: Array) -> Array:
-    """Return (draws, s, g) weighted means relative to the reference."""
     known = np.isfinite(table)
     with np.errstate(invalid="ignore", divide="ignore"):
         sums = np.einsum("sgk,dk->dsg", np.where(known, table, 0.0), weights)
@@ -229,7 +230,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def criteria_picture(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    """Draw each criterion over sigma, a line for each gamma."""
+    """Draw each criterion over sigma, with a line for each gamma."""
     tasks = [task for task in TASKS if "force" in TASKS[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))
@@ -254,10 +255,10 @@ def criteria_picture(
 
 
 def choice_picture(answers: dict[str, Answer], sigmas: list[float], gammas: list[float]) -> Figure:
-    """Draw the merit over sigma and gamma."""
+    """Draw the merit over sigma and gamma for each selection of criteria."""
     known = np.concatenate([found.merit[np.isfinite(found.merit)] for found in answers.values()])
     farthest = np.abs(np.log2(known)).max(initial=0.01)
-    # Symmetric about 1 in ratios; excluded points are grey.
+    # The colour scale is symmetric about 1 in ratios; excluded points are grey.
     ends = 2.0**-farthest, 2.0**farthest
     scale = LogNorm(*ends)
     colours = colormaps["RdBu_r"].with_extremes(bad="#dddddd")

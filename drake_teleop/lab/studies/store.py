@@ -1,6 +1,6 @@
-"""Rows of a study on disk, complete or absent after a crash.
+"""Storage of a study's rows on disk; after a crash, each part is complete or absent.
 
-The folder `runs.parquet` is one table; each part is named after its first run.
+The folder `runs.parquet` is one table; each part of it is named after its first run.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _PART = "run_{:08d}.parquet"
 
 @dataclass(frozen=True)
 class Store:
-    """Rows of one study in a folder of parts."""
+    """Table of a study's rows, in a folder of parts."""
 
     folder: Path
 
     def finished(self) -> set[int]:
-        """Return the first runs of the complete chunks."""
+        """Return the first run of each complete chunk."""
         return set(map(_first_run, self._parts()))
 
     def _parts(self) -> list[Path]:
@@ -50,7 +50,7 @@ class Store:
         write_table(self.folder / _PART.format(rows["run"][0]), rows, aside=self.folder)
 
     def mark(self, run: int) -> None:
-        """Count one more start of a chunk."""
+        """Count one more start of the chunk whose first run is `run`."""
         path = self._marks / str(run)
         with wrap_write_errors(path):
             self._marks.mkdir(exist_ok=True)
@@ -58,11 +58,11 @@ class Store:
                 mark.write(b".")
 
     def unmark(self, run: int) -> None:
-        """Remove the mark of a chunk."""
+        """Remove the mark of the chunk whose first run is `run`."""
         (self._marks / str(run)).unlink(missing_ok=True)
 
     def marked(self, times: int) -> set[int]:
-        """Return the unfinished chunks with at least `times` starts."""
+        """Return the first runs of unfinished chunks with at least `times` starts."""
         marks = (mark for mark in self._marks.glob("*") if mark.name.isdecimal())
         return {int(mark.name) for mark in marks if mark.stat().st_size >= times}
 
@@ -88,7 +88,6 @@ def _first_run(part: Path) -> int:
 
 
 def _runs_in(parts: list[Path]) -> set[int]:
-    """Return the runs of some parts; empty if one is unreadable."""
     import polars as pl
 
     if parts:
@@ -101,13 +100,13 @@ def _runs_in(parts: list[Path]) -> set[int]:
 
 @contextmanager
 def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
-    """Open the store of a folder for this process alone.
+    """Open the store in the folder `out` for this process alone.
 
     Args:
         identity: JSON data of all inputs of the rows.
 
     Raises:
-        DrakeTeleopError: if the folder contains other rows, or is in use.
+        DrakeTeleopError: if the folder contains rows of other inputs, or is in use.
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)
@@ -120,10 +119,13 @@ def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
 
 @contextmanager
 def claimed(out: Path, identity: dict[str, Any]) -> Iterator[None]:
-    """Lock an existing folder for this process and the content `identity`.
+    """Lock the existing folder `out` for this process.
+
+    Args:
+        identity: JSON data of all inputs of the folder's content.
 
     Raises:
-        DrakeTeleopError: if the folder contains something else, or is in use.
+        DrakeTeleopError: if the content is from other inputs, or the folder is in use.
     """
     handle = os.open(out, os.O_RDONLY)
     try:

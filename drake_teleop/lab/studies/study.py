@@ -42,11 +42,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationWork:
-    """One run of the station.
+    """Function that executes one run of the station for a study.
 
     Args:
         data: content of the base scenario's file.
         where: name of that file, for messages.
+        measures: names of the measures.
         threshold: force [N] of time_above_force_s.
     """
 
@@ -56,12 +57,12 @@ class StationWork:
     threshold: float
 
     def scenario(self, values: Values, seed: int) -> Scenario:
-        """Return the scenario of one run."""
+        """Return the scenario of one run from the factors' values and the seed."""
         changes = values | {"simulation.seed": seed}
         return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
     def __call__(self, values: Values, seed: int) -> dict[str, float]:
-        """Return the measures of one run, and the time of one-time work [s]."""
+        """Return the measures of one run, and `ONE_TIME_COST` [s]."""
         scenario, start = self.scenario(values, seed), time.monotonic()
         run = run_scenario(scenario, progress=False)
         simulated = scenario.simulation.settle + float(run.result.t[-1])
@@ -87,13 +88,14 @@ def study_command(
         path: study file, or the name of a shipped study.
         jobs: number of processes; -1: one for each core.
         cluster: address of a Dask scheduler, or "local".
+        quiet: True hides progress bars and tables.
+        progress: False hides the progress bars.
         repeats: replaces the value of the file.
-        progress: False: no progress bars; `quiet`: no tables either.
-        yes: True permits more than 1e5 runs; or a function that answers.
+        yes: True permits more than 1e5 runs; or a function that asks the user for permission.
 
     Raises:
         DrakeTeleopError: for a wrong file, too many runs, another study's folder, or missing Dask.
-        KeyboardInterrupt: with the number of stored runs.
+        KeyboardInterrupt: its message contains the number of stored runs.
     """
     study, path = LoadStudy(path), study_file(path)
     study.repeats = repeats or study.repeats
@@ -116,7 +118,7 @@ def study_command(
 
 
 def study_file(name_or_path: str | Path) -> Path:
-    """Return the file of a shipped study, or the path itself.
+    """Return the file of a shipped study, or the given path.
 
     Raises:
         DrakeTeleopError: if neither exists.
@@ -136,10 +138,10 @@ def study_file(name_or_path: str | Path) -> Path:
 
 
 def LoadStudy(path: str | Path) -> Study:
-    """Load and check a study file, except its factors.
+    """Load a study file and check everything that does not depend on the scenario.
 
     Raises:
-        DrakeTeleopError: with file and field.
+        DrakeTeleopError: if the file is invalid; the message contains file and field.
     """
     path = study_file(path)
     data = read_yaml(path)
@@ -155,7 +157,6 @@ def _scenario_path(study: Study, path: Path) -> str | Path:
 
 
 def _check_values(factor: Factor, where: str) -> None:
-    """Check each value alone; combinations are checked in the runs."""
     ranged = factor.low is not None and factor.high is not None
     for value in (factor.low, factor.high) if ranged else factor.listed():
         data = _with_changes({}, {factor.field: value})
