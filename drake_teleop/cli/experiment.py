@@ -52,7 +52,7 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return the participant's number: `wanted`, the first with trials left, or a new one."""
+    """Return the requested participant's number, the first with trials left, or a new one."""
     if wanted is not None:
         return wanted
     known = store.participants()

@@ -256,8 +256,8 @@ def can_oscillate(
     """Return booleans: True where some hand and environment of the ranges can oscillate (T57).
 
     If no pair can at any frequency, either all pairs are stable or none is (zero exclusion): check
-    one pair. Behind an ideal servo this holds if the displayed tool mass is less than that of hand
-    and device. The frequencies must be dense.
+    one pair. Behind an ideal servo this conclusion holds if the displayed tool mass is less
+    than that of hand and device. The frequencies must be dense.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]

@@ -132,14 +132,14 @@ class OneDofRun:
 
 @dataclass(frozen=True)
 class Figures:
-    """Measures of a run."""
+    """Measures of one run of the task."""
 
     #: True: at rest in hold and end, within 0.5 mm about a parabola, also at a rotating tool's tip.
     stable: bool
     hunting: float  #: largest peak-to-peak motion in hold and end [m]
     turning: float  #: largest peak-to-peak rotation in hold and end [rad]
     felt_force: float  #: mean force on the hand in the hold [N]
-    chatter: float  #: standard deviation of this force [N]
+    chatter: float  #: standard deviation of the force on the hand in the hold [N]
     force_error: float  #: relative error of felt_force to the scaled contact force
     drift: float  #: slave minus master, 2 s after contact [m]
     free_force: float  #: rms force on the hand in free motion [N]
