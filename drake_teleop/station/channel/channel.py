@@ -59,7 +59,7 @@ _TIMEOUT_FACTOR = 1.5  # default timeout over the longest silence of a minute
 @settings
 @dataclass
 class Channel(NetworkConfig):
-    """Network between master and slave: a preset, or the fields below for `custom`."""
+    """Network between master and slave: a preset, or `custom` with the fields of this block."""
 
     network: str = choice(
         "custom", _NETWORKS, "a preset, or custom for the network of these fields"
@@ -356,7 +356,7 @@ class TeleopChannel(LeafSystem):
         force_scale: scale of force, slave to master.
         start: (7,) pose X_WS of the slave at the start.
         period: time between packets [s].
-        seed: of the network's random numbers.
+        seed: seed of the random numbers.
     """
 
     __slots__ = ONE_DICT

@@ -219,7 +219,7 @@ def _uniform(p, k, draw):
 
 @njit(cache=True)
 def _delay_steps(p, k, draw):
-    """Return the delay of packet k [steps], -1 if the trace lost it; use draws `draw` to + 2."""
+    """Return the delay of packet k [steps], -1 if the trace lost it; use three random numbers."""
     if p.shape[0] > _TRACE:
         steps = p[_TRACE + k % (p.shape[0] - _TRACE)]
         return int(max(steps, p[_MIN_DELAY])) if steps >= 0.0 else -1
@@ -325,7 +325,7 @@ def receive(p, state, k, packet):
 
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
-    """Apply the policy `NetworkConfig.silence` to a packet, `silent` seconds after it."""
+    """Apply the policy `NetworkConfig.silence` to the last packet, `silent` seconds after it."""
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0

@@ -136,7 +136,7 @@ def component_along(a, b, p):
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work over a displacement [J]; for a unit wrench its component along it [m]."""
+    """Return the work of a wrench [J]; for a unit wrench, the displacement along it [m]."""
     return dot(wrench, displacement, 0) + dot(wrench, displacement, 1)
 
 
@@ -254,7 +254,6 @@ def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, 
 
 @njit(cache=True)
 def _servo_lag(p):
-    """Return the servo's delay [s]."""
     return 2.0 * math.sqrt(p[MASS][0] / p[STIFFNESS][0])
 
 

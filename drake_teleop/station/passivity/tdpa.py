@@ -213,7 +213,7 @@ def _send_surplus(g, p, memory):
 
 @njit(cache=True)
 def _account_for_work(g, drained, p, memory):
-    """Subtract work on the hand from ledger and kept energy, or keep and send its input."""
+    """Subtract work on the hand from ledger and kept energy, or keep and send work by it."""
     ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)

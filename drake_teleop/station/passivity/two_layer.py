@@ -1,11 +1,12 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
 Each end has an energy tank, which must cover the energy that the wrench can use until the next
-step. At the slave this is the wrench of its motors. The tanks are never overdrawn if hand and walls
+step. At the slave this is the motors' wrench. The tanks are never overdrawn if hand and walls
 accelerate less than `acceleration` and if servo and mass are configured correctly.
 
-Only braking uses the slave's reserve: otherwise a slave slower than `acceleration` times period
-would coast with an empty tank. A damper on the hand fills the master's tank up to `level`.
+Only braking uses the last 1 % of the slave's tank: otherwise a slave slower than `acceleration`
+times period would coast with an empty tank. A damper on the hand fills the master's tank up to
+`level`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -193,12 +193,12 @@ class WristSensorConfig:
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
 
     def latencies(self, period: float) -> NDArray[np.int64]:
-        """Return (3,) latencies of force, acceleration and encoders, in whole samples."""
+        """Return the latencies (3,) of force, acceleration and encoders, in whole samples."""
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
     def delays(self, period: float) -> NDArray[np.float64]:
-        """Return (3,) delays of force, acceleration and encoder readings [s].
+        """Return the delays (3,) of force, acceleration and encoder readings [s].
 
         A delay is the latency; for force and acceleration plus the low-pass's group delay at zero
         frequency.
