@@ -528,7 +528,7 @@ def _readings() -> list[Reading]:
 
 
 def _reading_packets(_: Path) -> list[bytes]:
-    return [b"".join(map(udp.packed, _readings()))]
+    return [b"".join(map(udp.pack_reading, _readings()))]
 
 
 def _reading_lines(_: Path) -> list[bytes]:
