@@ -241,7 +241,7 @@ DATA = st.recursive(
 
 @given(DATA)
 def test_written_yaml_is_read_back(data) -> None:
-    """By this package and by YAML 1.1, which has other words for numbers and flags."""
+    """Read the text with this package and with YAML 1.1, whose numbers and booleans differ."""
     text = yaml_text(data, head=["a\nb: 1"])
     assert yaml_data(text, "text") == data
     assert yaml.safe_load(text) == data

@@ -7,6 +7,7 @@ clock is set, a new segment of the record starts; the longest segment is written
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -35,7 +36,7 @@ _CLOCK_SAMPLES = 50  # successive samples that confirm another clock
 _T = TypeVar("_T")
 
 
-class Records(Generic[_T]):
+class Records(ABC, Generic[_T]):
     """Recorder of samples.
 
     Attributes:
@@ -81,13 +82,13 @@ class Records(Generic[_T]):
         """Length of the record [s]."""
         return _seconds(self._longest_part())
 
+    @abstractmethod
     def take(self, sample: _T) -> None:
         """Add a sample if it is valid."""
-        raise NotImplementedError
 
+    @abstractmethod
     def write(self, path: Path) -> None:
         """Write the log; raise DrakeTeleopError if there are too few samples."""
-        raise NotImplementedError
 
 
 class Recorder(Records[Reading]):

@@ -59,13 +59,12 @@ from drake_teleop.station.passivity.packet import (
 
 # Share of the hand's input kept until the reserve is full; all of it would starve a soft wall.
 _KEPT_SHARE = 0.5
-_ONSET_S = (
-    0.1  # s, onset and end of a wrench that needs no delay filter: slower than hand and servo
-)
+# Onset and end of a wrench that needs no delay filter: slower than hand and servo [s].
+_ONSET_S = 0.1
 _END_SHARE = 0.1  # a wrench below this share of the filtered one ends
 _ONSET_COMPLETE = 0.98  # share at which a quick onset is complete
-# By group: travel over which the contact stiffness is averaged [m, rad]; speed below which the drag
-# fades [m/s, rad/s].
+# Travel over which the contact stiffness is averaged [m, rad], and speed below which the drag fades
+# [m/s, rad/s], for translation and rotation.
 _STIFFNESS_TRAVEL = (1e-3, 1e-2)
 _DRAG_SPEED = (0.02, 0.2)
 
