@@ -28,6 +28,7 @@ def print_identification(summary: dict[str, Any], out: Path) -> None:
         rows = [(f"object: {row[0]}", *row[1:]) for row in _load_rows(summary["object"])]
         _add_rows(table, rows, summary["object"]["identifiable"])
     figures = (
+        "com from, and inertia about, the origin So of the sensor frame S\n"
         f"residual {summary['residual_rms_force']:.4g} N rms of |F|,"
         f" {summary['residual_rms_torque']:.4g} N m rms of |tau|,"
         f" condition number {summary['condition_number']:.3g}, {summary['samples']} samples"
@@ -104,7 +105,7 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
     from rich.table import Table
 
     table = Table(title=f"Contact in {Path(summary['log']).name}", title_justify="left")
-    for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "pushed along"):
+    for heading in ("from [s]", "to [s]", "|F| [N]", "|tau| [N m]", "direction in S"):
         table.add_column(escape(heading), justify="right")
     for c in summary["contacts"]:
         push = "" if c["push"] is None else " ".join(f"{x:+.2f}" for x in c["push"])
@@ -116,14 +117,14 @@ def print_detection(summary: dict[str, Any], out: Path) -> None:
         table.add_row("none", *[""] * 4)
     said = {"raw": "measured", "gravity_only": "without the weight", "eliminated": "contact"}
     shares = ", ".join(
-        f"{said[name]} {100 * share:.2g} %"
+        f"{said[name]} {100 * share:.3g} %"
         for name, share in summary["above_force_threshold"].items()
         if share is not None
     )
     figures = (
         f"above the threshold ({summary['statistic']} {summary['threshold']:.3g})"
-        f" {100 * summary['above_threshold']:.2g} % of the time, in contact"
-        f" {100 * summary['in_contact']:.2g} %\n"
+        f" {100 * summary['above_threshold']:.3g} % of the time, in contact"
+        f" {100 * summary['in_contact']:.3g} %\n"
         f"|F| above {summary['force_threshold']:.3g} N, of the time: {shares}"
     )
     print_results(table, figures, summary, out)

@@ -149,7 +149,7 @@ def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
             label = "Diagram, simulated"
             grid[0, 0].loglog(measured["frequency_Hz"], np.abs(felt), label=label, **dots)
             grid[1, 0].semilogx(measured["frequency_Hz"], _degrees(felt), **dots)
-        grid[0, 0].set_ylabel("|Z| felt [N s/m]")
+        grid[0, 0].set_ylabel("|Z| displayed [N s/m]")
         grid[1, 0].set_ylabel("phase [deg]")
         grid[0, 0].legend()
     return figure
@@ -173,7 +173,7 @@ def draw_nyquist(curves: Curves) -> Figure:
             axes.set_xlabel("real part")
             axes.set_aspect("equal", adjustable=adjusted)
         whole.set_ylabel("imaginary part")
-        whole.set_title(f"Loop at the felt force, wall of {curves.wall[0] / 1e3:.3g} kN/m")
+        whole.set_title(f"Loop at the displayed force, wall of {curves.wall[0] / 1e3:.3g} kN/m")
         near.set_title("around -1")
         whole.legend(title="grip")
     return figure
@@ -226,7 +226,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
         left.loglog(hertz, np.abs(width.rigid), color=COLOURS[0], label="rigid environment")
         left.loglog(hertz, np.abs(width.free), color=COLOURS[2], label="free motion")
         left.set_xlabel("frequency [Hz]")
-        left.set_ylabel("|Z| felt [N s/m]")
+        left.set_ylabel("|Z| displayed [N s/m]")
         left.set_title("Transmitted through the station")
         left.legend()
         shown = {
@@ -259,7 +259,7 @@ def draw_maps(curves: Curves, grip: str) -> Figure:
             legend.plot([], [], color=colour, label=f"limit of stability, {name} grip")
         legend.fill_between([], [], color=GREY, alpha=0.25, label=f"unstable with the {grip} grip")
         legend.legend(loc="upper left", fontsize=9)
-        figure.colorbar(mesh, ax=legend, location="bottom", label="error of the felt force")
+        figure.colorbar(mesh, ax=legend, location="bottom", label="error of the displayed force")
     return figure
 
 

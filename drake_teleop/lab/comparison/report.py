@@ -86,7 +86,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
             x, y = networks.index(network), methods.index(method)
             mark, colour, text_colour = VERDICTS[cell.verdict]
             axes.add_patch(Rectangle((x - 0.48, y - 0.46), 0.96, 0.92, color=colour, linewidth=0))
-            lines = [f"feels {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
+            lines = [f"displays {felt:.1f} of {pressed:.1f} N" for felt, pressed in cell.forces]
             lines += cell.unrest
             offset = 0.12 * len(lines)
             axes.text(
@@ -121,12 +121,12 @@ def draw_hands(summary: Mapping[str, Any]) -> Figure:
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
         (
-            f"felt of taps at {TAP_RATES[0]:g} Hz [%]",
+            f"displayed share of taps at {TAP_RATES[0]:g} Hz [%]",
             "linear",
             lambda row: 100 * row["tap_shares"][0],
         ),
         (
-            f"felt of taps at {TAP_RATES[1]:g} Hz [%]",
+            f"displayed share of taps at {TAP_RATES[1]:g} Hz [%]",
             "linear",
             lambda row: 100 * row["tap_shares"][1],
         ),
