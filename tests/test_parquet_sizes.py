@@ -125,8 +125,15 @@ for place in range(len(good)):
 
 @pytest.mark.long
 @pytest.mark.slow
-@pytest.mark.parametrize("bits", [1, 0x80, 0xFF])
-@pytest.mark.parametrize("options", [{}, {"row_group_size": 8, "compression": "uncompressed"}])
+@pytest.mark.parametrize(
+    ("bits", "options"),
+    [
+        (1, {}),
+        (0x80, {}),
+        (0xFF, {}),
+        (1, {"row_group_size": 8, "compression": "uncompressed"}),
+    ],
+)
 def test_no_damaged_byte_ends_the_process(tmp_path: Path, bits: int, options: dict) -> None:
     """The lowest bit of a number is its sign."""
     path = tmp_path / "x.parquet"
