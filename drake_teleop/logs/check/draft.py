@@ -66,8 +66,6 @@ _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {r
 
 
 class _Columns(NamedTuple):
-    """Columns of one quantity, and the unit in their names ("" for none)."""
-
     columns: list[str]
     unit: str
 
@@ -76,12 +74,9 @@ _NOTHING = _Columns([], "")
 
 
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
-    """Return a log description (YAML) guessed from names and magnitudes of a table's columns.
+    """Return a draft of a log description (YAML), guessed from names and magnitudes of columns.
 
-    Args:
-        table: any table.
-        folder: folder of the draft; the path to the table is relative to it.
-        header: whether the file contains column names.
+    `folder` is that of the draft, to which the path to the table is relative.
     """
     plain = {name: _normalized(name) for name in table.columns}
     found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)

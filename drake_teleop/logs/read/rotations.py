@@ -13,9 +13,9 @@ WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vec
 
 
 def rotation_matrices(columns: Array, form: str) -> Array:
-    """Return rotation matrices (N, 3, 3) from columns (N, WIDTHS[form]), without normalization.
+    """Return rotation matrices (N, 3, 3) from columns (N, 3, 4 or 9) of a `form`, not normalized.
 
-    Matrices are row-major, rotation vectors in [rad].
+    Matrices are row-major, rotation vectors in [rad]; see `WIDTHS` for the forms.
     """
     if form == "matrix":
         return columns.reshape(-1, 3, 3)
@@ -31,7 +31,7 @@ def rotation_error(R: Array) -> Array:
 
 
 def nearest_rotation(R: Array) -> Array:
-    """Return the rotations closest to near-rotations (..., 3, 3)."""
+    """Return the rotation closest to each near-rotation (..., 3, 3)."""
     # Newton-Schulz iteration for the polar factor; 4 steps reduce an error of 0.3 below 1e-15.
     for _ in range(4):
         R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
