@@ -1,4 +1,4 @@
-"""The haptic device as a block that advances its dynamics once per period."""
+"""The haptic device as a Drake block that advances its dynamics once per period."""
 
 from __future__ import annotations
 
@@ -21,11 +21,7 @@ _MAX_FRICTION_STEP = 2.0
 
 @njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
-    """Advance the device by one `step`, then update pose and twist, in one compiled call.
-
-    Write joint positions and the force display's memory, `drive[6:]`, into `display` (27,). With
-    invalid forces the device does not move.
-    """
+    """Advance the device by one `step` and update pose, twist and `display`, in one compiled call."""
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
         step(state, hand_wrench, drive[:6], device, period, work, stages)
@@ -37,7 +33,7 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Check that one step per period [s] is stable for the device at the joint positions q.
+    """Check that the device is stable with one step per period [s] at the joint positions q.
 
     Raises:
         DrakeTeleopError: if the period is too long for haptic devices or for the friction.
@@ -63,8 +59,8 @@ def check_period(
 class MasterDevice(LeafSystem):
     """Haptic device with the hand's passive mass, advanced once per period.
 
-    Each period is one classical Runge-Kutta step of the nonlinear dynamics (gravity, Coriolis,
-    friction, stiff damped end stops) with held inputs.
+    Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs. B is
+    the device's base frame, E the stylus frame.
 
     .. pydrake_system::
 
@@ -133,10 +129,9 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Add and connect the blocks "master_device" and "force_display" of a device or leader arm.
+    """Add, connect and return the blocks "master_device" and "force_display" of a haptic device.
 
-    Returns:
-        Both blocks; the hand's wrench and the command remain to be connected.
+    Arguments as for `MasterDevice`. The caller connects the hand's wrench and the wrench to render.
     """
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):

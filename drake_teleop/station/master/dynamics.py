@@ -1,6 +1,7 @@
-"""Dynamics of a haptic device: the Phantom, or a device in task space.
+"""Compiled dynamics of a haptic device: the Phantom, or a device in task space.
 
-`numbers.IN_TASK_SPACE` selects the model in compiled code; `HapticDevice` is the Python interface.
+The parameters `device` (NUMBERS,) select the model. B is the device's base frame, E the stylus
+frame.
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ def step(state, hand_wrench, motor, device, period, work, stages):
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
         motor: (6,) motor torques (or forces) at the joints.
         device: (NUMBERS,) device parameters, see `numbers`.
+        period: length of the step [s].
         work, stages: (2, 6, 6) and (3, 12) scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
@@ -113,6 +115,8 @@ class DisplayDevice:
 class HapticDevice(DisplayDevice):
     """Haptic device (Phantom or in task space) with the hand's passive mass.
 
+    Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus frame.
+
     Attributes:
         numbers: (NUMBERS,) device parameters, see `numbers`.
         name: device name for messages.
@@ -129,12 +133,12 @@ class HapticDevice(DisplayDevice):
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the axes (6,) for the force display: the joint positions q (6,) unchanged."""
+        """Return the positions (6,) for the force display: q (6,) itself."""
         return q
 
     @property
     def is_phantom(self) -> bool:
-        """True for the Phantom's kinematics, False for those of `task_space`."""
+        """True for the Phantom, False for a device in task space."""
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -177,9 +181,9 @@ class HapticDevice(DisplayDevice):
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """Return the damping matrix D (6, 6), joint forces -D dq/dt, at the joint positions q (6,).
+        """Return the damping matrix D (6, 6) at q (6,): the joint forces are -D dq/dt.
 
-        `creeping` adds the slope of Coulomb friction at standstill.
+        With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
             slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED

@@ -1,4 +1,4 @@
-"""Leader arm from a model file, in the file formats of the slave's arm."""
+"""Leader arm, which the operator holds as a haptic device, from a model file."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -77,7 +77,7 @@ class Leader:
         """Check the fields without reading the model file.
 
         Raises:
-            DrakeTeleopError: with `where` and the field.
+            DrakeTeleopError: with the path `where` of this block and the field.
         """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
@@ -101,7 +101,7 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Add the leader to a plant, with its base at the origin of B; X_Table is the pose of B.
+        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world.
 
         Raises:
             DrakeTeleopError: if the model cannot be read, see `ParseModel`.
@@ -112,7 +112,9 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """Return the leader with the hand's mass added; at home E is at p_BE = `position` (3,) [m].
+        """Return the arm's dynamics with the hand's mass and inertia about E [kg, kg m^2].
+
+        At home E is at p_BE = `position` (3,) [m].
 
         Raises:
             DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
