@@ -1,8 +1,7 @@
 """Contact detection at the slave from the wrench without the load's part.
 
-The flag is displayed to the operator. `drake_teleop.load.contact` describes the statistic. Noise
-floor and threshold come from an earlier identification: free motion of the same load with the same
-sensor.
+`drake_teleop.load.contact` describes the statistic. Noise floor and threshold come from an
+identification: free motion of the same load with the same sensor.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -127,6 +127,7 @@ _OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "ra
 # | virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
 #
 # Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate.
+
 #: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
     "geomagic_touch": _data_sheet(

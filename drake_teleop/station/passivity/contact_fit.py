@@ -15,7 +15,7 @@ _RIDGE = 0.05
 
 @njit(cache=True)
 def update_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one piece of displacement to the fit; return stiffness [N/m] and damping [N s/m], both >= 0.
+    """Add one piece of displacement to the fit; return stiffness [N/m] and damping [N s/m].
 
     Args:
         sums: (NUM_SUMS,) products of displacement, speed change and force change; updated.
@@ -43,8 +43,8 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
 def smooth_slip(displayed, component, explained, share, max_slip):
     """Return the force to render along the contact's mean direction [N], without steps by slips.
 
-    A slip changes this component of the contact wrench w by up to f^2 / |w|, with the friction f. Up
-    to this size, changes that depth and speed do not explain are rendered gradually.
+    A slip changes this component of the contact wrench w by up to f^2 / |w|, with the friction f.
+    Up to this size, changes that depth and speed do not explain are rendered gradually.
 
     Args:
         displayed: result of the last step [N].

@@ -114,7 +114,7 @@ def difference_into(a, b, e):
 
 @njit(cache=True)
 def moved_into(pose, e, out):
-    """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,); it may be `pose`."""
+    """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
     turn = exponential((e[3], e[4], e[5]))
     q = normalized(multiply(turn, (pose[0], pose[1], pose[2], pose[3])))
     for i in range(4):
