@@ -1,7 +1,6 @@
-"""Sheet spring of the paper's Fig. 5: a clamped-free leaf that the ball tip hits.
+"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits.
 
-The first bending mode is one degree of freedom (Euler-Bernoulli stiffness, Rayleigh mass). Contact
-of ball and leaf is Drake's compliant point contact.
+The first bending mode is one degree of freedom. Contact is Drake's compliant point contact.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -1,7 +1,6 @@
 """Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home).
 
-Both arms have the same joints in the same order. The wrench is rendered through the leader's
-Jacobian.
+The leader arm, which the operator holds, has the same joints in the same order.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ Array = NDArray[np.float64]
 
 
 class JointCoupling(LeafSystem):
-    """Coupling of the slave's joint positions to those of the leader, with a clutch.
+    """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the commanded joints are constant. When it closes they are the leader's
-    again; `JointFollower` limits the speed.
+    While the clutch is open the commanded joints are constant. When it closes they follow the
+    leader again, at the full difference; `JointFollower` limits the speed.
 
     .. pydrake_system::
 

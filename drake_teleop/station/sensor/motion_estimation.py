@@ -361,7 +361,7 @@ def _differentiate(constants, joints, angles):
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    """Convert the accelerometer's reading in `sample` to s, omega and alpha; `motion` is overwritten."""
+    """Convert the accelerometer's reading in `sample` to s, omega and alpha; overwrite `motion`."""
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     R_SA, R = nine(constants, _ORIENTATION), motion[12:21]
