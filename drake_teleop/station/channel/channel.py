@@ -1,8 +1,7 @@
-"""Channel between master and slave: a network, both of its ends, and their block (long: one step).
+"""Channel between master and slave: a network, and a passivity method at both ends.
 
-In every period both ends run one step of the passivity method (`station.passivity`). Their packets
-pass one line of the network (`network`) in each direction. The step works in world axes and in the
-master's power units, see `passivity.methods`.
+In every period both ends run one step of the method (`station.passivity`). Their packets pass one
+line of the network in each direction.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -80,7 +79,8 @@ class Channel(NetworkConfig):
         """Return the networks of both directions: forward (master to slave) and backward.
 
         Raises:
-            DrakeTeleopError: if a preset is combined with other fields.
+            DrakeTeleopError: if a preset is combined with other fields; `where` is the path of this
+                block.
         """
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
@@ -95,7 +95,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def silent_after(self, period: float) -> float:
-        """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
+        """Return the silence [s] that starts the safe state, if a packet is sent every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -138,7 +138,7 @@ _NO_LOAD = np.zeros(6)
 def initial_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state of both ends before their first step.
+    """Return the state vector of both ends before their first step.
 
     Args:
         method: one of `METHODS`.
@@ -274,15 +274,9 @@ def channel_step(
 
 @njit(cache=True)
 def _increment_into(pose, before, dx):
-    """Write the pose increment since the last step; 0 if one of both poses is not finite.
+    """Write the increment `dx` (6,) since the last pose; return whether `pose` (7,) is finite.
 
-    Args:
-        pose: (7,) present pose.
-        before: (8,) last finite pose; 1 if the last pose was not finite. Updated.
-        dx: (6,) written: increment.
-
-    Returns:
-        True if the pose is finite.
+    `before` (8,) is the last finite pose, and 1 if the last pose was not finite; updated.
     """
     valid = sound(pose)
     if valid:
@@ -308,7 +302,6 @@ def _to_world(wrench_B, frame, out):
 
 @njit(cache=True)
 def _to_master(wrench, frame, out):
-    """Convert a wrench to the hand, the inverse of `_to_world`."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -319,15 +312,12 @@ def _to_master(wrench, frame, out):
 
 
 class TeleopChannel(LeafSystem):
-    """Network with a passivity method at both ends.
+    """Network with a passivity method at both ends; a packet takes at least one period.
 
-    A packet takes at least one period. Both ends have a safe state, see
-    `drake_teleop.station.passivity.safe_state`. The last valid wrench is used while the wrist
-    sensor is saturated.
-
-    The rendered wrench depends on the inputs without delay, so that wrench times increment of the
-    command is the work at the device. This is exact for translation, and for rotation with scale 1.
-    The output is valid only at the instants of the period.
+    Both ends have a safe state, see `station.passivity.safe_state`. The last valid wrench is used
+    while the wrist sensor is saturated. The rendered wrench depends on the inputs without delay, so
+    that wrench times increment of the command is the work at the device. The output is valid only
+    at the instants of the period.
 
     .. pydrake_system::
 
@@ -447,8 +437,8 @@ class TeleopChannel(LeafSystem):
             context: context of this block.
             command: (7,) present command X_WS of the slave; the master's command must be equal.
             slave: (7,) actual pose X_WS of the slave.
-            fills: time with open clutch [s]. During it the slave of `wave` keeps its command and
-                reflects the present wrench.
+            fills: time with open clutch [s]. During it the slave of method `wave` keeps its command
+                and reflects the present wrench.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills
@@ -482,7 +472,6 @@ class TeleopChannel(LeafSystem):
         )
 
     def _step_result(self, context: Context) -> list[NDArray[np.float64]]:
-        """Return the state after the step, and the values received at the master."""
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

@@ -1,8 +1,7 @@
-"""The operator: intended path of the hand, followed through the hand's impedance.
+"""The simulated operator: intended path of the hand, followed through the hand's impedance.
 
-The hand pulls the stylus towards the intended pose and yields to forces. Its passive mass is part
-of the device. With a task the operator is closed-loop: delayed vision and force perception
-determine its movements (`decision.py`, `perception.py`), which add to the intent's segments.
+With a task, delayed vision and force perception determine movements (`decision`, `perception`) in
+addition to the configured path.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -39,11 +38,7 @@ _MAX_TORQUE_NM = 2.0  # N m, estimate
 
 @dataclass(frozen=True)
 class HandImpedance:
-    """Impedance between intended and actual pose of the hand; all values are estimates.
-
-    Translational values are common in the haptics literature. The radius of gyration is 30 mm; the
-    rotational damping ratio is about 0.7.
-    """
+    """Impedance between intended and actual pose of the hand; all values are estimates."""
 
     mass: float  # kg, passive mass that moves with the stylus
     damping: float  # N s/m
@@ -108,12 +103,12 @@ class OperatorConfig:
 
     @property
     def hand(self) -> HandImpedance:
-        """Impedance of the hand."""
+        """Impedance of the hand for the configured grip."""
         return GRIPS[self.grip]
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
-    """Return the segments of the intent as an array (n, 12) for compiled functions.
+    """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
     (3), rotation (3). A minimum-jerk move has no ramp out and the factor sin(pi / 2).
@@ -134,7 +129,6 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _ramp(time, length):
-    """Return the minimum-jerk ramp from 0 at time 0 to 1 at `length` [s], and its rate."""
     u = time / length
     if u <= 0.0:
         return 0.0, 0.0
@@ -145,7 +139,7 @@ def _ramp(time, length):
 
 @njit(cache=True)
 def intent_into(packed, start, t, pose, twist):
-    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) at time t [s].
+    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
     `packed` (n, 12) is from `pack_intent`, `start` (7,) is X_BE before the first segment.
     Translations add; rotations apply in the order of the list, each about axes of B.
@@ -177,7 +171,12 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion; return True if pose and twist (6,) are valid."""
+    """Write a pose (7,) with unit quaternion into `out`.
+
+    Returns:
+        True if pose and twist (6,) are finite and the quaternion is not zero; else `out` is
+            unchanged.
+    """
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -206,7 +205,7 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
 
     f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector (in B) of the
-    shorter rotation. Both are limited to the strength of a hand.
+    shorter rotation. Both are limited to the strength of a hand, 60 N and 2 N m.
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
@@ -254,13 +253,11 @@ def _look_feel_decide(
 
     Args:
         task, person, senses: from `pack_task`, `pack_person`, `Perception.parameters`.
-        arm: `ArmModel.table` of the slave.
         tip: (6,) position of the tool's tip in S, and at the start in W [m].
         hand_wrench, twist: (6,) wrench of the hand on the stylus, twist of the stylus, in B.
         slave_q: (n,) joint positions of the slave [rad].
-        task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
-        sights: (m, 3) ring buffer of delayed vision; updated.
-        touches: (n, 5) ring buffer of delayed force perception; updated.
+        sights, touches: (m, 3), (n, 5) ring buffers of delayed vision and force perception;
+            updated.
     """
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -286,7 +283,7 @@ def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64
 
 
 class Operator(LeafSystem):
-    """Operator that moves the stylus towards the intended pose and perceives contact.
+    """Simulated operator: moves the stylus towards the intended pose and perceives contact.
 
     .. pydrake_system::
 

@@ -109,7 +109,7 @@ def check_task(task: Task, where: str) -> None:
     """Check that the target is farther from the tool's start than its tolerance or standoff.
 
     Raises:
-        DrakeTeleopError: with `where` and the field.
+        DrakeTeleopError: with the path `where` of the block and the field.
     """
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:
