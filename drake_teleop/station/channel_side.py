@@ -87,10 +87,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
 
 
 def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """Return the passivity method with its wrench limited to the largest wrench of the device.
-
-    Otherwise the energy balance would contain a wrench that the device does not display.
-    """
+    """Limit the method's wrench to the device, so that its balance counts displayed wrenches."""
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -128,8 +125,8 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale(scenario: Scenario) -> Array:
     """Return the master's power over the slave's (2,), for translation and rotation.
 
-    This scale is force scale over motion scale. A motion scale of 0 counts as 1, because no power
-    is transmitted then.
+    It is force scale over motion scale. A motion scale of 0 counts as 1, because it transmits no
+    power.
     """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])

@@ -1,10 +1,6 @@
 """3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`.
 
-Forces are arrows of 3 mm per newton, in the slave's scale. Blue at wrist and stylus: force measured
-by the wrist sensor. Orange at tool tip and stylus: calculated contact force.
-
-The scenario of a log is `scenario.yaml` beside `log.parquet` (`run`), or the YAML file with the
-log's name (folder `logs` of `reproduce`).
+Arrows are forces, 3 mm per newton: blue measured by the wrist sensor, orange calculated contact.
 """
 
 from __future__ import annotations
@@ -76,16 +72,14 @@ _OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "she
 def replay_command(
     run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Write the replays of logged runs, and summary.json with their paths.
+    """Write the replays of logged runs, and summary.json with their paths; return the summary.
 
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
         out: output folder: replay.html, or one file per log for several logs.
-        scenario: shipped scenario or YAML file; by default the scenario beside the log.
+        scenario: shipped scenario or YAML file; by default `scenario.yaml` beside the log, or the
+            YAML file with the log's name.
         quiet: print nothing.
-
-    Returns:
-        The summary.
 
     Raises:
         DrakeTeleopError: if there is no log or no scenario.
@@ -108,15 +102,15 @@ def replay_command(
 def write_replay(
     path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float | None = None
 ) -> None:
-    """Write the replay of a run.
+    """Write the replay of a run to an HTML file.
 
     Args:
         path: HTML file.
         result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
             contact_wrench_S, force_to_master and sheet_state.
         scenario: scenario of the run.
-        slow_motion: initial speed: seconds of replay per second of the run; by default the
-            replay lasts at least 6 s.
+        slow_motion: initial speed: seconds of replay per second of the run; by default the replay
+            lasts at least 6 s.
 
     Raises:
         DrakeTeleopError: if required signals are missing.
@@ -286,7 +280,7 @@ class ReplayScene:
             arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body of the surroundings; set its parents before."""
+        """Set the pose (7,) of a moving body; its parents must have theirs."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
@@ -298,10 +292,6 @@ class ReplayScene:
         self.plant.SetPositions(self.context, q)
 
     def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
-        """Return the forces (3,) of the load on the sensor by name, in W.
-
-        The sign is opposite to Eq. (1).
-        """
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
@@ -321,12 +311,9 @@ class ReplayScene:
 
 
 class _Device(NamedTuple):
-    """Haptic device in the plant of a replay.
+    """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    Attributes:
-        hand: frame at the stylus; the hand holds the point `grip` (3,) [m] of this frame.
-        positions: converts joint positions of the device state to those of the plant.
-        folder: folder of converted meshes, kept while shapes are in use.
+    `positions` converts joint positions to those of the plant. `folder` keeps meshes in use.
     """
 
     instance: ModelInstanceIndex

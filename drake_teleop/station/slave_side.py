@@ -148,10 +148,10 @@ def MakeSlaveSide(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build the slave side without master: the joints follow an excitation trajectory (section IV).
+    """Build the slave side without master: its joints follow an excitation trajectory (section IV).
 
-    The arm starts at the trajectory's start; `trajectory` runs once after the settling time.
-    Output ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
+    The arm starts at the trajectory's start; `trajectory` runs once after the settling time. Output
+    ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -261,10 +261,6 @@ def _add_slave_blocks(
 
 
 def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
-    """Return the number of samples of the joint servo per event of the simulation.
-
-    The number is 1 with contact by Drake, other moving bodies, or a position interface.
-    """
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.beyond or contact.plant_size or interface is not None:
         return 1
@@ -272,13 +268,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Reject dry friction that stops a joint within one step [s] (numerical instability).
-
-    A Runge-Kutta step is stable for (slope of friction / inertia) * step up to 2.5.
-
-    Raises:
-        DrakeTeleopError: for such friction at the start pose.
-    """
+    """Reject dry friction that stops a joint within one step [s] (numerical instability)."""
     if not slave.friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)

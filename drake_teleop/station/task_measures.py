@@ -12,8 +12,8 @@ false_notices                number of detected contacts before the first contac
 press_error_N                RMS error of the held force; nan if not held
 ============================ =====================================================================
 
-The interval ends when the operator finishes or gives up, or with the log. A failed task has only
-success, detection_time_s and false_notices; the others are nan. `task_failure` gives the reason.
+The interval ends when the operator finishes or gives up, or with the log. For a failed task all but
+success, detection_time_s and false_notices are nan.
 """
 
 from __future__ import annotations
@@ -151,7 +151,10 @@ def contact_force(result: SimulationResult) -> Array:
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to its detection [s]; nan if either is missing."""
+    """Return the time from the first contact to its detection [s]; nan if either is missing.
+
+    `t`, `touching` and `noticed` are (N,) [s], [1], [1].
+    """
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))

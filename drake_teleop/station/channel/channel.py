@@ -1,7 +1,6 @@
 """Channel between master and slave: a network, and a passivity method at both ends.
 
-In every period both ends run one step of the method (`station.passivity`). Their packets pass one
-line of the network in each direction.
+In every period both ends run one step of the method; their packets pass the network.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -95,7 +94,7 @@ class Channel(NetworkConfig):
         return PRESETS[self.network], PRESETS[self.network]
 
     def silent_after(self, period: float) -> float:
-        """Return the silence [s] that starts the safe state, if a packet is sent every `period` [s]."""
+        """Return the silence [s] that starts the safe state, for a packet every `period` [s]."""
         if self.timeout is not None:
             return self.timeout
         longest = [
@@ -274,10 +273,7 @@ def channel_step(
 
 @njit(cache=True)
 def _increment_into(pose, before, dx):
-    """Write the increment `dx` (6,) since the last pose; return whether `pose` (7,) is finite.
-
-    `before` (8,) is the last finite pose, and 1 if the last pose was not finite; updated.
-    """
+    """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
     valid = sound(pose)
     if valid:
         difference_into(pose, before, dx)
@@ -290,7 +286,6 @@ def _increment_into(pose, before, dx):
 
 @njit(cache=True)
 def _to_world(wrench_B, frame, out):
-    """Convert a wrench at the hand, in B, to W and the master's power units."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):

@@ -1,9 +1,8 @@
 """Simulated network; it returns the newest packet at each step (docs/theory.md, (T26), (T27)).
 
-Packets have independent random delays, rounded to whole steps, so jitter reorders them. For `gamma`
-the delay is (1 - jitter) times the mean plus a gamma distribution of shape 3 (Mukherjee 1992; Chen
-et al., ROBIO 2008). Losses follow a Gilbert-Elliott chain. All random numbers are hashes of (seed,
-direction, step).
+Delays are random and independent, so jitter reorders packets; `gamma`: Mukherjee 1992; Chen et al.,
+ROBIO 2008. Losses follow a Gilbert-Elliott chain. Random numbers are hashes of (seed, direction,
+step).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -234,10 +233,7 @@ def _delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _advance_chain(p, k, bad):
-    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none).
-
-    `bad` is the state one step before: 0 good, 1 bad; before step 0 the probability of bad.
-    """
+    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
         bad = 1.0 if _uniform(p, k, 0) <= likely else 0.0
@@ -320,7 +316,6 @@ def receive(p, state, k, packet):
 
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
-    """Apply the policy `NetworkConfig.silence` to the last packet, `silent` seconds after it."""
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0

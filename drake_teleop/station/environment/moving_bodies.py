@@ -1,7 +1,6 @@
 """Compiled poses of moving bodies from the plant's state, for contact between plant steps.
 
-Revolute, prismatic, free or fixed joints connect the bodies to each other and the world. From
-parent P (joint frame F) to child B (joint frame M), and likewise for velocities:
+From parent P (joint frame F) to child B (joint frame M), and likewise for velocities:
 
     X_WB = X_WP X_PF X_FM(q) X_MB
 """
@@ -158,7 +157,6 @@ def bodies_into(joints, state, out):
 
 @njit(cache=True)
 def _hermite(h, u, a, a_dot, b, b_dot):
-    """Return value and rate of a cubic from a to b at the fraction u of the interval h [s]."""
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))

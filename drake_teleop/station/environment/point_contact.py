@@ -1,7 +1,6 @@
 """Drake's compliant point contact between the tool's spheres and boxes, compiled.
 
-The wrist sensor needs it between the steps of the plant. The law is Drake's for continuous plants
-(Hunt and Crossley 1975; regularised Coulomb friction):
+Normal force f_n and friction f_t (Hunt and Crossley 1975; regularised Coulomb friction) are
 
     f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
 

@@ -1,6 +1,6 @@
 """Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits.
 
-The first bending mode is one degree of freedom. Contact is Drake's compliant point contact.
+The first bending mode is one degree of freedom.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

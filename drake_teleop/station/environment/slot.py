@@ -111,7 +111,6 @@ def _material(slot: Slot) -> ProximityProperties:
 
 
 def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
-    """Return pose in M and shape of each box of the slot, by name."""
     edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
     boxes = {}
     for name, side in (("left", 1.0), ("right", -1.0)):

@@ -1,7 +1,6 @@
 """Solids with Drake's point contact: fixed wall and box, movable block on a table.
 
-Drake's point contact of two boxes is a single point, which cannot carry a box. So the block stands
-on balls in its corners.
+The block stands on balls in its corners, because a contact of two boxes is a single point.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

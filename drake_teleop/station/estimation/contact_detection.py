@@ -1,7 +1,6 @@
 """Contact detection at the slave from the wrench without the load's part.
 
-`drake_teleop.load.contact` describes the statistic. Noise floor and threshold come from an
-identification: free motion of the same load with the same sensor.
+`drake_teleop.load.contact` describes the statistic; the noise floor is from an identification.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -49,10 +48,6 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _update_flag(memory, sample, estimate, arm, settings):
-    """Update the detector with one sample; return whether there is contact.
-
-    An invalid sample or estimate does not change the result.
-    """
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
     contact, acceleration = np.empty(6), np.empty(3)

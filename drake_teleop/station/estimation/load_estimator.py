@@ -1,8 +1,4 @@
-"""Recursive estimator of load and sensor offsets during a run (Fig. 2 of the paper).
-
-With `watch` it freezes a settled load, tracks the offsets, and detects another load
-(`drake_teleop.load.online.watched`).
-"""
+"""Recursive estimator of load and sensor offsets during a run (Fig. 2 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass

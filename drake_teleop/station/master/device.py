@@ -21,7 +21,6 @@ _MAX_FRICTION_STEP = 2.0
 
 @njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
-    """Advance the device by one `step`; update pose, twist and `display`, in one compiled call."""
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
         step(state, hand_wrench, drive[:6], device, period, work, stages)

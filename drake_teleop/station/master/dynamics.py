@@ -1,7 +1,6 @@
 """Compiled dynamics of a haptic device: the Phantom, or a device in task space.
 
-The parameters `device` (NUMBERS,) select the model. B is the device's base frame, E the stylus
-frame.
+B is the device's base frame, E the stylus frame.
 """
 
 from __future__ import annotations

@@ -117,7 +117,6 @@ def display_into(wrench, device, numbers, period, J, drive):
 
 @njit(cache=True)
 def _fade(device, numbers, period, drive):
-    """Fade the displayed wrench out during a fault, and cross-fade to the command afterwards."""
     displayed, last = drive[_DISPLAYED], device[_DISPLAYED]
     limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT

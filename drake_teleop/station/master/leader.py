@@ -2,9 +2,8 @@
 
     M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 
-E is the point of `hand_frame` that the hand holds; its axes equal those of the base frame B at
-home. The operator carries the hand's weight. The force display commands the wrench F in the order
-[f; tau_z, tau_y, tau_x] of `task_space`; this module applies J^T.
+The hand holds the arm at E, whose axes equal those of the base frame B at home. The operator
+carries the hand's weight.
 """
 
 from __future__ import annotations
@@ -89,7 +88,6 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 @njit(cache=True)
 def _pose_and_twist(arm, q, v, pose, twist):
-    """Write X_BE (quaternion sign as before in `pose`) and the twist [v; omega] of E in B."""
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)

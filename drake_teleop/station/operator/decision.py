@@ -1,8 +1,7 @@
 """Decisions of the simulated operator during a task, from vision and perceived force.
 
-The hand moves by planned displacements (submovements, `minimum_jerk`). The next one waits until the
-effect of the last is visible (Ferrell, IEEE Trans. Hum. Factors Electron. 6, 1965).
-`docs/operator.md` contains all assumptions and sources.
+The hand moves by planned displacements, and waits until their effect is visible (Ferrell, IEEE
+Trans. Hum. Factors Electron. 6, 1965). All assumptions and sources: `docs/operator.md`.
 """
 
 from __future__ import annotations
@@ -198,7 +197,6 @@ def _pressed_force(task, person, felt):
 
 @njit(cache=True)
 def _is_met(memory, time, good, still_good):
-    """Return whether an aim is met: since `good` was true, until `still_good` is false."""
     if memory[_MET_SINCE] < 0.0 and good:
         memory[_MET_SINCE] = time
     elif not still_good:
@@ -262,7 +260,6 @@ def decide(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _seen_target(task, person, out):
-    """Write the perceived target (3,), minus the standoff, from the tool's start, in W [m]."""
     depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
@@ -328,7 +325,6 @@ def _approach(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_force(task, person, felt, memory):
-    """Return the perceived contact force against the axis [N], with a random error."""
     error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
     return (1.0 + error) * _pressed_force(task, person, felt)
 

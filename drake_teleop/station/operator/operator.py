@@ -1,8 +1,4 @@
-"""The simulated operator: intended path of the hand, followed through the hand's impedance.
-
-With a task, delayed vision and force perception determine movements (`decision`, `perception`) in
-addition to the configured path.
-"""
+"""The simulated operator: intended path of the hand, followed through the hand's impedance."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
@@ -225,10 +221,7 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 @njit(cache=True)
 def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
-    """Write the intended pose (7,) and twist (6,): the intent's segments plus the task's plan.
-
-    `start` (7,) moves with the twist `moving` (6,). An empty `memory` means no task.
-    """
+    """Write the intended pose (7,) and twist (6,): the intent's segments plus the task's plan."""
     intent_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += moving[k]
@@ -249,16 +242,6 @@ def _look_feel_decide(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
     memory, feelings, sights, touches,
 ):  # fmt: skip
-    """Update perception and decision by one step; inputs are not checked.
-
-    Args:
-        task, person, senses: from `pack_task`, `pack_person`, `Perception.parameters`.
-        tip: (6,) position of the tool's tip in S, and at the start in W [m].
-        hand_wrench, twist: (6,) wrench of the hand on the stylus, twist of the stylus, in B.
-        slave_q: (n,) joint positions of the slave [rad].
-        sights, touches: (m, 3), (n, 5) ring buffers of delayed vision and force perception;
-            updated.
-    """
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
     forward_kinematics(arm, slave_q, R_WS, p_WS)

@@ -4,9 +4,9 @@ The expected force (internal model: Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 
 
     u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
 
-A Kalman filter with random walks estimates m, b, c, u_0 without contact. Contact is detected if |u
-- u_expected| reaches max(absolute threshold, Weber fraction * held |u_expected|); the held value
-decays. See `docs/operator.md`.
+A Kalman filter estimates m, b, c, u_0 without contact. Contact is detected if the excess u -
+u_expected reaches the absolute threshold and the Weber fraction of recent expected forces. See
+`docs/operator.md`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

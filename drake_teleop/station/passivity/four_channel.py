@@ -1,7 +1,6 @@
 """Passivity method "four_channel": Lawrence's architecture with local force feedback.
 
-docs/theory.md, (T39). The slave's controller is its servo: a force F shifts the command by F / K,
-with the servo's stiffness K. There is no energy balance: any delay makes the channel active.
+docs/theory.md, (T39). There is no energy balance: any delay makes the channel active.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

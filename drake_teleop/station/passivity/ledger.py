@@ -1,7 +1,7 @@
 """Passivity method "ledger" with an energy balance at the slave's actual motion: master's end.
 
 docs/theory.md, "The energy ledger", has equations, guarantees, constants, and the steps M1 to M7
-(master) and S1 to S6 (slave, in `ledger_slave`). A ledger is the energy that an end may use.
+(master) and S1 to S6 (slave, in `ledger_slave`).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -216,10 +216,9 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 
 @njit(cache=True)
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
-    """Write the predicted contact wrench (M2, M3) into `wrench` (6,).
+    """Write the predicted contact wrench (M2, M3) into `wrench`.
 
-    `offset_to_slave` (6,), which may be `wrench`, contains the pose of the hand minus the slave's
-    pose without a wall.
+    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose without a wall.
     """
     contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
@@ -319,7 +318,6 @@ def _add_friction(dx, force_ratio, p, memory, wrench):
 
 @njit(cache=True)
 def _cross_fade(g, T, p, memory, wrench):
-    """Bound the change of the wrench after missing packets or a change of contact."""
     last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -335,7 +333,6 @@ def _cross_fade(g, T, p, memory, wrench):
 
 @njit(cache=True)
 def _limit_to_ledger(g, dx, T, p, memory, wrench):
-    """Shorten the wrench to the energy that it may use until the next step (M5)."""
     size, cost = length(wrench, g), 0.0
     if size > 0.0:
         displacement = dot(wrench, memory[OWN_VELOCITY], g) / size * T
@@ -354,11 +351,7 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
-    """Return the share of a wrench against the motion that the master's energy permits, 0 to 1.
-
-    The velocity filter detects a reversal at least one encoder step late: without energy the
-    wrench must not push the hand until then (M5).
-    """
+    """Return the share of a wrench against the motion that the master's energy permits, 0 to 1."""
     if memory[LEDGER][g] >= MARGIN * p[SLAVE_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]

@@ -223,7 +223,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
-    """Update the slave's energy balance and send surplus energy to the master (S1, S2)."""
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
     new = receive(g, received, memory)
@@ -277,7 +276,6 @@ def _max_displayed_stiffness(received, T, p, memory):
 
 @njit(cache=True)
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
-    """Estimate direction, stiffness, damping, rendered share and depth of the contact (S3)."""
     normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
     if not in_contact:
         if memory[IN_CONTACT] > 0.0 and _wall_is_removed(dx, memory):
@@ -353,10 +351,6 @@ def _max_slip_change(wrench, size, T, p, memory):
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    """Compute the velocity of the slave's command (S3, S4).
-
-    `error` (6,) is the difference between received pose and command; it is overwritten.
-    """
     velocity, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
@@ -387,10 +381,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved.
-
-    Later commands continue from there, at most as fast as the slave moves.
-    """
+    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     difference_into(command, pose, motor_wrench)
     for g in range(2):
@@ -412,7 +403,6 @@ def _limit_motor_energy(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _limit_motor_wrench(g, damping, twist, p, memory):
-    """Limit the motors' wrench to the available energy, or brake; return whether it was changed."""
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
@@ -448,7 +438,6 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
 
 @njit(cache=True)
 def _step_servo_model(received, connected, T, p, memory, error):
-    """Advance the servo model (S6) by implicit Euler, which is stable for all K and D."""
     model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:

@@ -1,9 +1,9 @@
 """Passivity methods by name, their parameters, and one step of each end of the channel.
 
-Ports of the bilateral part of the station: at the master the wrench to render and the motion of
-its command (after kinematic scaling, before the channel); at the slave the contact wrench and its
-actual motion. All are in world axes W. Wrenches are in the *master's power units*: wrench times
-motion of the slave's command is the work at the hand, docs/theory.md (T29).
+Ports: at the master the wrench to render and the motion of its command (after kinematic scaling,
+before the channel); at the slave the contact wrench and its actual motion, all in world axes W.
+Wrenches are in the *master's power units*: wrench times motion of the slave's command is the work
+at the hand, docs/theory.md (T29).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

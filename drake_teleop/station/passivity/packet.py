@@ -1,7 +1,6 @@
 """Layout of a packet, (38,) float64, and small vector operations of all passivity methods.
 
-Counters and integrals are cumulative, so lost, late or duplicate packets do no harm. Vectors (6,)
-have two *groups* g of three: 0 is translation, 1 rotation.
+Vectors (6,) have two *groups* g of three: 0 is translation, 1 rotation.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
 A spring pulls each end to a set position, which moves as near to the requested one as the stored
-energy permits. The master sends energy above a ceiling to the slave; the slave discards it.
+energy permits.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -82,10 +82,7 @@ def initialize(p, memory):
 
 @njit(cache=True)
 def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    """Move the set position of group `g` as near to the requested one as the energy permits.
-
-    `before` is its last squared offset. Energy above the ceiling is sent (`shuffle`) or discarded.
-    """
+    """Move the set position of group `g` as near to the requested one as the energy permits."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     stored, required = dot(offset, offset, g), dot(requested, requested, g)
     damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)

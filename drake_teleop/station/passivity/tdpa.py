@@ -1,7 +1,7 @@
 """Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
 
-Passivity is guaranteed at the hand and the slave's *command*. `charged_tdpa` adds a drag on the
-hand that stores energy in free motion (Franken et al. 2011), and a filter of the slave's wrench.
+`charged_tdpa` adds a drag on the hand that stores energy in free motion (Franken et al. 2011), and
+a filter of the slave's wrench.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -171,11 +171,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
-    """Return the share of the wrench that may be rendered in this step.
-
-    The full wrench would use the energy `drained`. The share may use the part `drain` of the energy
-    `stored`, or all of it if the wrench would otherwise drop abruptly.
-    """
+    """Return the share of the wrench that may be rendered within the stored energy."""
     least, size = length(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
     share = min(share, max(drain * stored / drained, least / size))
     return min(share, stored / drained)
@@ -265,7 +261,6 @@ def _filter(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
-    """Return the contact stiffness -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
     size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
         change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
@@ -276,7 +271,6 @@ def _contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _available_energy(memory, g):
-    """Return received energy minus output [J], negative if the servo released too much."""
     return memory[RECEIVED][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
 
 

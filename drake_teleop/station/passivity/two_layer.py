@@ -1,7 +1,7 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end must cover the energy that the wrench can use until the next step. A damper
-on the hand fills the master's tank up to `level`. Only braking uses the last 1 % of the slave's.
+The tank of each end must cover the energy that the wrench can use until the next step. A damper on
+the hand fills the master's tank up to `level`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

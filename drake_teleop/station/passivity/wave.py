@@ -1,9 +1,8 @@
 """Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
 
-An end sends integral and energy of its wave. The receiver outputs the integral through a filter,
-within the received energy (Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So
-jitter, loss and hold create no energy at the hand and the slave's *command*, and cause no drift.
-A damper at the command matches the line's impedance b: free motion then renders the drag b v.
+The receiver outputs the integral of the wave through a filter, within the received energy
+(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
+energy at the hand and the slave's *command*. A damper at the command matches the line.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -139,7 +138,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _limit_change(g, energy, dx, most, held, wrench):
-    """Limit the change of the wrench to `most`, or to more if `energy` requires."""
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
         size += (wrench[i] - held[i]) ** 2
@@ -214,11 +212,7 @@ def _play_rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _fill_line(received, wrench, T, p, memory):
-    """Reflect as a rigid wall while a new channel fills, and prepare the steady state.
-
-    The channel begins with the energy of the contact force f, f^2 / 4 b over a round trip and both
-    filter times.
-    """
+    """Reflect as a rigid wall while a new channel fills, and prepare the steady state."""
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):

@@ -131,10 +131,7 @@ def scales_at(change, time, scales):
 
 @njit(cache=True)
 def _scaled_into(sample, estimate, gripper, scales, out):
-    """Write the scaled wrench F' of one sample; the object is the load without the gripper.
-
-    `estimate` and `gripper` are (16,) [offsets; phi] of load and gripper.
-    """
+    """Write the scaled wrench F' of one sample; the object is the load without the gripper."""
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -176,7 +173,6 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_range, out):
-    """Write a log row: scaled wrench F' with the scales at `time`, contact wrench, fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
     _scaled_into(sample, estimate, gripper, elimination, out[6:12])
     out[12] = fault_of(sample, estimate, time, valid_range)

@@ -1,7 +1,4 @@
-"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home).
-
-The leader arm, which the operator holds, has the same joints in the same order.
-"""
+"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home)."""
 
 from __future__ import annotations
 

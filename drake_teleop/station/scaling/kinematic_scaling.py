@@ -73,7 +73,6 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 @njit(cache=True, borrows=True)
 def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded pose X_WS (7,); `references` is the state of `KinematicScaling`."""
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)

@@ -208,10 +208,7 @@ def estimated_motion_std(
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad].
-
-    Assumption: the n joint axes have random directions.
-    """
+    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad]."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -319,7 +316,6 @@ def estimate_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def _delay_paths(constants, memory, n, reading, sample):
-    """Delay wrench, accelerometer (written in place of s and omega), angles and saturation flag."""
     angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
@@ -361,7 +357,6 @@ def _differentiate(constants, joints, angles):
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    """Convert the accelerometer's reading in `sample` to s, omega and alpha; overwrite `motion`."""
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     R_SA, R = nine(constants, _ORIENTATION), motion[12:21]
@@ -418,13 +413,7 @@ def _rotation_vector_into(before, R, angle):
 
 @njit(cache=True)
 def _update_filters(gains, period, moved, acceleration, kept):
-    """Update the filters of `steady_state` for three axes, with Numerov's mean acceleration.
-
-    Args:
-        moved: (3,) encoder displacement since the last sample; becomes the acceleration correction.
-        acceleration: (3,) present acceleration.
-        kept: (12,) position error, rate half a sample ago, last two accelerations; updated.
-    """
+    """Update the filters of `steady_state` for three axes, with Numerov's mean acceleration."""
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
         rate = kept[3 + i] + period * mean

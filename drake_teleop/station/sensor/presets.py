@@ -18,7 +18,7 @@ def _with_imu(
     torque_noise: float,
     **others: Any,
 ) -> WristSensorConfig:
-    """Return the settings of a force/torque sensor with the IMU of the ATI record.
+    """Return a force/torque sensor with the IMU of the ATI record.
 
     Ranges: `side` for fx, fy and `along` for fz [N], `bending` for tx, ty and `twist` for tz [N m].
     """

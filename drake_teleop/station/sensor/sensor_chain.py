@@ -496,7 +496,6 @@ def _calibrate(constants, truth, out):
 
 @njit(cache=True)
 def _convert(constants, first, end, channels):
-    """Quantise and saturate channels in place; return 1.0 if one of them is saturated, else 0."""
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]

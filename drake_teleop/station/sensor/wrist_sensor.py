@@ -2,10 +2,9 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-Sampling needs no events: position and velocity at each sampling instant are interpolated within an
-integration step, and accelerations follow from the dynamics. Near a shape of `Contact.watched`
-Drake computes the contact wrench (`ContactTwin`). With contact outside the compiled law
-(`Contact.beyond`) each sample is an event at the end of a step.
+Position and velocity at each sampling instant are interpolated within an integration step, and
+accelerations follow from the dynamics. With contact outside the compiled law (`Contact.beyond`)
+each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
