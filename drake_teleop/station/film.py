@@ -91,12 +91,10 @@ class Film:
     """Contents of a 3D replay, except the scene.
 
     Args:
-        title: one line.
         times: (F,) times of the frames, evenly spaced, at least two [s].
         slow_motion: initial speed: seconds of replay per second of `times`.
         readings: numbers beside the replay.
         shaded: intervals of `times` that the curves mark.
-        notes: further lines of text.
         clock: label of the times.
         curves: label of the curves; "{top}" is replaced by the largest value.
     """
@@ -166,14 +164,12 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the replay's frames (F,) [s], and the slow motion.
-
-    There are 50 frames per second of replay, at most 2001.
+    """Return the times of the replay's frames (F,) [s], 50 per second, and the slow motion.
 
     Args:
         start, stop: displayed interval [s].
-        slow_motion: seconds of replay per second; by default the player's lowest speed factor with
-            which the replay lasts 6 s.
+        slow_motion: seconds of replay per second; default: the lowest for which the replay lasts 6
+            s.
     """
     span = stop - start
     if slow_motion is None:

@@ -79,7 +79,6 @@ def replay_command(
         out: output folder: replay.html, or one file per log for several logs.
         scenario: shipped scenario or YAML file; by default `scenario.yaml` beside the log, or the
             YAML file with the log's name.
-        quiet: print nothing.
 
     Raises:
         DrakeTeleopError: if there is no log or no scenario.
@@ -105,10 +104,8 @@ def write_replay(
     """Write the replay of a run to an HTML file.
 
     Args:
-        path: HTML file.
         result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
             contact_wrench_S, force_to_master and sheet_state.
-        scenario: scenario of the run.
         slow_motion: initial speed: seconds of replay per second of the run; by default the replay
             lasts at least 6 s.
 
@@ -207,7 +204,6 @@ class ReplayScene:
 
     Attributes:
         plant: slave, surroundings and haptic device, for shapes and kinematics only.
-        context: the plant's context, with the positions of the sample shown last.
         canvas: receiver of poses and sizes; Meshcat by default.
     """
 

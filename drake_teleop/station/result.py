@@ -51,7 +51,6 @@ class Signal:
         name: name of the signal's port, such as "measured_wrench_S".
         components: name of each of the k components ("f_x", ...).
         units: unit of each component, or one string for all ("1" for dimensionless).
-        description: one line.
 
     Raises:
         DrakeTeleopError: if the numbers of units and components differ.
@@ -220,7 +219,7 @@ class SimulationResult:
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
     def write_parquet(self, path: str | Path) -> None:
-        """Write `to_dataframe` to a file, with names, units and descriptions as metadata.
+        """Write the samples to a file, with names, units and descriptions as metadata.
 
         Equal data give equal bytes.
         """

@@ -155,11 +155,7 @@ class Scenario:
         return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
-        """Check the values of all fields.
-
-        Raises:
-            DrakeTeleopError: with the name `where` of the scenario and the field.
-        """
+        """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
@@ -182,11 +178,7 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Check the type of a scenario and all its values.
-
-    Raises:
-        DrakeTeleopError: for an invalid value, or an object that is not a Scenario.
-    """
+    """Raise a DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"

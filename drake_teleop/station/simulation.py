@@ -41,8 +41,8 @@ def simulate(
         simulation: duration, settling time, integrator and seed.
         progress: True shows a progress bar after one second; or a function of the completed
             fraction.
-        log: folder for the log, which is then written in parts during the run, so that memory does
-            not grow. After Ctrl-C or an error it contains all samples. An old log is replaced.
+        log: folder for a log in parts, written during the run so that memory does not grow. After
+            Ctrl-C or an error it contains all samples. An old log is replaced.
 
     Returns:
         The recorded signals; t = 0 at the end of the settling time. With `log`, signals are read
@@ -122,7 +122,6 @@ class LogOnDisk:
 
     Args:
         folder: folder of the log; an old log is replaced.
-        simulator: simulator of the station.
         start: time that becomes t = 0 [s].
         form: converts the rows to the common form of all parts.
     """

@@ -52,7 +52,7 @@ def MakeSlaveSide(
     load_covariance: Array | None = None,
     noise_floor: NoiseFloor | None = None,
 ) -> Diagram:
-    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
+    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, force scaling.
 
     .. pydrake_system::
 
@@ -73,8 +73,7 @@ def MakeSlaveSide(
           surroundings): signals
         - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
-    Args:
-        scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+    Arguments as for `MakeTeleopStation`.
 
     Raises:
         DrakeTeleopError: for an invalid value, an unreachable start, scales that require a load
@@ -150,8 +149,8 @@ def MakeSlaveSide(
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
     """Build the slave side without master: its joints follow an excitation trajectory (section IV).
 
-    The arm starts at the trajectory's start; `trajectory` runs once after the settling time. Output
-    ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
+    `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
+    that need neither command nor elimination.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)

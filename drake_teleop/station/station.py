@@ -37,7 +37,6 @@ def MakeTeleopStation(
     clutch, intended_pose and intended_twist of the master side may stay unconnected.
 
     Args:
-        scenario: configuration of the station.
         load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an identification.
             Optional if the estimator runs online or sigma = gamma; without an estimate there is no
             `contact_wrench_S`.

@@ -54,11 +54,10 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of the module's table for one run.
+    """Return the measures of a task by name for one run; the module explains them.
 
     Args:
         result: result with the signal task_state.
-        scenario: scenario of the run.
 
     Raises:
         DrakeTeleopError: if the scenario has no task.
@@ -153,7 +152,7 @@ def contact_force(result: SimulationResult) -> Array:
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
     """Return the time from the first contact to its detection [s]; nan if either is missing.
 
-    `t`, `touching` and `noticed` are (N,) [s], [1], [1].
+    All arguments are (N,): times [s], true contact, detected contact.
     """
     if not touching.any():
         return math.nan

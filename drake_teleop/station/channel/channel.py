@@ -78,8 +78,7 @@ class Channel(NetworkConfig):
         """Return the networks of both directions: forward (master to slave) and backward.
 
         Raises:
-            DrakeTeleopError: if a preset is combined with other fields; `where` is the path of this
-                block.
+            DrakeTeleopError: if a preset is combined with other fields.
         """
         names = [entry.name for entry in dataclasses.fields(NetworkConfig)]
         own = NetworkConfig(**{name: getattr(self, name) for name in names})
@@ -140,8 +139,6 @@ def initial_ends(
     """Return the state vector of both ends before their first step.
 
     Args:
-        method: one of `METHODS`.
-        parameters: result of `methods.parameters`.
         start: (7,) pose X_WS of the slave and of its command.
     """
     ends = np.zeros(_SIZE)
@@ -186,7 +183,6 @@ def channel_step(
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
-        parameters: result of `methods.parameters`.
         forward_parameters, backward_parameters: results of `network.parameters`.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
@@ -309,10 +305,9 @@ def _to_master(wrench, frame, out):
 class TeleopChannel(LeafSystem):
     """Network with a passivity method at both ends; a packet takes at least one period.
 
-    Both ends have a safe state, see `station.passivity.safe_state`. The last valid wrench is used
-    while the wrist sensor is saturated. The rendered wrench depends on the inputs without delay, so
-    that wrench times increment of the command is the work at the device. The output is valid only
-    at the instants of the period.
+    Both ends have a safe state for silence and faults (`station.passivity.safe_state`). While the
+    wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends on the
+    inputs without delay, so that wrench times increment of the command is the work at the device.
 
     .. pydrake_system::
 
@@ -334,14 +329,11 @@ class TeleopChannel(LeafSystem):
         - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
-        channel: network and timeout.
-        passivity: passivity method.
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
         force_scale: scale of force, slave to master.
         start: (7,) pose X_WS of the slave at the start.
         period: time between packets [s].
-        seed: seed of the random numbers.
     """
 
     __slots__ = ONE_DICT
@@ -429,11 +421,9 @@ class TeleopChannel(LeafSystem):
         """Start in a running station, without packets in transit and with a constant slave command.
 
         Args:
-            context: context of this block.
             command: (7,) present command X_WS of the slave; the master's command must be equal.
             slave: (7,) actual pose X_WS of the slave.
-            fills: time with open clutch [s]. During it the slave of method `wave` keeps its command
-                and reflects the present wrench.
+            fills: time with open clutch [s], in which the slave of method `wave` keeps its command.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills

@@ -66,11 +66,7 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        """Check every value except the trace, which `parameters` reads.
-
-        Raises:
-            DrakeTeleopError: with the path `where` of this block and the invalid field.
-        """
+        """Check all fields except the trace; raise a DrakeTeleopError for an invalid one."""
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
@@ -121,8 +117,6 @@ def parameters(
     """Return the parameters of one direction for the compiled functions below.
 
     Args:
-        config: network of this direction.
-        seed: seed of the scenario.
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         least: smallest delay of a packet [steps].
@@ -253,12 +247,10 @@ def initial_state(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
-    A step k writes only the places of packet k, so a repeated step writes the same.
-
     Args:
         p: result of `parameters`.
-        neutral: (N,) values at the receiver before the first packet. The line carries the first N
-            numbers of a packet.
+        neutral: (N,) values at the receiver before the first packet. Only the first N numbers of a
+            packet are transmitted.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -269,7 +261,7 @@ def initial_state(
 def send(p, state, k, packet):
     """Send the packet (N,) of step `k`; steps count from 0 without gaps.
 
-    `p` is from `parameters`, `state` from `initial_state`, updated.
+    `p` is from `parameters`; `state`, from `initial_state`, is updated.
     """
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET

@@ -53,11 +53,7 @@ class Environment(ABC):
         return
 
     def check(self, where: str) -> None:
-        """Check rules that concern several fields.
-
-        Raises:
-            DrakeTeleopError: with the path `where` of this block and the field.
-        """
+        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         return
 
     @property

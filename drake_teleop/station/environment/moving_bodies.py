@@ -170,10 +170,9 @@ def _quaternion_rate(spin, turn):
 
 @njit(cache=True)
 def interpolate_bodies(joints, h, u, start, end, out):
-    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`.
+    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`, by cubics.
 
-    Positions are cubic polynomials in time, velocities are their rates. `joints` is a `JointTable`;
-    `start` and `end` are the plant's states at both ends of the step.
+    `joints` is a `JointTable`; `start` and `end` are the plant's states at both ends of the step.
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]

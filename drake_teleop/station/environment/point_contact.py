@@ -45,18 +45,17 @@ _MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class Pairs(NamedTuple):
-    """Pairs of a shape of the tool and a shape around it that may touch.
+    """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
         known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
             3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
-            the body moves), 16-18 half the box's edges, 19-21 direction in which a leaf moves in W
-            (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and
-            dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the body in a
-            `JointTable`, or -1.
-        watched: (l, 40), bounding boxes of all other pairs, see `separation`. As above, with 0-2
-            the centre of the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39
-            half its edges.
+            the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
+            moves in W (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25
+            static and dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the
+            body in a `JointTable`, or -1.
+        watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
+            tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
         unknown: reason why the first of the other pairs is not in `known`.
     """
 
@@ -76,11 +75,9 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized plant; a leaf of the environment is at 0 by default.
-        inspector: inspector of the scene graph.
+        plant: finalized plant.
         tool: shapes of the tool -> poses of their bodies in S.
-        environment: model instances that the tool may touch.
-        slip: slip speed v_s of full friction [m/s]; the plant's stiction tolerance.
+        slip: slip speed of full friction [m/s]; the plant's stiction tolerance.
         moving: indices of the bodies of a `JointTable`, row by row.
 
     Raises:
@@ -188,7 +185,7 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     Args:
         pair: (28,) row of `Pairs.known`.
         p_WS, R_WS: (3,) position [m] and (3, 3) rotation of the sensor frame S in W.
-        deflection: deflection of the leaf [m].
+        deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
     """
@@ -272,14 +269,13 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 
 @njit(cache=True)
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
-    """Write the contact force on a sphere at the depth `x` [m] in its box.
+    """Write the contact force on a sphere in its box into `force` (3,) [N].
 
     Args:
         pair: (28,) row of `Pairs.known`.
         x: depth [m].
         normal: (3,) direction out of the box.
         velocity: (3,) velocity of the sphere at the point of contact, relative to the box [m/s].
-        force: (3,) written [N], in the frame of `normal` and `velocity`.
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

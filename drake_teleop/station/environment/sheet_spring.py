@@ -98,7 +98,7 @@ class SheetSpring(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact of the leaf's deep collision shape with all bodies except the tool."""
+        """Exclude contact of the sheet's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
         tool_bodies = BodiesOfTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]

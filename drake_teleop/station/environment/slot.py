@@ -80,10 +80,9 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the slot and the tool's second ball to a plant with the tool, before Finalize.
+        """Add the slot, fixed in the world, and the tool's second ball to a plant, before Finalize.
 
-        The body "slot" is welded to the world. The ball has no mass. Without a scene graph there
-        are no shapes.
+        The ball has no mass. Without a scene graph there are no shapes.
         """
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)

@@ -88,10 +88,9 @@ def AddFixedBox(
 
     Args:
         plant: not finalized.
-        name: name of the body and of the model instance (with a number if the name exists).
+        name: name of body and model instance, numbered if it exists.
         X_WBox: pose of the box.
         size: (3,) lengths of its edges [m].
-        surface: contact surface of the box.
     """
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)

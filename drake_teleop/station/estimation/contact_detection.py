@@ -73,9 +73,7 @@ class ContactDetection(LeafSystem):
         - contact: (1,) 1 in contact, else 0
 
     Args:
-        config: settings of the detector.
         floor: noise floor in free motion, fitted at the rate of this block.
-        arm: the slave's kinematics.
         period: time between samples [s].
 
     Raises:

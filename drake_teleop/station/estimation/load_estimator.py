@@ -58,11 +58,9 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Check that the method can be combined with `watch`.
+        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`.
 
-        Raises:
-            DrakeTeleopError: with the path `where` of this block, if the method's covariance is too
-                small.
+        `where` is the block's path for the message.
         """
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
@@ -86,7 +84,6 @@ class LoadEstimator(LeafSystem):
           once the predicted uncertainty of every parameter is within the config's bound
 
     Args:
-        config: settings.
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
         motion_std: (9,) standard deviations of specific force [m/s^2], angular velocity [rad/s] and
             angular acceleration [rad/s^2], for "rtls" and for `watch`.

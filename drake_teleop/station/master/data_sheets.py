@@ -258,11 +258,7 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Check combinations of fields.
-
-        Raises:
-            DrakeTeleopError: with the path `where` of this block and the field.
-        """
+        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
                 "the Phantom's own dynamics are used, not a data sheet's",

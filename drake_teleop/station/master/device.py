@@ -32,10 +32,9 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Check that the device is stable with one step per period [s] at the joint positions q.
+    """Raise a DrakeTeleopError if the period [s] is too long for a stable step at the positions q.
 
-    Raises:
-        DrakeTeleopError: if the period is too long for haptic devices or for the friction.
+    The limits are 1 ms and a value that follows from the friction.
     """
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
@@ -58,8 +57,7 @@ def check_period(
 class MasterDevice(LeafSystem):
     """Haptic device with the hand's passive mass, advanced once per period.
 
-    Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs. B is
-    the device's base frame, E the stylus frame.
+    Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs.
 
     .. pydrake_system::
 
@@ -69,13 +67,12 @@ class MasterDevice(LeafSystem):
         - drive: (27,) from the force display: motor torques (6) [N m; N], the display's memory
         output_ports:
         - state: (12,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) X_BE of the stylus E in the device's base B
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - for_display: (27,) joint positions (6) [rad; m], the display's memory
 
     Args:
         period: sampling period [s], at most 1 ms.
-        device: model with the hand's mass; the operator carries the hand's weight.
         q_initial: (6,) joint positions at the start, at rest [rad; in task space m, rad].
 
     Raises:

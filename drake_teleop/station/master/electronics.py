@@ -25,9 +25,9 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Block that reads the stylus pose in whole encoder steps (6,) [m, rad] from `q_start` (6,).
+    """Encoders of a haptic device: round the stylus pose to whole steps (6,) [m, rad]; 0 is exact.
 
-    Step 0 is exact.
+    Steps count from the joint positions `q_start` (6,).
 
     .. pydrake_system::
 

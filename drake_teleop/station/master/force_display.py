@@ -94,7 +94,6 @@ def display_into(wrench, device, numbers, period, J, drive):
     Args:
         wrench: (6,) F_E_B to render.
         device: (27,) port `for_display` of `MasterDevice`.
-        numbers: (NUMBERS,) device parameters.
         period: sampling period [s].
         J: (6, 6) scratch.
         drive: (27,) written: input of `MasterDevice`, with the displayed wrench and a `Fault`.
@@ -156,7 +155,6 @@ class ForceDisplay(LeafSystem):
 
     Args:
         period: sampling period of the device [s].
-        device: device with `numbers`.
     """
 
     __slots__ = ONE_DICT

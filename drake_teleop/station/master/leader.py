@@ -197,7 +197,6 @@ class LeaderDevice(DisplayDevice):
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
         numbers: (NUMBERS,) parameters for the force display.
-        name: for messages.
     """
 
     arm: ArmModel
@@ -243,7 +242,7 @@ class LeaderDevice(DisplayDevice):
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """Return the pose X_BE (7,) at the joint positions q (n,)."""
+        """Return the pose X_BE (7,) of the held point E in the base B at q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
@@ -263,7 +262,7 @@ class LeaderDevice(DisplayDevice):
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the Jacobian (6, n), rows [v; omega] of E in B."""
+        """Return the Jacobian (6, n) of the held point E, rows [v; omega] in the base B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
@@ -308,7 +307,6 @@ class LeaderArm(LeafSystem):
 
     Args:
         period: sampling period [s].
-        device: model with the hand's mass.
         q_initial: (n,) joint positions at the start, at rest.
     """
 

@@ -74,10 +74,9 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Check the fields without reading the model file.
+        """Raise a DrakeTeleopError for invalid fields, without reading the model file.
 
-        Raises:
-            DrakeTeleopError: with the path `where` of this block and the field.
+        `where` is the block's path for the message.
         """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
@@ -114,11 +113,11 @@ class Leader:
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
         """Return the arm's dynamics with the hand's mass and inertia about E [kg, kg m^2].
 
-        At home E is at p_BE = `position` (3,) [m].
+        At home the hand's point E is at `position` (3,) [m] in the base frame B.
 
         Raises:
-            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
-                length of a list differs from the number of joints.
+            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or a list has
+                a wrong length.
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)

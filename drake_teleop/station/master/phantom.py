@@ -99,7 +99,7 @@ def _main_mass_matrix_into(q, M):
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the Jacobian of the stylus E, rows [v; omega] in the base B, into J (6, 6)."""
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
@@ -124,8 +124,8 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix with wrist, hand and reflected motors into M (6, 6).
 
-    J is the Jacobian at q. Each wrist link and the hand is a point mass at E with equal moments of
-    inertia.
+    J is the Jacobian at q. Wrist links and hand are point masses at the stylus with equal moments
+    of inertia.
     """
     _main_mass_matrix_into(q, M)
     M[0, 0] += _MOTOR_1
@@ -224,7 +224,6 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     Args:
         q, v, motor_torque: (6,) joint positions, speeds and motor torques.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        device: (NUMBERS,) device parameters, see `numbers`.
         work: (2, 6, 6) scratch.
     """
     J, M = work[0], work[1]
@@ -242,7 +241,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
+    """Write the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
     s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
@@ -263,7 +262,7 @@ def pose_into(q, pose):
 
 
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the geometric Jacobian (6, 6) of E at q (6,), rows [v; omega] in B."""
+    """Return the Jacobian (6, 6) of the stylus E at q (6,), rows [v; omega] in the base B."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     return J
@@ -286,7 +285,7 @@ def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
+    """Return the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
     pose = np.empty(7)
     pose_into(q, pose)
     return pose

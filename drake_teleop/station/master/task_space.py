@@ -2,8 +2,8 @@
 
     q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 
-Isotropic mass and inertia, Coulomb friction, damping, end stops at the faces of the workspace, and
-balanced weight approximate a delta or counterbalanced arm in the middle of its workspace.
+Isotropic mass and inertia, friction, damping, end stops at the faces of the workspace, balanced
+weight.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/r
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the Jacobian of the grip E, rows [v; omega] in the base B, into J (6, 6)."""
     s4, c4 = math.sin(q[3]), math.cos(q[3])
     s5, c5 = math.sin(q[4]), math.cos(q[4])
     J[:, :] = 0.0
@@ -124,7 +124,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
+    """Write the grip pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])

@@ -58,7 +58,7 @@ class Training:
     Args:
         R_WB: (3, 3) orientation of the master's base in the world.
         translation_scale: displacement of the tool over displacement of the hand.
-        force_gain: rendered force over true contact force, gamma * force_scale.
+        force_gain: rendered force over true contact force.
         forward, backward: mean one-way delays [s].
         seed: random seed of the operator's noise.
     """

@@ -167,11 +167,9 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion into `out`.
+    """Write a pose (7,) with unit quaternion into `out`; return whether the input was valid.
 
-    Returns:
-        True if pose and twist (6,) are finite and the quaternion is not zero; else `out` is
-            unchanged.
+    Valid are a finite pose and twist (6,) with a quaternion that is not zero.
     """
     square, rest = 0.0, 0.0
     for k in range(4):
@@ -200,8 +198,8 @@ def _limit(vector, limit):
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector (in B) of the
-    shorter rotation. Both are limited to the strength of a hand, 60 N and 2 N m.
+    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector of the shorter
+    rotation. Both are limited to 60 N and 2 N m.
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
@@ -284,7 +282,6 @@ class Operator(LeafSystem):
           the rendered force [N], trust (with a task)
 
     Args:
-        config: grip, intent and task.
         start: (7,) X_BE to which the intent is relative.
         training, arm, tip: required for a task: station properties, the slave's arm, and the
             position of the tool's tip in S and at the start in W (6,) [m].

@@ -164,7 +164,6 @@ def perceive(
         t: (N,) evenly spaced times [s].
         hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
             same axes, as in the signals `hand_wrench_E` and `twist_master`.
-        perception: parameters.
         hand_mass: mass of the hand that moves with the stylus [kg].
         attentive: start time of detection [s]; before, only the expectation is updated.
 

@@ -1,10 +1,7 @@
 """Energy through a port of the station, computed from recorded wrenches f and poses x.
 
-The work of a step from x_(k-1) to x_k uses one of these wrenches:
-
-- `held`: f_(k-1), exact for a wrench that is held between samples (hand, motors).
-- `backward`: f_k; the energy balances of TDPA and wave variables are exact for it.
-- `mean`: mean of both, for a steadily changing wrench such as contact.
+The work of a step from x_(k-1) to x_k uses the wrench `held` f_(k-1) (exact for hand and motors),
+`backward` f_k (the balance of TDPA and wave variables) or the `mean` of both (contact).
 """
 
 from __future__ import annotations
@@ -31,7 +28,7 @@ def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
         pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
-        pair: wrench of each step: `held`, `backward` or `mean`, see the module.
+        pair: wrench of step k: `held` f_(k-1), `backward` f_k or `mean` of both.
 
     Returns:
         (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample.
@@ -84,8 +81,7 @@ class Ledger:
             rotation [J].
         received: energy received from the other end so far.
         sent: energy sent so far.
-        lost: energy removed from the loop. `tdpa`: work of the withheld wrench and motion;
-            `two_layer`, `pspm`, `ledger`: overflow; `wave`: dissipation of the matching damper.
+        lost: energy removed from the loop (damper, overflow, withheld work).
     """
 
     stored: Array

@@ -28,7 +28,7 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 

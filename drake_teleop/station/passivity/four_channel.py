@@ -61,7 +61,7 @@ class FourChannelConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
         p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
 

@@ -138,7 +138,7 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -158,9 +158,7 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the slave's largest speed (2,) that its reserve of energy permits [m/s, rad/s].
 
-    Args:
-        config: parameters; `reserve` limits the kinetic energy (step S4 in docs/theory.md).
-        mass: (2,) mass and inertia of the slave, in the master's power units [kg, kg m^2].
+    `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
     left = (1.0 - MARGIN) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (MASS_FACTOR * mass))

@@ -53,10 +53,10 @@ from drake_teleop.station.passivity.wave import WaveConfig
 class Methods:
     """Parameters of all passivity methods; each field registers the method of its name.
 
-    The module of the field's class implements the method. It has compiled `master_step` and
-    `slave_step`, with the arguments of those below except `steps`; the class has `pack_into(p)`.
-    Optional: `initialize(p, memory)` of an end; compiled `command_sent`, likewise without `steps`;
-    `AT_THE_MOTOR = True` for an energy balance at the slave's motors instead of its command.
+    The module of the field's class implements the method: compiled `master_step` and `slave_step`,
+    with the arguments of those below except `steps`; the class has `pack_into(p)`. Optional:
+    `initialize(p, memory)` of an end; compiled `command_sent`; `AT_THE_MOTOR = True` for an energy
+    balance at the slave's motors instead of its command.
     """
 
     wave: WaveConfig = field(default_factory=WaveConfig)
@@ -130,7 +130,6 @@ def parameters(
     """Return the parameters of the selected method as one vector for the compiled steps.
 
     Args:
-        config: method and parameters.
         power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
             torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
@@ -156,7 +155,6 @@ def initial_memory(
     """Return the memory (MEMORY,) of one end of the channel before its first step.
 
     Args:
-        method: one of `METHODS`.
         parameters: result of `parameters`.
         pose: (7,) slave's pose X_WS at the start, its command until a packet arrives.
 
@@ -193,10 +191,7 @@ _master_step, _slave_step, _command_sent = map(
 
 @cache
 def steps_of(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's compiled `master_step`, `slave_step` and `command_sent`.
-
-    A channel calls them by address, which avoids compiling all methods into it.
-    """
+    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`."""
     file = _MODULES[method]
     return (
         address_of(file.master_step, _MASTER_ARGUMENTS),
@@ -280,7 +275,7 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 
 @njit(cache=True)
 def command_sent(steps, requested, command, pose, twist, p, memory):
-    """Report to the method the command that is sent, which the safe state may have changed.
+    """Report to the method the command that is sent; a stop by the safe state may have changed it.
 
     Args:
         steps: result of `steps_of(method)`.

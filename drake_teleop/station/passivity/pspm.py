@@ -69,7 +69,7 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
@@ -146,7 +146,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Adopt the command after the safe state as set position; see `methods.command_sent`."""
+    """Adopt the command that is sent as the spring's set position; see `methods.command_sent`."""
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, offset)

@@ -1,8 +1,8 @@
 """Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
-An end is *silent* if no new packet of a healthy sender arrived for `timeout` seconds. It is silent
-at once if its own data, or those of the other end, are not finite or beyond 1e6 in SI units. Both
-ends begin silent. A silent master fades the wrench to zero; a silent slave stops.
+An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
+either end are not finite or beyond 1e6 in SI units. Both ends begin silent. A silent master fades
+the wrench to zero; a silent slave stops.
 """
 
 from __future__ import annotations
@@ -146,16 +146,15 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Reduce a rendered wrench that moves the hand along it, so that a released hand stays slow.
+    """Reduce a rendered wrench that pushes the hand, so that a released hand stays slow.
 
-    Between the speed `RETREAT` and twice this speed the wrench falls to 0. While the hand
+    For hand speeds along the wrench between `RETREAT` and twice this, it falls to 0. While the hand
     decelerates, the slave's inertial force remains.
 
     Args:
         twist: (6,) twist of the command before the channel [v; omega], in W.
         T: time between steps [s].
-        p: parameters of the method.
-        memory: memory of the master's end, updated.
+        p, memory: parameters and memory of the master's end; memory is updated.
         wrench: (6,) in W and the master's power units, updated.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)

@@ -125,7 +125,7 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))

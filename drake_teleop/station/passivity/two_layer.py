@@ -84,7 +84,7 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
         p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
         p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
@@ -182,7 +182,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Store the servo's wrench for the command after the safe state; see `methods.command_sent`."""
+    """Store the servo's wrench for the command that is sent; see `methods.command_sent`."""
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

@@ -81,7 +81,7 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write these parameters into the vector `p` of the compiled steps."""
+        """Write these parameters into the parameter vector `p`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 

@@ -60,8 +60,8 @@ class ForceScalingConfig:
         """Return the scales (sigma_gripper, sigma_object, gamma).
 
         Raises:
-            DrakeTeleopError: with the path `where` of this block, if eta is given without
-                gripper_phi, sigma = 0 and gamma = 1 (section V).
+            DrakeTeleopError: if eta is given without gripper_phi, sigma = 0 and gamma = 1 (section
+                V); `where` is the block's path.
         """
         if self.eta is None:
             return self.sigma, self.sigma, self.gamma
@@ -94,8 +94,7 @@ def wrench_to_master(
 ) -> NDArray[np.float64]:
     """Return the wrench to render at the master for a wrench at the slave's sensor.
 
-    It is the reaction, rotated and scaled: for a load that is held up, the hand is pulled down. The
-    moment about the origin of the sensor frame S becomes the moment about the grip E.
+    It is the reaction, rotated and scaled: for a load that is held up, the hand is pulled down.
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
@@ -105,7 +104,7 @@ def wrench_to_master(
         torque_scale: torque at the master over torque at the slave.
 
     Returns:
-        (..., 6) F_E_B, [f; tau] on the hand at E, in B [N, N m].
+        (..., 6) F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
     """
     R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
     force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
@@ -144,7 +143,7 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, valid_range):
-    """Return the `Fault` of a sample and a load estimate.
+    """Return the code (`Fault`) of the first fault in a sample and a load estimate.
 
     Args:
         sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
@@ -193,11 +192,11 @@ def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_ran
 
 
 class ForceScaling(LeafSystem):
-    """Removal or scaling of the non-contact wrench, and transformation to the hand.
+    """Scaling of contact wrench and load's wrench, and transformation to the hand.
 
     F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
-    and inertial parameters phi of gripper and object. `SetScales` changes the scales, a numeric
-    parameter of the context, during a simulation.
+    and inertial parameters phi of gripper and object. `SetScales` changes the scales during a
+    simulation.
 
     .. pydrake_system::
 
@@ -210,13 +209,12 @@ class ForceScaling(LeafSystem):
         - contact_wrench_S: contact wrench F_c of Eq. (13)
         - fault: `Fault` of sample or estimate
         - scaled_contact_and_fault: the three above in one vector, for a log
-        - non_contact_wrench_S: wrench of the load, Eq. (12)
+        - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
         - load_wrench_B: part of wrench_B from weight and inertia of the load, zero for sigma = 0
 
     Args:
         config: initial scales.
-        arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
         largest_wrench: (6,) largest valid reading [N, N m]; None for no limit.
         oldest: largest valid age of a sample [s].

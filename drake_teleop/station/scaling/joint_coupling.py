@@ -17,7 +17,7 @@ class JointCoupling(LeafSystem):
     """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
 
     While the clutch is open the commanded joints are constant. When it closes they follow the
-    leader again, at the full difference; `JointFollower` limits the speed.
+    leader again with a jump; `JointFollower` limits the speed.
 
     .. pydrake_system::
 
@@ -30,7 +30,6 @@ class JointCoupling(LeafSystem):
         - pose_command: (7,) X_WS for these joints
 
     Args:
-        slave: the slave's arm.
         start: (n,) joints of the slave when the leader is at `home` [rad].
         home: (n,) joints of the leader [rad].
         period: sampling period of the clutch [s].

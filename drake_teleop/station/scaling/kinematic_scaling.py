@@ -97,7 +97,6 @@ class KinematicScaling(LeafSystem):
         - pose_command: (7,) commanded pose X_WS of the slave
 
     Args:
-        config: scales and alignment.
         period: sampling period of the clutch [s].
         start: (7,) commanded pose X_WS at the start.
     """

@@ -189,7 +189,8 @@ def estimated_motion_std(
 ) -> NDArray[np.float64]:
     """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
 
-    They exclude a low-pass after the converter. The small noise of omega counts as 0.
+    s is specific force, omega and alpha are angular velocity (counted as exact) and acceleration. A
+    low-pass after the converter is excluded.
     """
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)

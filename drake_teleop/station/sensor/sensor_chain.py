@@ -179,8 +179,8 @@ class WristSensorConfig:
     def motion_std(self) -> NDArray[np.float64]:
         """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
 
-        They contain noise and quantisation of raw samples of specific force s and angular
-        acceleration alpha. The angular velocity omega counts as exact.
+        They contain noise and quantisation of raw samples; the angular velocity omega counts as
+        exact.
         """
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
@@ -211,10 +211,9 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Check R_SA, and the low-pass bandwidth against the sensor's rate [Hz].
+        """Raise a DrakeTeleopError for an invalid R_SA or a bandwidth too high for the rate [Hz].
 
-        Raises:
-            DrakeTeleopError: with the path `where` of this block and the field.
+        `where` is the block's path for the message.
         """
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
@@ -291,8 +290,8 @@ def calibration_matrices(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return matrices that multiply true values by the calibration errors.
 
-    Each is (1 + gains + cross-talk) times the rotation of the misalignment, random within the
-    configured bounds. All draws depend only on `unit`.
+    Each is (1 + gains + cross-talk) times the rotation of the misalignment, drawn with the seed
+    `unit`.
 
     Returns:
         (6, 6) for [f; tau] in S, (3, 3) for specific force in A, (3, 3) for angular acceleration in

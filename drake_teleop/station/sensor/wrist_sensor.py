@@ -103,8 +103,8 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
         arm: `ArmModel.table` of an arm with n joints.
         phi: (10,) inertial parameters of the tool.
         q, v, vdot: (n,) joint positions, speeds and accelerations.
-        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W; the
-            wrench in `out` is that of Eqs. (1)-(2) minus this one.
+        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W, which
+            is subtracted from that of Eqs. (1)-(2).
         motion: (21,) scratch.
     """
     sensor_motion(arm, q, v, vdot, motion)
@@ -209,10 +209,8 @@ def sample_step(
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
-        noise: random numbers for the chain.
         memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
             length of the queue, time and x of each step's end in it].
-        until_now: whether to take a sample that is due now.
         touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
             in W; or (0,) to calculate it with `physics`.
         scratch: (9, 2 n + 6 + size of the plant's state).
@@ -302,8 +300,6 @@ class WristSensor(LeafSystem):
 
     Args:
         slave: the plant; source of the tool's true inertial parameters and contact shapes.
-        config: parts of the sensor.
-        motion: estimation of the motion of S.
         period: sampling period [s].
         held: duration for which the motors hold a torque, or its rate [s].
         q_start: (n,) joint angles at rest before the first sample [rad].
@@ -415,7 +411,7 @@ class WristSensor(LeafSystem):
 
     @property
     def moves(self) -> str:
-        """Sentence that names the moving bodies around the arm except a leaf, or ""."""
+        """Sentence that names the moving bodies around the arm except a sheet spring, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
