@@ -164,7 +164,9 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the replay's frames (F,) [s], 50 per second, and the slow motion.
+    """Return the times of the replay's frames (F,) [s], and the slow motion.
+
+    There are 50 frames per second of replay, at most 2001.
 
     Args:
         start, stop: displayed interval [s].

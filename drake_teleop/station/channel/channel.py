@@ -1,4 +1,4 @@
-"""Channel between master and slave: a network, and a passivity method at both ends.
+"""Channel between master and slave: network and passivity method at both ends (long: one step).
 
 In every period both ends run one step of the method; their packets pass the network.
 """

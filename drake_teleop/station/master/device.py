@@ -32,9 +32,11 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Raise a DrakeTeleopError if the period [s] is too long for a stable step at the positions q.
+    """Check that one step per period [s] is stable at the joint positions q.
 
-    The limits are 1 ms and a value that follows from the friction.
+    Raises:
+        DrakeTeleopError: if the period is above 1 ms or too long for the friction, or if q violates
+            a joint limit.
     """
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(

@@ -1,4 +1,4 @@
-"""Slave's end of the passivity method "ledger": steps S1 to S6 of docs/theory.md."""
+"""Slave's end of the method "ledger" (long: all steps of one end): S1 to S6 of docs/theory.md."""
 
 from __future__ import annotations
 

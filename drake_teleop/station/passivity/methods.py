@@ -1,9 +1,9 @@
 """Passivity methods by name, their parameters, and one step of each end of the channel.
 
 Ports: at the master the wrench to render and the motion of its command (after kinematic scaling,
-before the channel); at the slave the contact wrench and its actual motion, all in world axes W.
-Wrenches are in the *master's power units*: wrench times motion of the slave's command is the work
-at the hand, docs/theory.md (T29).
+before the channel); at the slave the wrench of contact (with sigma > 0 also of the load) and the
+actual motion, all in world axes W. Wrenches are in the *master's power units*: wrench times motion
+of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -257,7 +257,8 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         pose: (7,) actual pose X_WS of the slave.
         twist: (6,) actual twist of the slave [v; omega], in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) contact wrench on the slave, in W and master's power units.
+        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W and
+            master's power units.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """

@@ -1,4 +1,6 @@
-"""Estimated motion of the sensor frame S: specific force s of its origin, omega, alpha.
+"""Estimated motion of the sensor frame S (long: each source with its delay and noise).
+
+It is specific force s of the origin So, angular velocity omega and acceleration alpha. Sources:
 
 - `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
 - `accelerometer` (default, as in the paper): measured s and alpha, omega from encoders.

@@ -1,4 +1,4 @@
-"""Wrist sensor as a chain from true values to readings::
+"""Wrist sensor as a chain from truth to readings (long: parameters beside their functions)::
 
     wrench at So in S        -> calibration errors ----.
     motion of S -> moved to Ao, turned into A          |

@@ -1,4 +1,4 @@
-"""Wrist sensor in the station: sampling instants and samples.
+"""Wrist sensor in the station: sampling instants, samples (long: the step and its block).
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
