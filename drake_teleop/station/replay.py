@@ -170,7 +170,6 @@ def _row_norms(vectors: Array) -> Array:
 
 
 def _find_logs(run: Path) -> list[Path]:
-    """Return the log `run` itself; of a folder, its log.parquet, or its logs with a scenario."""
     if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
     if run.suffix == ".parquet":

@@ -379,7 +379,6 @@ def _reduce_curve(
 
 
 def _components_text(spec: Signal) -> str:
-    """Return names and units of a signal's components: "f_x, f_y, f_z [N], tau_x [N m]"."""
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)

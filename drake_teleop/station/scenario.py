@@ -151,7 +151,7 @@ class Scenario:
 
     @property
     def is_direct(self) -> bool:
-        """True if master and slave are connected by wires only."""
+        """True if no network and no passivity method are between master and slave."""
         return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:

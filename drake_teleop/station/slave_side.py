@@ -182,7 +182,6 @@ def _add_slave_blocks(
     load_covariance: Array | None = None,
     q_start: Array | None = None,
 ) -> _SlaveBlocks:
-    """Add the blocks that both slave sides have; the joint command stays unconnected."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start = slave.arm, slave.plant, slave.start

@@ -171,7 +171,6 @@ def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    """Return the violated success criterion as text; "" if there is none."""
     force = contact_force(result)
     if isinstance(task, Press):
         held = float(_held_force(result.t, force, task, ended).mean())

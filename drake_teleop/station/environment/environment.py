@@ -40,7 +40,10 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip speed of full Coulomb friction [m/s]; the smallest of all environments applies."""
+        """Slip speed at which friction is fully developed [m/s].
+
+        The smallest of all environments applies.
+        """
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:

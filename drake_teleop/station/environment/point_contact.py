@@ -161,7 +161,6 @@ def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) 
 
 
 def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    """Return stiffness, dissipation, static and dynamic friction of a pair, as in Drake."""
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
             raise DrakeTeleopError(

@@ -6,7 +6,7 @@ Section across the slot, M is the middle of its mouth, z up::
     ------.       M       .------        on an edge of two boxes touches both, so an edge is up to
            \.     |     ./  chamfer      twice as stiff as a face. The slot is open at its ends.
              |    |    |
-             |  width  |  wall           The peg is the tool's ball and a second one up its shank.
+             |  width  |  wall
              |_________|
                 floor
 """
@@ -62,7 +62,7 @@ class Slot(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed of full friction [m/s], an estimate: a peg at rest creeps more slowly."""
+        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     @property

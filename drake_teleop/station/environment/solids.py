@@ -54,7 +54,7 @@ class Surface(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed of full friction [m/s], an estimate."""
+        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     def material(self) -> ProximityProperties:

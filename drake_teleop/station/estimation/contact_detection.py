@@ -1,7 +1,4 @@
-"""Contact detection at the slave from the wrench without the load's part.
-
-`drake_teleop.load.contact` describes the statistic; the noise floor is from an identification.
-"""
+"""Contact detection at the slave from the wrench without the load's part."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass

@@ -2,8 +2,7 @@
 
     M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 
-The hand holds the arm at E, whose axes equal those of the base frame B at home. The operator
-carries the hand's weight.
+The hand holds the arm at E, whose axes equal those of the base frame B at home.
 """
 
 from __future__ import annotations

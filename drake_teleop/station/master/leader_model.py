@@ -147,7 +147,6 @@ class Leader:
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
     def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        """Return values (n,) from a list field with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(

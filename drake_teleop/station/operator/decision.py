@@ -1,7 +1,7 @@
 """Decisions of the simulated operator during a task, from vision and perceived force.
 
-The hand moves by planned displacements, and waits until their effect is visible (Ferrell, IEEE
-Trans. Hum. Factors Electron. 6, 1965). All assumptions and sources: `docs/operator.md`.
+The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965). All
+assumptions and sources: `docs/operator.md`.
 """
 
 from __future__ import annotations
@@ -357,7 +357,6 @@ def _control_force(task, person, step, time, felt, state, memory):
 
 @njit(cache=True)
 def _sideways_into(task, person, felt, out):
-    """Write the contact force lateral to the task's axis (3,), in W [N]; return its magnitude."""
     along, size = _pressed_force(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
@@ -377,7 +376,6 @@ def _is_stuck(task, person, felt):
 
 @njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
-    """Push with the set force; yield to a lateral force, or search on a spiral without one."""
     force = _perceived_force(task, person, felt, memory)
     if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
         _enter_phase(state, memory, FEELING, time)

@@ -219,7 +219,6 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 @njit(cache=True)
 def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
-    """Write the intended pose (7,) and twist (6,): the intent's segments plus the task's plan."""
     intent_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += moving[k]

@@ -1,7 +1,8 @@
 """Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
 
-`charged_tdpa` adds a drag on the hand that stores energy in free motion (Franken et al. 2011), and
-a filter of the slave's wrench.
+Passivity is guaranteed at the hand and the slave's *command*, for the `backward` work of module
+`energy`. `charged_tdpa` adds a drag on the hand that stores energy in free motion (Franken et al.
+2011), and a filter of the slave's wrench.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -299,7 +300,6 @@ def _move_command(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _account_command(command, sign, memory):
-    """Add (`sign` 1) or subtract (-1) the work of the last step of the command."""
     step = np.empty(6)
     difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):

@@ -1,7 +1,8 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-The tank of each end must cover the energy that the wrench can use until the next step. A damper on
-the hand fills the master's tank up to `level`.
+The tank of each end must cover the energy that the wrench can use until the next step. It is never
+overdrawn if hand and walls accelerate less than `acceleration` and if servo and mass are configured
+correctly.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.

@@ -2,7 +2,7 @@
 
 The receiver outputs the integral of the wave through a filter, within the received energy
 (Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
-energy at the hand and the slave's *command*. A damper at the command matches the line.
+energy at the hand and the slave's *command*, for the `backward` work of module `energy`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -195,7 +195,6 @@ def _reflect(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _play_rest(wrench, T, p, memory):
-    """Output the wave that keeps the slave at rest, if the stored energy suffices."""
     wave, ledger = memory[_WAVE], memory[LEDGER]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
@@ -227,7 +226,6 @@ def _fill_line(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _correct_drift(received, wrench, T, p, memory):
-    """Add a step towards the received pose in each group where it increases no contact force."""
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):

@@ -130,7 +130,6 @@ def scales_at(change, time, scales):
 
 @njit(cache=True)
 def _scaled_into(sample, estimate, gripper, scales, out):
-    """Write the scaled wrench F' of one sample; the object is the load without the gripper."""
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -179,7 +178,6 @@ def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_ra
 
 @njit(cache=True)
 def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
-    """Write the wrench to render, or NaN during a fault; `contact` 0 keeps only the load's part."""
     if fault_of(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
         return

@@ -189,10 +189,10 @@ def motion_gains(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
+    """Return standard deviations (9,) of specific force, angular velocity and its derivative.
 
-    s is specific force, omega and alpha are angular velocity (counted as exact) and acceleration. A
-    low-pass after the converter is excluded.
+    Units are m/s^2, rad/s (counted as exact) and rad/s^2. A low-pass after the converter is
+    excluded.
     """
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)

@@ -2,9 +2,8 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-Position and velocity at each sampling instant are interpolated within an integration step, and
-accelerations follow from the dynamics. With contact outside the compiled law (`Contact.beyond`)
-each sample is an event at the end of a step.
+The state at each sampling instant is interpolated within an integration step. With contact outside
+the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
