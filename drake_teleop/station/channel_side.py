@@ -87,10 +87,7 @@ def MakeChannel(scenario: Scenario) -> Diagram:
 
 
 def _limit_to_device(scenario: Scenario, passivity: PassivityConfig) -> PassivityConfig:
-    """Return the passivity method with its wrench limited to the largest wrench of the device.
-
-    Otherwise the energy balance would contain a wrench that the device does not display.
-    """
+    """Limit the method's wrench to the device, so that its balance counts displayed wrenches."""
     device = scenario.master.device(0.0, 0.0)
     return dataclasses.replace(
         passivity,
@@ -103,8 +100,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
     """Return the scenario's passivity method; for `ledger`, add mass and servo of the arm.
 
     Raises:
-        DrakeTeleopError: if the arm has fewer than six joints, so that its mass is unbounded in
-            some direction.
+        DrakeTeleopError: if the arm has fewer than six joints (unbounded mass in a direction).
     """
     passivity = scenario.passivity
     if passivity.method != "ledger" or passivity.slave_mass is not None:
@@ -128,8 +124,7 @@ def passivity_with_arm_mass(scenario: Scenario) -> PassivityConfig:
 def power_scale(scenario: Scenario) -> Array:
     """Return the master's power over the slave's (2,), for translation and rotation.
 
-    This scale is force scale over motion scale. A motion scale of 0 counts as 1, because no power
-    is transmitted then.
+    It is force scale over motion scale, where a motion scale of 0 counts as 1.
     """
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])

@@ -1,8 +1,4 @@
-"""3D replay: one HTML file with Meshcat and a player, which works offline in any browser.
-
-The player (`pages/player.html.j2`) has a clock, play and pause, a slider, speeds, readings and
-their curves. The replay repeats.
-"""
+"""3D replay: one HTML file with Meshcat and a player, which works offline in any browser."""
 
 from __future__ import annotations
 
@@ -78,7 +74,7 @@ class Reading:
     arrow: bool = False
 
     def for_page(self) -> dict[str, object]:
-        """Return label and values as the data that the player reads."""
+        """Return label and values as the JSON data that the player reads."""
         largest = float(np.nanmax(np.abs(self.values), initial=0.0))
         return {
             "name": self.name,
@@ -95,12 +91,10 @@ class Film:
     """Contents of a 3D replay, except the scene.
 
     Args:
-        title: one line.
         times: (F,) times of the frames, evenly spaced, at least two [s].
         slow_motion: initial speed: seconds of replay per second of `times`.
         readings: numbers beside the replay.
         shaded: intervals of `times` that the curves mark.
-        notes: further lines of text.
         clock: label of the times.
         curves: label of the curves; "{top}" is replaced by the largest value.
     """
@@ -117,9 +111,7 @@ class Film:
     def write(self, path: Path, make_scene: Callable[[Meshcat], Show]) -> None:
         """Write the replay to an HTML file.
 
-        Args:
-            path: HTML file.
-            make_scene: adds the objects to Meshcat and returns the function that shows one frame.
+        `make_scene` adds the objects to Meshcat and returns the function that shows one frame.
         """
         # Only the thread that created Meshcat may destroy it, and reference cycles keep Drake's
         # objects until garbage collection, which may run in any thread: so collect here.
@@ -172,15 +164,14 @@ class Film:
 
 
 def frame_times(start: float, stop: float, slow_motion: float | None = None) -> tuple[Array, float]:
-    """Return the times of the frames, and the slow motion.
+    """Return the times of the replay's frames (F,) [s], and the slow motion.
+
+    There are 50 frames per second of replay, at most 2001.
 
     Args:
         start, stop: displayed interval [s].
-        slow_motion: seconds of replay per second; by default the player's lowest speed factor
-            with which the replay lasts 6 s.
-
-    Returns:
-        (F,) times [s], 50 per second of replay and at most 2001; the slow motion.
+        slow_motion: seconds of replay per second; default: the lowest for which the replay lasts 6
+            s.
     """
     span = stop - start
     if slow_motion is None:

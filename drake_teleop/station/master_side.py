@@ -45,7 +45,6 @@ def MakeMasterSide(scenario: Scenario, operator: Operator | None = None) -> Diag
         - task_state: signal (with a task)
 
     Args:
-        scenario: configuration of the station.
         operator: custom operator, added as "live_hand"; None for the scenario's operator.
 
     Raises:

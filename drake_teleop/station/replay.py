@@ -1,10 +1,6 @@
 """3D replay of a simulation: `replay.html` of a run and the command `drake-teleop replay`.
 
-Forces are arrows of 3 mm per newton, in the slave's scale. Blue at wrist and stylus: force measured
-by the wrist sensor. Orange at tool tip and stylus: calculated contact force.
-
-The scenario of a log is `scenario.yaml` beside `log.parquet` (`run`), or the YAML file with the
-log's name (folder `logs` of `reproduce`).
+Arrows are forces, 3 mm per newton: blue measured by the wrist sensor, orange calculated contact.
 """
 
 from __future__ import annotations
@@ -76,16 +72,13 @@ _OPTIONAL_SIGNALS = ("master_state", "contact_wrench_S", "force_to_master", "she
 def replay_command(
     run: Path, out: Path, *, scenario: str | Path | None = None, quiet: bool = False
 ) -> dict[str, Any]:
-    """Write the replays of logged runs, and summary.json with their paths.
+    """Write the replays of logged runs, and summary.json with their paths; return the summary.
 
     Args:
         run: folder written by `run` or `reproduce`, or a log in it.
         out: output folder: replay.html, or one file per log for several logs.
-        scenario: shipped scenario or YAML file; by default the scenario beside the log.
-        quiet: print nothing.
-
-    Returns:
-        The summary.
+        scenario: shipped scenario or YAML file; by default `scenario.yaml` beside the log, or the
+            YAML file with the log's name.
 
     Raises:
         DrakeTeleopError: if there is no log or no scenario.
@@ -108,15 +101,13 @@ def replay_command(
 def write_replay(
     path: Path, result: SimulationResult, scenario: Scenario, *, slow_motion: float | None = None
 ) -> None:
-    """Write the replay of a run.
+    """Write the replay of a run to an HTML file.
 
     Args:
-        path: HTML file.
         result: signals slave_state, measured_wrench_S, load_estimate; optionally master_state,
             contact_wrench_S, force_to_master and sheet_state.
-        scenario: scenario of the run.
-        slow_motion: initial speed: seconds of replay per second of the run; by default the
-            replay lasts at least 6 s.
+        slow_motion: initial speed: seconds of replay per second of the run; by default the replay
+            lasts at least 6 s.
 
     Raises:
         DrakeTeleopError: if required signals are missing.
@@ -179,7 +170,6 @@ def _row_norms(vectors: Array) -> Array:
 
 
 def _find_logs(run: Path) -> list[Path]:
-    """Return the log `run` itself; of a folder, its log.parquet, or its logs with a scenario."""
     if not os.path.exists(run):
         raise DrakeTeleopError("there is no such folder", where=str(run))
     if run.suffix == ".parquet":
@@ -213,7 +203,6 @@ class ReplayScene:
 
     Attributes:
         plant: slave, surroundings and haptic device, for shapes and kinematics only.
-        context: the plant's context, with the positions of the sample shown last.
         canvas: receiver of poses and sizes; Meshcat by default.
     """
 
@@ -286,7 +275,7 @@ class ReplayScene:
             arrow.show(self.canvas, film_time, places[place], f_W)
 
     def _set_body_pose(self, index: BodyIndex, pose: Array) -> None:
-        """Set the pose (7,) of a moving body of the surroundings; set its parents before."""
+        """Set the pose (7,) of a moving body; its parents must have theirs."""
         joints = map(self.plant.get_joint, self.plant.GetJointIndices())
         (joint,) = (joint for joint in joints if joint.child_body().index() == index)
         X_WBody = RigidTransform(Quaternion(pose[:4] / np.linalg.norm(pose[:4])), pose[4:])
@@ -298,10 +287,6 @@ class ReplayScene:
         self.plant.SetPositions(self.context, q)
 
     def _contact_forces_W(self, signals: Mapping[str, Array], sample: int) -> dict[str, Array]:
-        """Return the forces (3,) of the load on the sensor by name, in W.
-
-        The sign is opposite to Eq. (1).
-        """
         R_WS = self._sensor.CalcPoseInWorld(self.context).rotation().matrix()
         offset = signals["load_estimate"][sample, :3]
         forces = {"measured": -R_WS @ (signals["measured_wrench_S"][sample, :3] - offset)}
@@ -321,12 +306,9 @@ class ReplayScene:
 
 
 class _Device(NamedTuple):
-    """Haptic device in the plant of a replay.
+    """Haptic device in the plant of a replay; the hand holds the point `grip` (3,) [m] of `hand`.
 
-    Attributes:
-        hand: frame at the stylus; the hand holds the point `grip` (3,) [m] of this frame.
-        positions: converts joint positions of the device state to those of the plant.
-        folder: folder of converted meshes, kept while shapes are in use.
+    `positions` converts joint positions to those of the plant. `folder` keeps meshes in use.
     """
 
     instance: ModelInstanceIndex

@@ -51,7 +51,6 @@ class Signal:
         name: name of the signal's port, such as "measured_wrench_S".
         components: name of each of the k components ("f_x", ...).
         units: unit of each component, or one string for all ("1" for dimensionless).
-        description: one line.
 
     Raises:
         DrakeTeleopError: if the numbers of units and components differ.
@@ -154,7 +153,6 @@ class SimulationResult:
             raise KeyError(f"no signal {name!r}; there are {', '.join(near)}") from None
 
     def _column(self, name: object) -> tuple[str, int] | None:
-        """Return the signal and the component's index for a table column; None for other names."""
         signal = str(name).partition(".")[0]
         if signal not in self._specs or name not in self._specs[signal].columns:
             return None
@@ -174,7 +172,7 @@ class SimulationResult:
         return ["t", *self._specs, *columns]
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return `to_dataframe` as a pandas frame.
+        """Return the samples as a pandas frame, with the columns of `to_dataframe`.
 
         Raises:
             DrakeTeleopError: if pandas (extra `notebook`) is not installed.
@@ -198,11 +196,10 @@ class SimulationResult:
         return pl.DataFrame(columns)
 
     def sensor_log(self) -> pl.DataFrame:
-        """Return the wrist sensor's samples as a canonical log, for `identify` and `eliminate`.
+        """Return the wrist sensor's samples as a log for `identify` and `eliminate`.
 
         Columns ``t``, ``f_x`` ... ``tau_z``, ``s_x`` ..., ``omega_x`` ..., ``alpha_x`` ... in S and
-        SI units, with the sign of Eq. (1). ``t`` is the sampling instant. Repeated rows of one
-        sample (log faster than the sensor) are merged.
+        SI units, with the sign of Eq. (1). ``t`` is the sampling instant; each sample has one row.
 
         Raises:
             DrakeTeleopError: if the sensor's signals were not recorded.
@@ -222,7 +219,7 @@ class SimulationResult:
         return pl.DataFrame(columns).unique("t", keep="first", maintain_order=True)
 
     def write_parquet(self, path: str | Path) -> None:
-        """Write `to_dataframe` to a file, with names, units and descriptions as metadata.
+        """Write the samples to a file, with names, units and descriptions as metadata.
 
         Equal data give equal bytes.
         """
@@ -238,8 +235,7 @@ class SimulationResult:
     def write_part(self, folder: Path, first_row: int) -> None:
         """Write this result as one part of a longer log, in the format of `write_parquet`.
 
-        The folder is a valid table at any time: a part is complete or absent. The same rows
-        written again replace the part.
+        A part is complete or absent at any time. The same rows written again replace the part.
 
         Args:
             folder: folder of the log, prepared by `remove_log`.
@@ -262,9 +258,7 @@ class SimulationResult:
 
     @classmethod
     def scan_parquet(cls, path: str | Path) -> SimulationResult:
-        """Open a log that may exceed the memory.
-
-        Only the times are read now. Each access to a signal reads the signal from the disk.
+        """Open a log that may exceed the memory: each access to a signal reads it from the disk.
 
         Args:
             path: file or folder of parts, from `write_parquet` or `simulate`.
@@ -376,7 +370,6 @@ class _SignalsOnDisk(Mapping[str, "NDArray[np.float64]"]):
 def _reduce_curve(
     t: NDArray[np.float64], values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Reduce a curve to about _MAX_CURVE_POINTS points: minimum and maximum of each block."""
     length = 2 * len(t) // _MAX_CURVE_POINTS
     if length < 2:
         return t, values
@@ -386,7 +379,6 @@ def _reduce_curve(
 
 
 def _components_text(spec: Signal) -> str:
-    """Return names and units of a signal's components: "f_x, f_y, f_z [N], tau_x [N m]"."""
     pairs = zip(spec.components, spec.units, strict=True)
     groups = groupby(pairs, key=lambda pair: pair[1])
     return ", ".join(f"{', '.join(c for c, _ in pairs)} [{unit}]" for unit, pairs in groups)
@@ -402,7 +394,6 @@ def _log_parts(path: Path) -> list[Path]:
 
 
 def _read_columns(path: Path, columns: list[str]) -> NDArray[np.float64]:
-    """Read columns of a Parquet file into an array (N, k)."""
     import polars as pl
 
     refuse_fork()

@@ -1,6 +1,6 @@
 """Scenarios: configuration of a station as dataclasses, read from YAML.
 
-Every field has a unit and a plausible range; an error names file and field. Units: s, Hz, m.
+Every field has a unit and a plausible range; an error names file and field.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -151,15 +151,11 @@ class Scenario:
 
     @property
     def is_direct(self) -> bool:
-        """True if master and slave are connected by wires only."""
+        """True if no network and no passivity method are between master and slave."""
         return self.passivity.method == "none" and self.channel.lines() == (NetworkConfig(),) * 2
 
     def check(self, where: str = "scenario") -> None:
-        """Check the values of all fields.
-
-        Raises:
-            DrakeTeleopError: with `where` and the field.
-        """
+        """Check all fields; raise a DrakeTeleopError that names `where` and the invalid field."""
         check_ranges(self, where)
         self.force_scaling.scales(f"{where}:force_scaling")
         self.load_estimator.check(f"{where}:load_estimator")
@@ -182,11 +178,7 @@ class Scenario:
 
 
 def check_scenario(scenario: Any) -> None:
-    """Check the type of a scenario and all its values.
-
-    Raises:
-        DrakeTeleopError: as `Scenario.check`, or for an object that is not a Scenario.
-    """
+    """Raise a DrakeTeleopError for an invalid value, or an object that is not a Scenario."""
     remedy = "load one: LoadScenario(name)"
     if isinstance(scenario, (str, Path)):
         remedy = f"write LoadScenario({str(scenario)!r})"
@@ -240,7 +232,7 @@ def ReadScenario(name_or_path: str | Path) -> tuple[Any, str]:
 
 
 def ScenarioFromData(data: Any, where: str) -> Scenario:
-    """Convert parsed YAML data to a scenario; `where` is the place for messages.
+    """Convert parsed YAML data to a checked scenario; `where` is the file's name for messages.
 
     Raises:
         DrakeTeleopError: with the invalid field.
@@ -262,7 +254,7 @@ def replace(scenario: Scenario, **changes: object) -> Scenario:
     >>> replace(Scenario(), force_scaling__sigma=0.5).force_scaling.sigma
     0.5
 
-    Values are checked when the scenario is used, or by `Scenario.check`.
+    Values are checked when the scenario is used.
 
     Raises:
         DrakeTeleopError: if there is no such block or field.

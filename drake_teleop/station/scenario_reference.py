@@ -1,8 +1,4 @@
-"""Reference, JSON schema and commented YAML of a scenario, generated from the dataclasses.
-
-docs/make_reference.py writes docs/scenario.md (`reference`) and docs/scenario.schema.json
-(`json_schema`); `drake-teleop scenario NAME` prints `commented`.
-"""
+"""Reference page, JSON schema and commented YAML of a scenario, generated from the dataclasses."""
 
 from __future__ import annotations
 
@@ -56,7 +52,6 @@ def commented(scenario: Scenario) -> str:
 
 
 def _all_texts(value: Any) -> list[str]:
-    """Return all strings of a scenario, to check that YAML preserves them."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, field.name) for field in dataclasses.fields(value)]
     if isinstance(value, dict):
@@ -70,8 +65,8 @@ def write_scenario(path: Path, scenario: Scenario) -> None:
     """Write every field of a scenario to a YAML file, for `LoadScenario`.
 
     Raises:
-        DrakeTeleopError: if reading the file would not give the same scenario, or the file
-            cannot be written.
+        DrakeTeleopError: if reading the file would not give the same scenario, or the file cannot
+            be written.
     """
     text, where = commented(scenario), str(path)
     found = ScenarioFromData(yaml_data(text, where, tagged=True), where)
@@ -122,7 +117,6 @@ def _block_lines(config: Any) -> list[str]:
 
 
 def _inner_lines(entry: FieldInfo) -> list[str]:
-    """Return the YAML lines of inner blocks; blocks that are not set are commented out."""
     if entry.default:
         return _named_lines(entry, entry.default)
     blocks = [block() for block in entry.blocks]

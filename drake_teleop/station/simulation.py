@@ -41,13 +41,12 @@ def simulate(
         simulation: duration, settling time, integrator and seed.
         progress: True shows a progress bar after one second; or a function of the completed
             fraction.
-        log: folder for the log, which is written during the run in parts of some seconds, so that
-            memory does not grow (`SimulationResult.scan_parquet`). After Ctrl-C or an error it
-            contains all samples; a killed process loses the last part. An old log is replaced.
+        log: folder for a log in parts, written during the run so that memory does not grow. After
+            Ctrl-C or an error it contains all samples. An old log is replaced.
 
     Returns:
         The recorded signals; t = 0 at the end of the settling time. With `log`, signals are read
-        at each access.
+            from the disk at each access.
 
     Raises:
         DrakeTeleopError: if an argument is invalid, a joint of the slave leaves its range, the
@@ -95,11 +94,7 @@ def _task_is_over(simulator: Simulator) -> bool:
 
 
 def _stop_at_fault(simulator: Simulator, start: float, rows: int) -> int:
-    """Check the log's rows from index `rows` on for faults; return the new number of rows.
-
-    Raises:
-        DrakeTeleopError: for the first fault.
-    """
+    """Raise a DrakeTeleopError for a fault in the log from row `rows` on; return its length."""
     station = simulator.get_system()
     log = station.GetSubsystemByName(LOG).FindLog(simulator.get_context())
     for name, column in columns(station).items():
@@ -127,7 +122,6 @@ class LogOnDisk:
 
     Args:
         folder: folder of the log; an old log is replaced.
-        simulator: simulator of the station.
         start: time that becomes t = 0 [s].
         form: converts the rows to the common form of all parts.
     """
@@ -156,8 +150,7 @@ class LogOnDisk:
     def take(self) -> None:
         """Write the rows in memory as the next part, and remove them from memory.
 
-        After an interrupt inside this method it may be called again: it rewrites the same part or
-        writes nothing new.
+        After an interrupt it may be called again: it rewrites the same part or writes nothing new.
         """
         part = self._read()
         self._write(part)
@@ -165,7 +158,7 @@ class LogOnDisk:
         self._rows += len(part.t)
 
     def keep(self) -> None:
-        """Write the rows in memory but keep them; the next `take` rewrites and extends it."""
+        """Write the rows in memory but keep them; the next `take` rewrites and extends the part."""
         self._write(self._read())
 
     def _write(self, part: SimulationResult) -> None:
@@ -187,10 +180,7 @@ def MakeSimulator(diagram: Diagram, simulation: Simulation) -> Simulator:
 
 
 def advance(simulator: Simulator, time: float) -> None:
-    """Call `simulator.AdvanceTo(time)` with garbage collection disabled.
-
-    The blocks create many short-lived arrays but no cycles, so that collection only costs time.
-    """
+    """Advance the simulator to `time` [s] with garbage collection disabled, which saves time."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

@@ -52,7 +52,7 @@ def MakeSlaveSide(
     load_covariance: Array | None = None,
     noise_floor: NoiseFloor | None = None,
 ) -> Diagram:
-    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, elimination.
+    """Build inverse kinematics, joint control, arm, wrist sensor, load estimator, force scaling.
 
     .. pydrake_system::
 
@@ -73,8 +73,7 @@ def MakeSlaveSide(
           surroundings): signals
         - sample, scaled_contact_and_fault: several of these signals in one port, for the log
 
-    Args:
-        scenario, load_estimate, load_covariance, noise_floor: as for `MakeTeleopStation`.
+    Arguments as for `MakeTeleopStation`.
 
     Raises:
         DrakeTeleopError: for an invalid value, an unreachable start, scales that require a load
@@ -148,10 +147,10 @@ def MakeSlaveSide(
 
 
 def MakeSlaveOnTrajectory(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build the slave side without master: the joints follow an excitation trajectory (section IV).
+    """Build the slave side without master: its joints follow an excitation trajectory (section IV).
 
-    The arm starts at the trajectory's start; `trajectory` runs once after the settling time.
-    Output ports are the signals of `MakeSlaveSide` that need neither command nor elimination.
+    `trajectory` runs once after the settling time. Output ports are the signals of `MakeSlaveSide`
+    that need neither command nor elimination.
     """
     builder = DiagramBuilder()
     start, _, _ = trajectory.evaluate(0.0)
@@ -183,7 +182,6 @@ def _add_slave_blocks(
     load_covariance: Array | None = None,
     q_start: Array | None = None,
 ) -> _SlaveBlocks:
-    """Add the blocks that both slave sides have; the joint command stays unconnected."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     slave = AddSlavePlant(builder, scenario.slave, scenario.surroundings, q_start)
     arm, plant, start = slave.arm, slave.plant, slave.start
@@ -261,10 +259,6 @@ def _add_slave_blocks(
 
 
 def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
-    """Return the number of samples of the joint servo per event of the simulation.
-
-    The number is 1 with contact by Drake, other moving bodies, or a position interface.
-    """
     contact, interface = slave.contact, scenario.joint_control.position_interface
     if contact.beyond or contact.plant_size or interface is not None:
         return 1
@@ -272,13 +266,7 @@ def _servo_samples_per_event(scenario: Scenario, slave: SlavePlant) -> int:
 
 
 def _check_friction(slave: SlavePlant, step: float) -> None:
-    """Reject dry friction that stops a joint within one step [s] (numerical instability).
-
-    A Runge-Kutta step is stable for (slope of friction / inertia) * step up to 2.5.
-
-    Raises:
-        DrakeTeleopError: for such friction at the start pose.
-    """
+    """Reject dry friction that stops a joint within one step [s] (numerical instability)."""
     if not slave.friction.any():
         return
     mass = mass_matrix(slave.arm, slave.start)

@@ -3,7 +3,7 @@
     operator, haptic device --- network, passivity --- arm, wrist sensor, elimination
           master side        <->      channel       <->          slave side
 
-Each side is one function in `drake_teleop.station`. Either side may be custom: docs/station.md.
+Either side may be custom: docs/station.md.
 """
 
 from __future__ import annotations
@@ -33,20 +33,18 @@ def MakeTeleopStation(
 ) -> Diagram:
     """Build the bilateral station: master side, channel, slave side.
 
-    Two direct wires replace a channel without network, method and contact detection. The output
-    ports are the sides' signals (`drake_teleop.station.signals`), which are recorded. The input
-    ports clutch, intended_pose and intended_twist of the master side may stay unconnected.
+    The output ports are the sides' signals (`station.signals`), which are recorded. The input ports
+    clutch, intended_pose and intended_twist of the master side may stay unconnected.
 
     Args:
-        scenario: configuration of the station.
-        load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an
-            identification. Optional if the estimator runs online or sigma = gamma; without an
-            estimate there is no `contact_wrench_S`.
+        load_estimate: (16,) Eq. (7), [offsets [N, N m]; phi] about So in S, from an identification.
+            Optional if the estimator runs online or sigma = gamma; without an estimate there is no
+            `contact_wrench_S`.
         load_covariance: (16, 16) covariance of the estimate: start value of a monitored load
             (`load_estimator.watch`). Use a method for noisy motion ("total"); the covariance of
             least squares is too small.
-        noise_floor: noise of the eliminated wrench in free motion, at the estimator's rate, for
-            contact detection: `LoadIdentification.noise_floor`.
+        noise_floor: noise of the wrench without the load's part in free motion, at the estimator's
+            rate, for contact detection: `LoadIdentification.noise_floor`.
         master: custom system with the ports of `MakeMasterSide(scenario)`.
         slave: custom system with the ports of `MakeSlaveSide(scenario, ...)`; it ignores
             load_estimate, load_covariance and noise_floor.
@@ -103,7 +101,7 @@ def MakeTeleopStation(
 
 
 def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory) -> Diagram:
-    """Build a station with only the slave, on a trajectory: see `MakeSlaveOnTrajectory`."""
+    """Build a station with only the slave, whose joints follow an excitation trajectory."""
     check_scenario(scenario)
     expect(FourierTrajectory, trajectory, "trajectory")
     builder = DiagramBuilder()
@@ -112,7 +110,7 @@ def MakeIdentificationStation(scenario: Scenario, trajectory: FourierTrajectory)
 
 
 def GetBlock(station: Diagram, name: str) -> System:
-    """Return the block `name` ("force_scaling", "slave_plant", ...) from any side."""
+    """Return the block `name` ("force_scaling", "slave_plant", ...) of the station."""
     sides = [side for side in station.GetSystems() if isinstance(side, Diagram)]
     (side,) = (side for side in sides if side.HasSubsystemNamed(name))
     return side.GetSubsystemByName(name)

@@ -12,8 +12,8 @@ false_notices                number of detected contacts before the first contac
 press_error_N                RMS error of the held force; nan if not held
 ============================ =====================================================================
 
-The interval ends when the operator finishes or gives up, or with the log. A failed task has only
-success, detection_time_s and false_notices; the others are nan. `task_failure` gives the reason.
+The interval ends when the operator finishes or gives up, or with the log. For a failed task all but
+success, detection_time_s and false_notices are nan.
 """
 
 from __future__ import annotations
@@ -54,11 +54,10 @@ _PHASE_TEXTS = {
 
 
 def task_measures(result: SimulationResult, scenario: Scenario) -> dict[str, float]:
-    """Return the measures of the module's table for one run.
+    """Return the measures of a task by name for one run; the module explains them.
 
     Args:
         result: result with the signal task_state.
-        scenario: scenario of the run.
 
     Raises:
         DrakeTeleopError: if the scenario has no task.
@@ -151,7 +150,10 @@ def contact_force(result: SimulationResult) -> Array:
 
 
 def detection_time(t: Array, touching: NDArray[np.bool_], noticed: NDArray[np.bool_]) -> float:
-    """Return the time from the first contact to its detection [s]; nan if either is missing."""
+    """Return the time from the first contact to its detection [s]; nan if either is missing.
+
+    All arguments are (N,): times [s], true contact, detected contact.
+    """
     if not touching.any():
         return math.nan
     contact = int(np.argmax(touching))
@@ -169,7 +171,6 @@ def _held_force(t: Array, force: Array, task: Press, ended: int) -> Array:
 
 
 def _failed_criterion(result: SimulationResult, scenario: Scenario, task: Task, ended: int) -> str:
-    """Return the violated success criterion as text; "" if there is none."""
     force = contact_force(result)
     if isinstance(task, Press):
         held = float(_held_force(result.t, force, task, ended).mean())

@@ -1,4 +1,4 @@
-"""Export, connection and recording of ports; a missing port gives one kind of error."""
+"""Export, connection and recording of the ports of a station."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def wire(builder: DiagramBuilder, source: System, name: str, target: System, ent
 def record(builder: DiagramBuilder, title: str, sides: Iterable[System], log_hz: float) -> Diagram:
     """Export and record signals in the order of `SIGNALS`, then poses; build the diagram.
 
-    Signals that share one port of a side (`COMBINED_PORTS`) are recorded from this port.
+    `log_hz` is the rate of the log. Signals that share one port of a side (`COMBINED_PORTS`) are
+    recorded from this port.
     """
     outputs = {
         port.get_name(): port

@@ -1,8 +1,6 @@
-"""Channel between master and slave: a network, both of its ends, and their block (long: one step).
+"""Channel between master and slave: network and passivity method at both ends (long: one step).
 
-In every period both ends run one step of the passivity method (`station.passivity`). Their packets
-pass one line of the network (`network`) in each direction. The step works in world axes and in the
-master's power units, see `passivity.methods`.
+In every period both ends run one step of the method; their packets pass the network.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -138,11 +136,9 @@ _NO_LOAD = np.zeros(6)
 def initial_ends(
     method: str, parameters: NDArray[np.float64], start: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the state of both ends before their first step.
+    """Return the state vector of both ends before their first step.
 
     Args:
-        method: one of `METHODS`.
-        parameters: result of `methods.parameters`.
         start: (7,) pose X_WS of the slave and of its command.
     """
     ends = np.zeros(_SIZE)
@@ -187,7 +183,6 @@ def channel_step(
         T: time between steps [s].
         timeout: time without packets before the safe state [s].
         frame: (11,) R_WB by rows, scale of translation and of rotation.
-        parameters: result of `methods.parameters`.
         forward_parameters, backward_parameters: results of `network.parameters`.
         forward, backward, ends: states of both directions and of the ends, updated.
         pose_received: (7,) written: slave's command X_WS.
@@ -274,16 +269,7 @@ def channel_step(
 
 @njit(cache=True)
 def _increment_into(pose, before, dx):
-    """Write the pose increment since the last step; 0 if one of both poses is not finite.
-
-    Args:
-        pose: (7,) present pose.
-        before: (8,) last finite pose; 1 if the last pose was not finite. Updated.
-        dx: (6,) written: increment.
-
-    Returns:
-        True if the pose is finite.
-    """
+    """Write the increment `dx` (6,) since the last finite pose; return whether `pose` is finite."""
     valid = sound(pose)
     if valid:
         difference_into(pose, before, dx)
@@ -296,7 +282,6 @@ def _increment_into(pose, before, dx):
 
 @njit(cache=True)
 def _to_world(wrench_B, frame, out):
-    """Convert a wrench at the hand, in B, to W and the master's power units."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -308,7 +293,6 @@ def _to_world(wrench_B, frame, out):
 
 @njit(cache=True)
 def _to_master(wrench, frame, out):
-    """Convert a wrench to the hand, the inverse of `_to_world`."""
     R, scales = frame[_ROTATION], frame[_SCALES]
     for g in range(2):
         for i in range(3):
@@ -319,15 +303,11 @@ def _to_master(wrench, frame, out):
 
 
 class TeleopChannel(LeafSystem):
-    """Network with a passivity method at both ends.
+    """Network with a passivity method at both ends; a packet takes at least one period.
 
-    A packet takes at least one period. Both ends have a safe state, see
-    `drake_teleop.station.passivity.safe_state`. The last valid wrench is used while the wrist
-    sensor is saturated.
-
-    The rendered wrench depends on the inputs without delay, so that wrench times increment of the
-    command is the work at the device. This is exact for translation, and for rotation with scale 1.
-    The output is valid only at the instants of the period.
+    Both ends have a safe state for silence and faults (`station.passivity.safe_state`). While the
+    wrist sensor is saturated, the last valid wrench is used. The rendered wrench depends on the
+    inputs without delay, so that wrench times increment of the command is the work at the device.
 
     .. pydrake_system::
 
@@ -349,14 +329,11 @@ class TeleopChannel(LeafSystem):
         - contact_at_hand: (1,) contact flag of the newest packet at the master
 
     Args:
-        channel: network and timeout.
-        passivity: passivity method.
         R_WB: (3, 3) alignment of the master's base with the world.
         scales: (2,) scale of translation and rotation, slave over master.
         force_scale: scale of force, slave to master.
         start: (7,) pose X_WS of the slave at the start.
         period: time between packets [s].
-        seed: seed of the random numbers.
     """
 
     __slots__ = ONE_DICT
@@ -444,11 +421,9 @@ class TeleopChannel(LeafSystem):
         """Start in a running station, without packets in transit and with a constant slave command.
 
         Args:
-            context: context of this block.
             command: (7,) present command X_WS of the slave; the master's command must be equal.
             slave: (7,) actual pose X_WS of the slave.
-            fills: time with open clutch [s]. During it the slave of `wave` keeps its command and
-                reflects the present wrench.
+            fills: time with open clutch [s], in which the slave of method `wave` keeps its command.
         """
         ends = initial_ends(*self._initial_arguments, command)
         ends[_POSE_S][:7], ends[MEMORY_S][FILL_TIME] = slave, fills
@@ -482,7 +457,6 @@ class TeleopChannel(LeafSystem):
         )
 
     def _step_result(self, context: Context) -> list[NDArray[np.float64]]:
-        """Return the state after the step, and the values received at the master."""
         return self.get_cache_entry(self._step).Eval(context)
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

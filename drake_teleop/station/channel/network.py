@@ -1,14 +1,8 @@
 """Simulated network; it returns the newest packet at each step (docs/theory.md, (T26), (T27)).
 
-* Delay: `jitter` j gives the standard deviation j D / sqrt(3) about the mean D: uniform from
-  (1 - j) D to (1 + j) D; normal, at least 0; or (1 - j) D plus a gamma distribution of shape 3
-  (Mukherjee 1992; Chen et al., ROBIO 2008). Delays are rounded to whole steps and independent, so
-  jitter reorders packets. Use a recorded trace for a queue that keeps the order.
-* Loss: Gilbert-Elliott chain in continuous time. `rate_hz` sends at even intervals.
-* Playout buffer: a packet is used at the earliest `playout` after it was sent. `redundant` packets
-  repeat earlier samples, so a sufficient `playout` makes the delay exactly constant.
-
-All random numbers are hashes of (seed, direction, step).
+Delays are random and independent, so jitter reorders packets; `gamma`: Mukherjee 1992; Chen et al.,
+ROBIO 2008. Losses follow a Gilbert-Elliott chain. Random numbers are hashes of (seed, direction,
+step).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -72,11 +66,7 @@ class NetworkConfig:
     )
 
     def check(self, where: str = "network") -> None:
-        """Check every value except the trace, which `parameters` reads.
-
-        Raises:
-            DrakeTeleopError: with `where` and the invalid field.
-        """
+        """Check all fields except the trace; raise a DrakeTeleopError for an invalid one."""
         check_ranges(self, where)
         if self.loss > self.burst_loss:
             raise DrakeTeleopError(
@@ -127,8 +117,6 @@ def parameters(
     """Return the parameters of one direction for the compiled functions below.
 
     Args:
-        config: network of this direction.
-        seed: seed of the scenario.
         direction: FORWARD or BACKWARD, with independent random numbers.
         period: time between steps [s].
         least: smallest delay of a packet [steps].
@@ -167,7 +155,7 @@ def parameters(
 
 
 def mean_delay(config: NetworkConfig) -> float:
-    """Return the mean age of packets at their use [s]; lost packets do not count."""
+    """Return the mean one-way delay of arriving packets, at least the playout time [s]."""
     if config.trace is None:
         return max(config.delay, config.playout)
     delays = _read_trace(Path(config.trace), _TRACE_STEP) * _TRACE_STEP
@@ -213,7 +201,6 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _uniform(p, k, draw):
-    """Return the random number `draw` (0 to 15) of packet k, uniform in (0, 1]."""
     return (float(random_bits(np.uint64(p[_KEY]), 16 * k + draw)) + 1.0) * 2.0**-53
 
 
@@ -240,10 +227,7 @@ def _delay_steps(p, k, draw):
 
 @njit(cache=True)
 def _advance_chain(p, k, bad):
-    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none).
-
-    `bad` is the state one step before: 0 good, 1 bad; before step 0 the probability of bad.
-    """
+    """Return the loss chain's state at step k; delays of packet and copy [steps] (-1: none)."""
     if p[_BAD_SHARE] > 0.0:
         likely = p[_BAD_SHARE] + (bad - p[_BAD_SHARE]) * p[_BAD_MEMORY]
         bad = 1.0 if _uniform(p, k, 0) <= likely else 0.0
@@ -261,16 +245,12 @@ def _advance_chain(p, k, bad):
 def initial_state(
     p: NDArray[np.float64], neutral: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the state of a line before step 0.
+    """Return the state of one direction before step 0: receiver (4 + N,), packets in transit.
 
     Args:
         p: result of `parameters`.
-        neutral: (N,) values at the receiver before the first packet. The line carries the first N
-            numbers of a packet.
-
-    Returns:
-        State of the receiver (4 + N,) with its last packet, and the packets in transit. There, step
-        k writes only the places of packet k, so a repeated step writes the same.
+        neutral: (N,) values at the receiver before the first packet. Only the first N numbers of a
+            packet are transmitted.
     """
     slots = int(p[_SLOTS])
     receiver = np.concatenate([[p[_BAD_SHARE], -1.0, -1.0, 0.0], neutral])
@@ -279,7 +259,10 @@ def initial_state(
 
 @njit(cache=True)
 def send(p, state, k, packet):
-    """Send the packet (N,) of step k over the line `state`; steps count from 0 without gaps."""
+    """Send the packet (N,) of step `k`; steps count from 0 without gaps.
+
+    `p` is from `parameters`; `state`, from `initial_state`, is updated.
+    """
     receiver, in_transit = state
     slots, size = int(p[_SLOTS]), receiver.shape[0] - _LAST_PACKET
     receiver[_BAD], first, second = _advance_chain(p, k, receiver[_BAD])
@@ -325,7 +308,6 @@ def receive(p, state, k, packet):
 
 @njit(cache=True)
 def _fill_silence(policy, silent, packet):
-    """Apply the policy `NetworkConfig.silence` to the last packet, `silent` seconds after it."""
     velocity, pose = packet[VELOCITY], packet[POSE]
     if policy == _ZERO:
         velocity[:] = 0.0
@@ -341,8 +323,7 @@ def packet_delays(
 ) -> NDArray[np.int64]:
     """Return the delays (steps, 2) of each packet and of its copy [steps]; -1: does not arrive.
 
-    Args:
-        config, seed, direction, period: as for `parameters`.
+    Other arguments as for `parameters`.
     """
     return _all_delays(parameters(config, seed, direction, period), steps)
 
@@ -358,10 +339,9 @@ def _all_delays(p, steps):
 def newest_packets(
     config: NetworkConfig, seed: int, direction: int, steps: int, period: float
 ) -> NDArray[np.int64]:
-    """Return the number of the newest packet at each step (steps,), as `receive` does; -1 for none.
+    """Return the number of the newest received packet at each step, (steps,); -1 for none.
 
-    Args:
-        config, seed, direction, period: as for `parameters`.
+    Other arguments as for `parameters`.
     """
     p = parameters(config, seed, direction, period)
     sent, arrived, playout = np.arange(steps), np.full(steps, -1), int(p[_PLAYOUT])
@@ -374,10 +354,9 @@ def newest_packets(
 
 
 def longest_silence(config: NetworkConfig, direction: int, period: float) -> float:
-    """Return the longest time without a new packet in a minute after the first packet [s].
+    """Return the longest time without a new packet in a simulated minute [s].
 
-    Args:
-        config, direction, period: as for `parameters`. The seed is fixed, not the scenario's.
+    `direction` and `period` are as for `parameters`. The random seed is fixed.
     """
     steps = math.ceil((_MINUTE_S + longest_delay(config)) / period)
     newest = newest_packets(config, _SILENCE_SEED, direction, steps, period)

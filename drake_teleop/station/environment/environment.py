@@ -21,7 +21,7 @@ from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex, QuaternionFloa
 
 
 class Stand(NamedTuple):
-    """Box on the floor that a replay shows below an environment: sizes and position [m], in W."""
+    """Box on the floor that a 3D replay shows below an environment: sizes, position [m] in W."""
 
     along_x: float
     along_y: float
@@ -40,7 +40,10 @@ class Environment(ABC):
     @property
     @abstractmethod
     def slip(self) -> float:
-        """Slip speed of full friction [m/s]; the smallest of all environments applies."""
+        """Slip speed at which friction is fully developed [m/s].
+
+        The smallest of all environments applies.
+        """
 
     @abstractmethod
     def AddTo(self, plant: MultibodyPlant) -> None:
@@ -49,15 +52,11 @@ class Environment(ABC):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Change contact pairs and materials, also of the tool, after Finalize."""
+        """Change contact pairs and materials after Finalize, also those of the body `tool`."""
         return
 
     def check(self, where: str) -> None:
-        """Check rules that concern several fields.
-
-        Raises:
-            DrakeTeleopError: with `where` and the field.
-        """
+        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         return
 
     @property
@@ -72,7 +71,7 @@ class Environment(ABC):
 
     @property
     def moving_part(self) -> tuple[float, float, float] | None:
-        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a prismatic joint.
+        """Mass [kg], stiffness [N/m] and damping [N s/m] of a body on a sprung prismatic joint.
 
         The joint's position is 0 at rest. None if there is no such body.
         """
@@ -80,7 +79,7 @@ class Environment(ABC):
 
     @property
     def stand(self) -> Stand | None:
-        """Stand below the environment in a replay, if any."""
+        """Box that a 3D replay shows below the environment, if any."""
         return None
 
 
@@ -137,7 +136,7 @@ def BodiesOfTool(plant: MultibodyPlant, tool: BodyIndex) -> list[BodyIndex]:
 def ToolShapes(
     plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
 ) -> dict[BodyIndex, list[GeometryId]]:
-    """Return the shapes with contact properties for each body of the tool (see `BodiesOfTool`)."""
+    """Return the shapes with contact properties for each body of the tool, also welded ones."""
     properties = scene_graph.model_inspector().GetProximityProperties
     return {
         index: [
@@ -170,7 +169,10 @@ def ExcludeContact(
 
 
 def ContactMaterial(stiffness: float, dissipation: float, friction: float) -> ProximityProperties:
-    """Return a material for Drake's point contact, with equal static and dynamic friction."""
+    """Return a material for Drake's point contact, with equal static and dynamic friction.
+
+    Units: stiffness [N/m], Hunt-Crossley dissipation [s/m], friction coefficient [1].
+    """
     properties = ProximityProperties()
     AddContactMaterial(properties, dissipation, stiffness, CoulombFriction(friction, friction))
     return properties

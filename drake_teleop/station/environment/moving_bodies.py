@@ -1,9 +1,8 @@
-"""Poses of moving bodies from the plant's state, compiled, for contact between plant steps.
+"""Compiled poses of moving bodies from the plant's state, for contact between plant steps.
 
-The bodies are connected to each other and the world by revolute, prismatic, free or fixed joints.
-From parent to child, with F on the parent P and M on the body B,
+From parent P (joint frame F) to child B (joint frame M), and likewise for velocities:
 
-    X_WB = X_WP X_PF X_FM(q) X_MB,   and velocities likewise, expressed in W.
+    X_WB = X_WP X_PF X_FM(q) X_MB
 """
 
 from __future__ import annotations
@@ -56,9 +55,9 @@ def JointTable(plant: MultibodyPlant, bodies: Iterable[BodyIndex]) -> tuple[Arra
 
     Returns:
         Table (m, 21) with a joint in each row, parents first: 0 row of the parent, or -1 if it is
-        anchored; 1 type of joint; 2 and 3 first index of positions and velocities in the state
-        [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored parent) and 14-20 X_MB, a quaternion and a
-        position each. Body index of each row: `bodies` and their parents.
+            anchored; 1 type of joint; 2 and 3 first index of positions and velocities in the state
+            [q; v]; 4-6 axis; 7-13 X_PF (X_WF for an anchored parent) and 14-20 X_MB, a quaternion
+            and a position each. Body index of each row: `bodies` and their parents.
     """
     # Indices instead of joints: a stored joint and its plant would keep each other alive.
     above: dict[int, tuple[int, int]] = {}
@@ -112,7 +111,10 @@ def _quaternion(x, i):
 
 @njit(cache=True)
 def bodies_into(joints, state, out):
-    """Write the bodies' pose and twist (m, 13), see `POSE_AND_TWIST`, at the state [q; v]."""
+    """Write pose and twist of each body (m, 13) at the plant's state [q; v] into `out`.
+
+    A row is [q_WB (4), p_WB (3), omega_WB_W (3), v_WB_W (3)]; `joints` is a `JointTable`.
+    """
     still = (0.0, 0.0, 0.0)
     for k in range(joints.shape[0]):
         row = joints[k]
@@ -155,7 +157,6 @@ def bodies_into(joints, state, out):
 
 @njit(cache=True)
 def _hermite(h, u, a, a_dot, b, b_dot):
-    """Return value and rate of a cubic from a to b at the fraction u of the interval h [s]."""
     d = b - a
     c2, c3 = 3.0 * d - h * (2.0 * a_dot + b_dot), h * (a_dot + b_dot) - 2.0 * d
     value = a + u * (h * a_dot + u * (c2 + u * c3))
@@ -164,16 +165,14 @@ def _hermite(h, u, a, a_dot, b, b_dot):
 
 @njit(cache=True)
 def _quaternion_rate(spin, turn):
-    """Return the rate of the quaternion `turn` for the angular velocity `spin`."""
     return multiply((0.0, 0.5 * spin[0], 0.5 * spin[1], 0.5 * spin[2]), turn)
 
 
 @njit(cache=True)
 def interpolate_bodies(joints, h, u, start, end, out):
-    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`.
+    """Write the joints' state [q; v] at the fraction u of a step of h [s] into `out`, by cubics.
 
-    Positions are cubic polynomials in time, velocities are their rates: third order, as the
-    integrator. The rest of `out` is unchanged.
+    `joints` is a `JointTable`; `start` and `end` are the plant's states at both ends of the step.
     """
     for k in range(joints.shape[0]):
         q, v, kind = int(joints[k, _Q]), int(joints[k, _V]), joints[k, _KIND]

@@ -1,7 +1,6 @@
 """Drake's compliant point contact between the tool's spheres and boxes, compiled.
 
-The wrist sensor samples between the steps of the plant, where Drake has no contact results. The law
-is that of Drake for continuous plants (Hunt and Crossley 1975; regularised Coulomb friction):
+Normal force f_n and friction f_t (Hunt and Crossley 1975; regularised Coulomb friction) are
 
     f_n = k x (1 + d x') >= 0;   f_t = -mu(|v_t| / v_s) f_n v_t / |v_t|
 
@@ -46,18 +45,17 @@ _MIN_SLIP_SPEED = 1e-14  # m/s, as in Drake: a point at rest has a direction
 
 
 class Pairs(NamedTuple):
-    """Pairs of shapes that may touch.
+    """Pairs of a shape of the tool and a shape of the environment that may touch.
 
     Attributes:
         known: (k, 28), pairs of a sphere of the tool and a box: 0-2 centre of the sphere in S [m],
             3 its radius, 4-12 R_WBox by rows and 13-15 p_WBox at rest (in the body instead of W if
-            the body moves), 16-18 half the box's edges, 19-21 direction in which a leaf moves in W
-            (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25 static and
-            dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the body in a
-            `JointTable`, or -1.
-        watched: (l, 40), bounding boxes of all other pairs, see `separation`. As above, with 0-2
-            the centre of the tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39
-            half its edges.
+            the body moves), 16-18 half the box's edges, 19-21 direction in which a sheet spring
+            moves in W (zero if fixed), 22 stiffness k [N/m], 23 dissipation d [s/m], 24 and 25
+            static and dynamic friction, 26 slip speed v_s of full friction [m/s], 27 row of the
+            body in a `JointTable`, or -1.
+        watched: (l, 40), bounding boxes of all other pairs. As above, with 0-2 the centre of the
+            tool's box, 3 unused; 28-36 R_SBox of the tool's box by rows, 37-39 half its edges.
         unknown: reason why the first of the other pairs is not in `known`.
     """
 
@@ -77,11 +75,9 @@ def ContactPairs(
     """Return the pairs of a shape of the tool and one of the environment.
 
     Args:
-        plant: finalized plant; a leaf of the environment is at 0 by default.
-        inspector: inspector of the scene graph.
+        plant: finalized plant.
         tool: shapes of the tool -> poses of their bodies in S.
-        environment: model instances that the tool may touch.
-        slip: slip speed v_s of full friction [m/s]; the plant's stiction tolerance.
+        slip: slip speed of full friction [m/s]; the plant's stiction tolerance.
         moving: indices of the bodies of a `JointTable`, row by row.
 
     Raises:
@@ -165,10 +161,6 @@ def _motion_direction(plant: MultibodyPlant, context: Context, body: RigidBody) 
 
 
 def _contact_law(ball: ProximityProperties, box: ProximityProperties) -> list[float]:
-    """Return stiffness, dissipation, static and dynamic friction of a pair, as in Drake.
-
-    Springs are in series, dissipation is weighted by deformation, friction is the harmonic mean.
-    """
     for shape in (ball, box):
         if not all(shape.HasProperty("material", name) for name in (_STIFFNESS, _DISSIPATION)):
             raise DrakeTeleopError(
@@ -190,10 +182,9 @@ def indentation(pair: Array, p_WS: Array, R_WS: Array, deflection: float, normal
     """Return the depth of a sphere in its box [m], below 0 if they are apart.
 
     Args:
-        pair: (28,) row of `Pairs`.
-        p_WS: (3,) origin of the sensor frame S in W [m].
-        R_WS: (3, 3) rotation of S.
-        deflection: deflection of the leaf [m].
+        pair: (28,) row of `Pairs.known`.
+        p_WS, R_WS: (3,) position [m] and (3, 3) rotation of the sensor frame S in W.
+        deflection: deflection of the sheet spring [m].
         normal: (6,) written if the result is not below 0: direction out of the box in W (3), point
             of contact in W [m] (3).
     """
@@ -244,8 +235,7 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
     Args:
         pair: (40,) row of `Pairs.watched`, for the tool's box.
         box: (28,) this row with the present pose of the other box.
-        p_WS, R_WS: position and rotation of the sensor frame S in W.
-        deflection: deflection of the leaf [m].
+        p_WS, R_WS, deflection: as for `indentation`.
     """
     R, between = rows(R_WS), minus(three(p_WS, 0), three(box, 13))
     between = plus(between, apply(R, three(pair, 0)))
@@ -268,7 +258,6 @@ def separation(pair: Array, box: Array, p_WS: Array, R_WS: Array, deflection: fl
 
 @njit(cache=True)
 def _friction(static: float, dynamic: float, slip: float) -> float:
-    """Return the friction coefficient at a slip in units of v_s (Drake's StribeckModel)."""
     if slip < 1.0:
         return static * slip**3 * (10.0 + slip * (6.0 * slip - 15.0))
     if slip < 3.0:
@@ -279,14 +268,13 @@ def _friction(static: float, dynamic: float, slip: float) -> float:
 
 @njit(cache=True)
 def contact_force(pair: Array, x: float, normal: Array, velocity: Array, force: Array) -> None:
-    """Write the contact force on a sphere at the depth `x` in its box.
+    """Write the contact force on a sphere in its box into `force` (3,) [N].
 
     Args:
-        pair: (28,) row of `Pairs`.
+        pair: (28,) row of `Pairs.known`.
         x: depth [m].
         normal: (3,) direction out of the box.
         velocity: (3,) velocity of the sphere at the point of contact, relative to the box [m/s].
-        force: (3,) written [N].
     """
     out = dot(velocity, normal)
     f_n = max(pair[22] * x * (1.0 - pair[23] * out), 0.0)

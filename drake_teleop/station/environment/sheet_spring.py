@@ -1,7 +1,6 @@
-"""Sheet spring of the paper's Fig. 5: a clamped-free leaf that the ball tip hits.
+"""Sheet spring of the paper's Fig. 5: a leaf, clamped at one end, that the tool's ball hits.
 
-The first bending mode is one degree of freedom (Euler-Bernoulli stiffness, Rayleigh mass). Contact
-of ball and leaf is Drake's compliant point contact.
+The first bending mode is one degree of freedom.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -99,7 +98,7 @@ class SheetSpring(Environment):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Exclude contact of the leaf's deep collision shape with all bodies except the tool."""
+        """Exclude contact of the sheet's deep collision shape with all bodies except the tool."""
         leaf = plant.GetBodyByName("leaf")
         tool_bodies = BodiesOfTool(plant, tool)
         others = [k for k in map(BodyIndex, range(plant.num_bodies())) if k not in tool_bodies]

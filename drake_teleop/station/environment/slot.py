@@ -6,8 +6,8 @@ Section across the slot, M is the middle of its mouth, z up::
     ------.       M       .------        on an edge of two boxes touches both, so an edge is up to
            \.     |     ./  chamfer      twice as stiff as a face. The slot is open at its ends.
              |    |    |
-             |  width  |  wall           The peg is the tool's ball and a second one up its shank:
-             |_________|                 two balls can jam between parallel walls, as a cylinder.
+             |  width  |  wall
+             |_________|
                 floor
 """
 
@@ -62,11 +62,7 @@ class Slot(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed at which friction is complete [m/s] (E: estimate).
-
-        A peg at rest creeps more slowly. A tenth of this value makes the simulation three times as
-        long.
-        """
+        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     @property
@@ -76,7 +72,7 @@ class Slot(Environment):
 
     @property
     def X_WM(self) -> RigidTransform:
-        """Pose X_WM of the middle of the slot's mouth; x is along the slot, z is up."""
+        """Pose of the middle of the slot's mouth in W; x is along the slot, z is up."""
         return RigidTransform(RollPitchYaw(0.0, 0.0, self.yaw), self.position)
 
     @property
@@ -84,10 +80,9 @@ class Slot(Environment):
         return Stand(0.16, 0.16, self.position[0], self.position[1], self.foot)
 
     def AddTo(self, plant: MultibodyPlant) -> None:
-        """Add the slot and the tool's second ball to a plant with the tool, before Finalize.
+        """Add the slot, fixed in the world, and the tool's second ball to a plant, before Finalize.
 
-        The body "slot" is welded to the world. The second ball has no mass. Without a scene graph
-        there are no shapes.
+        The ball has no mass. Without a scene graph there are no shapes.
         """
         body = plant.AddRigidBody("slot", plant.AddModelInstance("slot"), SpatialInertia.Zero())
         plant.WeldFrames(plant.world_frame(), body.body_frame(), self.X_WM)
@@ -111,12 +106,10 @@ class Slot(Environment):
 
 
 def _material(slot: Slot) -> ProximityProperties:
-    """Return the contact material of both sides: equal springs in series give `stiffness`."""
     return ContactMaterial(2 * slot.stiffness, slot.dissipation, slot.friction)
 
 
 def _boxes(slot: Slot) -> dict[str, tuple[RigidTransform, Box]]:
-    """Return pose in M and shape of each box of the slot, by name."""
     edge, c, depth = slot.width / 2, slot.chamfer, slot.depth
     boxes = {}
     for name, side in (("left", 1.0), ("right", -1.0)):

@@ -1,7 +1,6 @@
 """Solids with Drake's point contact: fixed wall and box, movable block on a table.
 
-Drake's point contact reduces the contact of two boxes to one point, which cannot carry a box. So
-the block stands on balls of 2 mm radius in its corners; the tool touches the box.
+The block stands on balls in its corners, because a contact of two boxes is a single point.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -55,7 +54,7 @@ class Surface(Environment):
 
     @property
     def slip(self) -> float:
-        """Slip speed of full friction [m/s] (E: estimate)."""
+        """Slip speed at which friction is fully developed [m/s], an estimate."""
         return 1e-3
 
     def material(self) -> ProximityProperties:
@@ -89,10 +88,9 @@ def AddFixedBox(
 
     Args:
         plant: not finalized.
-        name: name of the body and of the model instance (with a number if the name exists).
+        name: name of body and model instance, numbered if it exists.
         X_WBox: pose of the box.
         size: (3,) lengths of its edges [m].
-        surface: contact surface of the box.
     """
     body = plant.AddRigidBody(name, NewInstance(plant, name), SpatialInertia.Zero())
     plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WBox)
@@ -116,7 +114,7 @@ class Wall(Surface):
     size: list[float] = quantity([0.4, 0.4], "m", 1e-3, 4.0, "of its face; it is 0.1 m thick")
 
     def check(self, where: str) -> None:
-        """Check that the normal has a direction."""
+        """Raise a DrakeTeleopError if the normal is zero."""
         if np.linalg.norm(self.normal) < 1e-3:
             raise DrakeTeleopError(
                 "has no direction",
@@ -148,7 +146,7 @@ class Block(Surface):
     )
 
     def check(self, where: str) -> None:
-        """Check that the table is not smaller than the block."""
+        """Raise a DrakeTeleopError if the table is smaller than the block."""
         if 0.0 < min(self.table) < max(self.size[:2]):
             raise DrakeTeleopError(
                 "the table is smaller than the block",
@@ -158,7 +156,7 @@ class Block(Surface):
 
     @property
     def stand(self) -> Stand | None:
-        """Stand below the table of the block in a replay."""
+        """Box that a 3D replay shows below the block's table; None without a table."""
         x, y, top = self.position
         across = 0.6 * min(self.table)
         return Stand(across, across, x, y, top - _TABLE_THICKNESS) if across > 0.0 else None
@@ -189,7 +187,7 @@ class Block(Surface):
     def PrepareContact(
         self, plant: MultibodyPlant, scene_graph: SceneGraph, tool: BodyIndex
     ) -> None:
-        """Let the tool touch only the box, and all other bodies only the balls."""
+        """Let the tool touch only the block's box, and all other bodies only its balls."""
         bodies = [BodyIndex(index) for index in range(plant.num_bodies())]
         blocks = [body for body in map(plant.get_body, bodies) if body.name() == _NAME]
         shapes = [shape for body in blocks for shape in plant.GetCollisionGeometriesForBody(body)]

@@ -1,9 +1,4 @@
-"""Contact detection at the slave from the wrench without the load's part.
-
-The flag is displayed to the operator. `drake_teleop.load.contact` describes the statistic. Noise
-floor and threshold come from an earlier identification: free motion of the same load with the same
-sensor.
-"""
+"""Contact detection at the slave from the wrench without the load's part."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -50,10 +45,6 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _update_flag(memory, sample, estimate, arm, settings):
-    """Update the detector with one sample; return whether there is contact.
-
-    An invalid sample or estimate does not change the result.
-    """
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
     contact, acceleration = np.empty(6), np.empty(3)
@@ -79,9 +70,7 @@ class ContactDetection(LeafSystem):
         - contact: (1,) 1 in contact, else 0
 
     Args:
-        config: settings of the detector.
         floor: noise floor in free motion, fitted at the rate of this block.
-        arm: the slave's kinematics.
         period: time between samples [s].
 
     Raises:

@@ -1,9 +1,4 @@
-"""Recursive estimator of load and offsets in the loop (Fig. 2 of the paper).
-
-It uses the sensor's samples and the kernels for logs (`drake_teleop.load.online.recursive`,
-`recursive_tls`). With `watch` it freezes a settled load, tracks the offsets, and detects another
-load (`drake_teleop.load.online.watched`). This needs the unbiased variances of "rtls".
-"""
+"""Recursive estimator of load and sensor offsets during a run (Fig. 2 of the paper)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -63,10 +58,9 @@ class LoadEstimatorConfig:
     )
 
     def check(self, where: str) -> None:
-        """Check that the method can be combined with `watch`.
+        """Raise a DrakeTeleopError if the method's covariance is too small for `watch`.
 
-        Raises:
-            DrakeTeleopError: with `where`, if the method's covariance is too small.
+        `where` is the block's path for the message.
         """
         if self.enabled and self.watch and not METHODS[self.method].allows_for_noisy_motion:
             raise DrakeTeleopError(
@@ -77,7 +71,7 @@ class LoadEstimatorConfig:
 
 
 class LoadEstimator(LeafSystem):
-    """Load estimator whose estimate is constant, updated with every sample, or monitored.
+    """Estimator of load and offsets: constant, updated with every sample, or monitored (`watch`).
 
     .. pydrake_system::
 
@@ -90,16 +84,13 @@ class LoadEstimator(LeafSystem):
           once the predicted uncertainty of every parameter is within the config's bound
 
     Args:
-        config: settings.
         noise_std: (6,) standard deviations of the wrench channels, for weighting [N, N m].
-        motion_std: (9,) standard deviations of specific force s [m/s^2], angular velocity omega
-            [rad/s] and angular acceleration alpha [rad/s^2], for "rtls" and for `watch`. For
-            learning only their ratios matter.
+        motion_std: (9,) standard deviations of specific force [m/s^2], angular velocity [rad/s] and
+            angular acceleration [rad/s^2], for "rtls" and for `watch`.
         period: sampling period [s].
         sample_size: length of the sample.
         initial: (16,) initial estimate.
-        covariance: (16, 16) covariance of `initial`; None if unknown. With it, `watch` begins at
-            once.
+        covariance: (16, 16) covariance of `initial`; with it, monitoring begins at once.
         fallback: (10,) phi to use after a change of load.
 
     Raises:

@@ -1,26 +1,6 @@
 """Haptic devices by name: the paper's Phantom, and others by data sheets.
 
-D: the manufacturer's value from memory; E: estimate. The workspace is the largest box in the real
-one: in a cylinder of 160 x 110 mm (omega) or a ball of 450 mm (Virtuose), D.
-
-| name | mass at the grip | friction | peak force | workspace, depth x width x height |
-|---|---|---|---|---|
-| geomagic_touch | 45 g D | 0.26 N D | 3.3 N D | 70 x 160 x 120 mm D |
-| omega_3, _6, _7 | 0.25, 0.3, 0.35 kg E | 0.3 N E | 12 N D | 110 x 113 x 113 mm E |
-| falcon | 0.2 kg E | 0.5 N E | 8.9 N D | 102 mm cube D |
-| haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
-| virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
-
-| name | position step | rotation step | device rate |
-|---|---|---|---|
-| geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
-| omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
-| falcon | 64 um, 400 dpi D | - | 1 kHz D |
-| haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
-| virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
-
-Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate. Gripper and buttons
-are not modelled.
+A comment above `FIGURES` has the source of each number. Grippers and buttons are not modelled.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -127,6 +107,27 @@ _OMEGA_SIZE = [0.11, 0.113, 0.113]
 _OMEGA_ROTATION = np.radians([120.0, 70.0, 160.0]).tolist()  # D
 _OMEGA_READING = {"resolution": 1e-5, "turn_resolution": math.radians(0.09), "rate_hz": 4000.0}
 
+# Sources: D is the manufacturer's value, from memory; E is an estimate. A workspace is the largest
+# box in the real one: in a cylinder of 160 x 110 mm (omega) or a ball of 450 mm (Virtuose), D.
+#
+# | name | mass at the grip | friction | peak force | workspace, depth x width x height |
+# |---|---|---|---|---|
+# | geomagic_touch | 45 g D | 0.26 N D | 3.3 N D | 70 x 160 x 120 mm D |
+# | omega_3, _6, _7 | 0.25, 0.3, 0.35 kg E | 0.3 N E | 12 N D | 110 x 113 x 113 mm E |
+# | falcon | 0.2 kg E | 0.5 N E | 8.9 N D | 102 mm cube D |
+# | haply_inverse3 | 0.2 kg E | 0.15 N E | 10 N D | 200 x 340 x 190 mm E |
+# | virtuose_6d | 1 kg E | 1 N E | 35 N D | 260 mm cube E |
+#
+# | name | position step | rotation step | device rate |
+# |---|---|---|---|
+# | geomagic_touch | 55 um, 450 dpi D | 2 mrad E | 1 kHz D |
+# | omega_3, _6, _7 | 10 um D | 0.09 degrees D | 4 kHz D |
+# | falcon | 64 um, 400 dpi D | - | 1 kHz D |
+# | haply_inverse3 | 20 um E | 2 mrad E | 4 kHz E |
+# | virtuose_6d | 20 um E | 0.2 mrad E | 1 kHz D |
+#
+# Only the Virtuose displays torque (3.1 N m D); omega.3 and Falcon do not rotate.
+
 #: Data sheets by name, for `Master.figures`.
 FIGURES: dict[str, DeviceFigures] = {
     "geomagic_touch": _data_sheet(
@@ -186,10 +187,10 @@ class Master:
     leader: Leader | None = None
 
     def device(self, hand_mass: float, hand_inertia: float) -> HapticDevice | LeaderDevice:
-        """Return the device with the hand's passive mass [kg] and inertia about E [kg m^2] added.
+        """Return the dynamics of the device with the hand's mass [kg] and inertia about E [kg m^2].
 
         Raises:
-            DrakeTeleopError: as `Leader.device`.
+            DrakeTeleopError: if the model of a leader arm cannot be used, see `Leader.device`.
         """
         if self.leader is not None:
             return self.leader.device(self.position, hand_mass, hand_inertia)
@@ -215,7 +216,7 @@ class Master:
         return self.leader is not None and self.leader.leads == JOINTS
 
     def check_pose_mode(self, what: str) -> None:
-        """Raise a DrakeTeleopError if a leader commands joints; `what` names the caller."""
+        """Raise a DrakeTeleopError if a leader arm commands joints; `what` names the caller."""
         if self.leads_joints:
             raise DrakeTeleopError(
                 f"{what} supports pose mode only",
@@ -231,7 +232,7 @@ class Master:
         return np.repeat([figures.resolution, figures.turn_resolution], 3)
 
     def own_period(self, hand_hz: float) -> float | None:
-        """Return the sampling period [s] of a device that is slower than `hand_hz`, else None."""
+        """Return the sampling period [s] of a device slower than `hand_hz` [Hz], else None."""
         rate = 0.0 if self.model in (PHANTOM, LEADER) else self._figures().rate_hz
         return 1 / rate if 0.0 < rate < hand_hz else None
 
@@ -248,7 +249,7 @@ class Master:
         return dataclasses.replace(self, figures=figures)
 
     def found_from(self, folder: Path) -> "Master":
-        """Return a copy in which the leader's relative file paths are resolved from `folder`."""
+        """Return a copy in which the file paths of a leader arm are resolved from `folder`."""
         if self.leader is None:
             return self
         return dataclasses.replace(self, leader=self.leader.found_from(folder))
@@ -257,11 +258,7 @@ class Master:
         return self.figures or FIGURES.get(self.model, DeviceFigures())
 
     def check(self, where: str) -> None:
-        """Check combinations of fields.
-
-        Raises:
-            DrakeTeleopError: with `where` and the field.
-        """
+        """Raise a DrakeTeleopError for invalid combinations of fields; `where` is their path."""
         if self.model == PHANTOM and self.figures is not None:
             raise DrakeTeleopError(
                 "the Phantom's own dynamics are used, not a data sheet's",
@@ -300,5 +297,5 @@ _MAX_PITCH_RAD = 1.5  # rad
 
 
 def figures_of(block: Mapping[str, Any] | None) -> DeviceFigures | None:
-    """Return the default data sheet of the device that a `master` block names, or None."""
+    """Return the data sheet of the device that a scenario's block `master` names, or None."""
     return copy.deepcopy(FIGURES.get(str((block or {}).get("model"))))

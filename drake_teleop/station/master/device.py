@@ -1,4 +1,4 @@
-"""The haptic device as a block that advances its dynamics once per period."""
+"""The haptic device as a Drake block that advances its dynamics once per period."""
 
 from __future__ import annotations
 
@@ -21,11 +21,6 @@ _MAX_FRICTION_STEP = 2.0
 
 @njit(cache=True, borrows=True)
 def _advance(state, pose, twist, display, hand_wrench, drive, device, period, work, stages):
-    """Advance the device by one `step`, then update pose and twist, in one compiled call.
-
-    Write joint positions and the force display's memory, `drive[6:]`, into `display` (27,). With
-    invalid forces the device does not move.
-    """
     put(display, 6, drive, 6, drive.shape[0] - 6)
     if sound(hand_wrench) and sound(drive[:6]):
         step(state, hand_wrench, drive[:6], device, period, work, stages)
@@ -37,10 +32,11 @@ def _advance(state, pose, twist, display, hand_wrench, drive, device, period, wo
 def check_period(
     device: HapticDevice | LeaderDevice, q: NDArray[np.float64], period: float
 ) -> None:
-    """Check that one step per period [s] is stable for the device at the joint positions q.
+    """Check that one step per period [s] is stable at the joint positions q.
 
     Raises:
-        DrakeTeleopError: if the period is too long for haptic devices or for the friction.
+        DrakeTeleopError: if the period is above 1 ms or too long for the friction, or if q violates
+            a joint limit.
     """
     if not 0 < period <= _MAX_PERIOD_S:
         raise DrakeTeleopError(
@@ -63,8 +59,7 @@ def check_period(
 class MasterDevice(LeafSystem):
     """Haptic device with the hand's passive mass, advanced once per period.
 
-    Each period is one classical Runge-Kutta step of the nonlinear dynamics (gravity, Coriolis,
-    friction, stiff damped end stops) with held inputs.
+    Each period is one classical Runge-Kutta step of the nonlinear dynamics with held inputs.
 
     .. pydrake_system::
 
@@ -74,13 +69,12 @@ class MasterDevice(LeafSystem):
         - drive: (27,) from the force display: motor torques (6) [N m; N], the display's memory
         output_ports:
         - state: (12,) [q; qdot] [rad, rad/s; prismatic axes m, m/s]
-        - pose_master: (7,) X_BE
+        - pose_master: (7,) X_BE of the stylus E in the device's base B
         - twist_master: (6,) [v; omega] of E in B [m/s, rad/s]
         - for_display: (27,) joint positions (6) [rad; m], the display's memory
 
     Args:
         period: sampling period [s], at most 1 ms.
-        device: model with the hand's mass; the operator carries the hand's weight.
         q_initial: (6,) joint positions at the start, at rest [rad; in task space m, rad].
 
     Raises:
@@ -133,10 +127,9 @@ def AddDevice(
     device: HapticDevice | LeaderDevice,
     q_initial: NDArray[np.float64],
 ) -> tuple[LeafSystem, LeafSystem]:
-    """Add and connect the blocks "master_device" and "force_display" of a device or leader arm.
+    """Add, connect and return the blocks "master_device" and "force_display" of a haptic device.
 
-    Returns:
-        Both blocks; the hand's wrench and the command remain to be connected.
+    Arguments as for `MasterDevice`. The caller connects the hand's wrench and the wrench to render.
     """
     check_period(device, q_initial, period)
     if isinstance(device, LeaderDevice):

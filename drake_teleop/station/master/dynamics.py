@@ -1,6 +1,6 @@
-"""Dynamics of a haptic device: the Phantom, or a device in task space.
+"""Compiled dynamics of a haptic device: the Phantom, or a device in task space.
 
-`numbers.IN_TASK_SPACE` selects the model in compiled code; `HapticDevice` is the Python interface.
+B is the device's base frame, E the stylus frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drake_teleop.station.master.numbers import (
 
 @njit(cache=True)
 def jacobian_into(q, device, J):
-    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the Jacobian of the stylus E, rows [v; omega] in the base B, into J (6, 6)."""
     if device[IN_TASK_SPACE] != 0.0:
         task_space.jacobian_into(q, J)
     else:
@@ -53,7 +53,10 @@ def pose_into(q, device, pose):
 
 @njit(cache=True)
 def twist_into(q, v, device, J, twist):
-    """Write the twist [v; omega] of E in B (6,) = J v; the Jacobian `J` (6, 6) is scratch."""
+    """Write the twist [v; omega] of the stylus E in the base B, J v, into `twist` (6,).
+
+    The Jacobian `J` (6, 6) is scratch.
+    """
     jacobian_into(q, device, J)
     for i in range(6):
         twist[i] = 0.0
@@ -68,7 +71,7 @@ def step(state, hand_wrench, motor, device, period, work, stages):
     Args:
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
         motor: (6,) motor torques (or forces) at the joints.
-        device: (NUMBERS,) device parameters, see `numbers`.
+        period: length of the step [s].
         work, stages: (2, 6, 6) and (3, 12) scratch.
     """
     stage, slope, total = stages[0], stages[1], stages[2]
@@ -113,9 +116,10 @@ class DisplayDevice:
 class HapticDevice(DisplayDevice):
     """Haptic device (Phantom or in task space) with the hand's passive mass.
 
+    Joint positions q are (6,) [rad; in task space m, rad]. B is the base frame, E the stylus.
+
     Attributes:
         numbers: (NUMBERS,) device parameters, see `numbers`.
-        name: device name for messages.
     """
 
     numbers: NDArray[np.float64]
@@ -129,22 +133,22 @@ class HapticDevice(DisplayDevice):
         return "master.friction" if self.is_phantom else "master.figures"
 
     def display_axes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the axes (6,) for the force display: the joint positions q (6,) unchanged."""
+        """Return the positions (6,) for the force display: q (6,) itself."""
         return q
 
     @property
     def is_phantom(self) -> bool:
-        """True for the Phantom's kinematics, False for those of `task_space`."""
+        """True for the Phantom, False for a device in task space."""
         return not self.numbers[IN_TASK_SPACE]
 
     def inverse_kinematics(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the joint positions (6,) for the pose X_BE (7,); raise if it is out of reach."""
+        """Return the joint positions (6,) for a stylus pose X_BE (7,); raise if out of reach."""
         if self.is_phantom:
             return phantom.inverse_kinematics(pose)
         return task_space.inverse_kinematics(pose, self.numbers)
 
     def forward_kinematics(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the pose X_BE (7,) at the joint positions q (6,)."""
+        """Return the stylus pose X_BE (7,) in the base B at the joint positions q (6,)."""
         pose = np.empty(7)
         pose_into(q, self.numbers, pose)
         return pose
@@ -163,7 +167,7 @@ class HapticDevice(DisplayDevice):
         return task_space.at_an_end(q, self.numbers)
 
     def jacobian(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the Jacobian (6, 6), rows [v; omega] of E in B."""
+        """Return the Jacobian (6, 6) of the stylus E, rows [v; omega] in the base B."""
         J = np.empty((6, 6))
         jacobian_into(q, self.numbers, J)
         return J
@@ -177,9 +181,9 @@ class HapticDevice(DisplayDevice):
         return M
 
     def damping_matrix(self, q: NDArray[np.float64], creeping: bool = False) -> NDArray[np.float64]:
-        """Return the damping matrix D (6, 6), joint forces -D dq/dt, at the joint positions q (6,).
+        """Return the damping matrix D (6, 6) at q (6,): the joint forces are -D dq/dt.
 
-        `creeping` adds the slope of Coulomb friction at standstill.
+        With `creeping`, D includes the slope of the Coulomb friction at standstill.
         """
         if self.is_phantom:
             slope = creeping * self.numbers[COULOMB] / phantom.FRICTION_SPEED

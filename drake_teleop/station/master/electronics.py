@@ -1,8 +1,4 @@
-"""Encoders with finite steps, and the sampling rate of a device.
-
-Encoders count steps from the start and affect only the pose that the station reads. A device slower
-than `rates.hand_hz` holds this pose and the force; `force_to_master` is the held force.
-"""
+"""Encoders with finite steps, and the sampling rate of a slow haptic device."""
 
 from __future__ import annotations
 
@@ -17,7 +13,10 @@ from drake_teleop.station.master.dynamics import HapticDevice, pose_into
 
 @njit(cache=True)
 def read_pose_into(q, q_start, steps, device, pose):
-    """Write the pose X_BE (7,) for q (6,) rounded to whole `steps` (6,) from `q_start` (6,)."""
+    """Write the pose X_BE (7,) for q (6,), rounded to whole encoder steps from `q_start` (6,).
+
+    `steps` (6,) are in m or rad; 0 is exact.
+    """
     read = np.empty(6)
     for i in range(6):
         away = q[i] - q_start[i]
@@ -26,7 +25,9 @@ def read_pose_into(q, q_start, steps, device, pose):
 
 
 class Encoders(LeafSystem):
-    """Stylus pose read by encoders with `steps` (6,) [m, rad] from `q_start` (6,); 0: exact.
+    """Encoders of a haptic device: round the stylus pose to whole steps (6,) [m, rad]; 0 is exact.
+
+    Steps count from the joint positions `q_start` (6,).
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""Force display of the master: J_M^T, gravity compensation, the device's limits."""
+"""Force display of the master: converts a wrench to motor torques within the device's limits."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _peak_wrench(numbers):
 
 
 def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the display's input (27,) for the first period, at the joint positions q (6,)."""
+    """Return the force display's input (27,) for the first period, at joint positions q (6,)."""
     display = np.zeros(_WATCH.stop)
     display[_POSITIONS] = display[_LAST_POSITIONS] = q
     display[_WATCH] = initial_master_watch(_peak_wrench(numbers))
@@ -51,10 +51,11 @@ def initial_display(q: NDArray[np.float64], numbers: NDArray[np.float64]) -> NDA
 
 @njit(cache=True)
 def limit_wrench_into(wrench, numbers, J, displayed):
-    """Write the part of `wrench` that is within the device's limits into `displayed` (6,).
+    """Write `wrench` (6,), reduced to the device's limits, into `displayed` (6,).
 
     Both are [f; tau] at E, in B. The force is scaled to the peak force, the torque to the peak
-    torque of each wrist motor; both keep their directions. A wrench that is not finite gives zero.
+    torques of the wrist motors. A wrench that is not finite gives zero. J is the device's Jacobian
+    (6, 6).
     """
     for k in range(6):
         if not math.isfinite(wrench[k]):
@@ -76,7 +77,10 @@ def limit_wrench_into(wrench, numbers, J, displayed):
 
 @njit(cache=True)
 def motor_torque_into(displayed, q, numbers, J, torque):
-    """Write J_M^T F + gravity compensation (6,) for the wrench F, `displayed`; J is J_M at q."""
+    """Write J^T F plus gravity compensation (6,) into `torque`; F is `displayed` (6,).
+
+    J (6, 6) is the Jacobian at q (6,).
+    """
     gravity_torque_into(q, numbers, torque)
     for i in range(6):
         for k in range(6):
@@ -90,9 +94,9 @@ def display_into(wrench, device, numbers, period, J, drive):
     Args:
         wrench: (6,) F_E_B to render.
         device: (27,) port `for_display` of `MasterDevice`.
-        numbers: (NUMBERS,) device parameters.
+        period: sampling period [s].
         J: (6, 6) scratch.
-        drive: (27,) output for `MasterDevice`, with the displayed wrench and a `Fault`.
+        drive: (27,) written: input of `MasterDevice`, with the displayed wrench and a `Fault`.
     """
     q, fault = device[_POSITIONS], _NO_FAULT
     put(drive, 6, device, 6, _WATCH.stop - 6)
@@ -112,10 +116,6 @@ def display_into(wrench, device, numbers, period, J, drive):
 
 @njit(cache=True)
 def _fade(device, numbers, period, drive):
-    """Fade the displayed wrench out during a fault, and cross-fade to the command afterwards.
-
-    Arguments as for `display_into`; `drive` contains command and fault, and is changed.
-    """
     displayed, last = drive[_DISPLAYED], device[_DISPLAYED]
     limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT
@@ -139,8 +139,7 @@ class ForceDisplay(LeafSystem):
 
     Safe state: with an invalid command or invalid joint positions, the displayed wrench fades to
     zero in 50 ms; gravity compensation uses the last valid positions. Afterwards the wrench returns
-    as after silence in a channel (`station.passivity.safe_state`). The device's state contains this
-    block's memory, because events of this block would cost time.
+    as after silence in a channel (`station.passivity.safe_state`).
 
     .. pydrake_system::
 
@@ -156,7 +155,6 @@ class ForceDisplay(LeafSystem):
 
     Args:
         period: sampling period of the device [s].
-        device: device with `numbers`.
     """
 
     __slots__ = ONE_DICT

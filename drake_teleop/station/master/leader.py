@@ -1,11 +1,8 @@
-"""A leader arm: any serial arm as a haptic device, with its own dynamics.
+"""Leader arm: any serial arm that the operator holds as a haptic device.
 
     M(q) dv/dt + h(q, v) = motors + J^T F_hand - friction,  motors = J^T F + weight
 
-The dynamics are those of `slave.arm`. The hand holds the arm at E, the point of `hand_frame`, whose
-axes equal those of B at home. The operator carries the hand's weight; the motors carry the share
-`weight_carried` of the arm's weight. `force_display` treats the axes of E as the axes of the
-device. It commands the wrench F in the order of `task_space`, and this module applies J^T.
+The hand holds the arm at E, whose axes equal those of the base frame B at home.
 """
 
 from __future__ import annotations
@@ -59,7 +56,7 @@ _STOP_HZ = 12.0
 
 @njit(cache=True)
 def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
-    """Write the joint accelerations (forward dynamics) of leader and hand into `vdot`.
+    """Write the joint accelerations (n,) of leader and hand (forward dynamics) into `vdot`.
 
     Args:
         arm: `ArmModel.table` of the chain from B to E, with the hand's mass.
@@ -67,7 +64,7 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
         q, v: (n,) joint positions and speeds [rad, rad/s].
         applied: (6,) wrench [f; tau] on E, in B: the hand's wrench minus the hand's weight.
         motor: (n,) motor torques [N m].
-        vdot: (n,) output.
+        vdot: (n,) written [rad/s^2].
     """
     n = q.shape[0]
     R_BE, p_BE, tau, wrench = np.empty((3, 3)), np.empty(3), np.empty(n), np.empty(6)
@@ -90,7 +87,6 @@ def leader_acceleration(arm, joints, q, v, applied, motor, vdot):
 
 @njit(cache=True)
 def _pose_and_twist(arm, q, v, pose, twist):
-    """Write X_BE (quaternion sign as before in `pose`) and the twist [v; omega] of E in B."""
     n = q.shape[0]
     J, x = np.empty((6, n)), np.empty(21)
     jacobian_and_pose(arm, q, J, x)
@@ -200,7 +196,6 @@ class LeaderDevice(DisplayDevice):
             compensated share of the weight.
         home: (n,) joint positions where E has the axes of B [rad].
         numbers: (NUMBERS,) parameters for the force display.
-        name: for messages.
     """
 
     arm: ArmModel
@@ -215,7 +210,7 @@ class LeaderDevice(DisplayDevice):
 
     @property
     def num_joints(self) -> int:
-        """Number of joints."""
+        """Number of joints n."""
         return self.arm.num_joints
 
     @property
@@ -224,11 +219,15 @@ class LeaderDevice(DisplayDevice):
         return self.bare.table, self.arm.table, self.joints
 
     def display_axes(self, q: Array) -> Array:
-        """Return the axes (6,) for the force display: position of E (3), three unused zeros."""
+        """Return the vector (6,) for the force display: position of E (3) [m], three zeros."""
         return np.append(self.forward_kinematics(q)[4:], np.zeros(3))
 
     def inverse_kinematics(self, pose: Array) -> Array:
-        """Return joint positions (n,) for X_BE (7,), searched from home; raise if out of reach."""
+        """Return joint positions (n,) for X_BE (7,), searched from home.
+
+        Raises:
+            DrakeTeleopError: if the pose is out of reach.
+        """
         if np.allclose(pose, self.forward_kinematics(self.home), rtol=0, atol=1e-9):
             return self.home.copy()
         q, status = find_posture(self.arm, np.asarray(pose, dtype=float), self.home)
@@ -242,7 +241,7 @@ class LeaderDevice(DisplayDevice):
         return q
 
     def forward_kinematics(self, q: Array) -> Array:
-        """Return the pose X_BE (7,) at the joint positions q (n,)."""
+        """Return the pose X_BE (7,) of the held point E in the base B at q (n,)."""
         pose = np.array([1.0, *np.zeros(6)])
         _pose_and_twist(self.arm.table, np.asarray(q), np.zeros(len(q)), pose, np.empty(6))
         return pose
@@ -262,13 +261,13 @@ class LeaderDevice(DisplayDevice):
         return ((q < self.joints[_LOWER]) | (q > self.joints[_UPPER])).any(axis=1)
 
     def jacobian(self, q: Array) -> Array:
-        """Return the Jacobian (6, n), rows [v; omega] of E in B."""
+        """Return the Jacobian (6, n) of the held point E, rows [v; omega] in the base B."""
         J = np.empty((6, self.num_joints))
         jacobian(self.arm.table, np.asarray(q), J)
         return J
 
     def mass_matrix(self, q: Array) -> Array:
-        """Return the mass matrix (n, n) at the joints q (n,)."""
+        """Return the mass matrix (n, n), including the hand, at q (n,)."""
         return mass_matrix(self.arm, np.asarray(q))
 
     def damping_matrix(self, q: Array, creeping: bool = False) -> Array:
@@ -282,7 +281,8 @@ def joint_parameters(
 ) -> Array:
     """Return the array (8, n) `LeaderDevice.joints`; end stops scale with the inertia at home.
 
-    `viscous` (n,) adds to the model's damping; `carried` is the compensated share of the weight.
+    Vectors are (n,): start `home` [rad], friction `coulomb` [N m], `viscous` damping in addition to
+    the model's [N m s/rad], torque `limit` [N m]. `carried` is the compensated share of the weight.
     """
     inertia, w = np.diag(mass_matrix(arm, home)), 2 * np.pi * _STOP_HZ
     rows = [coulomb, viscous, arm.lower, arm.upper, w**2 * inertia, 2 * w * inertia, limit]
@@ -306,7 +306,6 @@ class LeaderArm(LeafSystem):
 
     Args:
         period: sampling period [s].
-        device: model with the hand's mass.
         q_initial: (n,) joint positions at the start, at rest.
     """
 
@@ -347,7 +346,7 @@ def _hand_weight(device: LeaderDevice) -> float:
 
 
 class LeaderDisplay(ForceDisplay):
-    """Force display of a leader, limited by motor torques after weight compensation.
+    """Force display of a leader arm, limited by motor torques after weight compensation.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""Leader arm from a model file, in the file formats of the slave's arm."""
+"""Leader arm, which the operator holds as a haptic device, from a model file."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import dataclasses
@@ -74,10 +74,9 @@ class Leader:
     )
 
     def check(self, where: str) -> None:
-        """Check the fields without reading the model file.
+        """Raise a DrakeTeleopError for invalid fields, without reading the model file.
 
-        Raises:
-            DrakeTeleopError: with `where` and the field.
+        `where` is the block's path for the message.
         """
         for name in ("file", "hand_frame"):
             if not getattr(self, name):
@@ -101,7 +100,7 @@ class Leader:
         )
 
     def parse(self, plant: MultibodyPlant, X_Table: RigidTransform | None = None) -> ParsedModel:
-        """Add the leader to a plant, with its base at the origin of B; X_Table is the pose of B.
+        """Add the leader arm to a plant; X_Table is the pose of its base frame B in the world.
 
         Raises:
             DrakeTeleopError: if the model cannot be read, see `ParseModel`.
@@ -112,11 +111,13 @@ class Leader:
         return ParseModel(plant, Path(self.file), self.hand_frame, packages, X_WBase)
 
     def device(self, position: list[float], hand_mass: float, hand_inertia: float) -> LeaderDevice:
-        """Return the leader with the hand's mass added; at home E is at p_BE = `position` (3,) [m].
+        """Return the arm's dynamics with the hand's mass and inertia about E [kg, kg m^2].
+
+        At home the hand's point E is at `position` (3,) [m] in the base frame B.
 
         Raises:
-            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or the
-                length of a list differs from the number of joints.
+            DrakeTeleopError: if the file cannot be read, the arm is no serial chain, or a list has
+                a wrong length.
         """
         plant = MultibodyPlant(0.0)
         parsed = self.parse(plant)
@@ -146,7 +147,6 @@ class Leader:
         return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
 
     def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
-        """Return values (n,) from a list field with one value per joint, one for all, or none."""
         values, n = getattr(self, name), arm.num_joints
         if len(values) not in ((n,) if name == "home" else (0, 1, n)):
             raise DrakeTeleopError(

@@ -1,9 +1,9 @@
 """The Phantom Premium 1.5 HighForce/6DoF: kinematics and dynamics in closed form.
 
-B: base frame, origin at the intersection of yaw and shoulder axis, z_B up, x_B towards the
-operator. E: stylus frame at the gimbal point. At `HOME` the inner link and the stylus point along
-x_B, the outer link down. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the
-downward vertical towards x_B (absolute: q2 rotates only the inner link); wrist yaw, pitch, roll.
+B: base frame at the intersection of yaw and shoulder axis, z_B up, x_B towards the operator. E:
+stylus frame at the gimbal point. At `HOME` inner link and stylus point along x_B, the outer link
+down. q (6,) [rad]: yaw; inner link up from the horizontal; outer link from the downward vertical
+towards x_B (absolute: q2 rotates only the inner link); wrist yaw, pitch, roll.
 
     p_BE = Rz(q1) [l1 cos q2 + l2 sin q3, 0, l1 sin q2 - l2 cos q3]
     R_BE = Rz(q1) Ry(-q3) Rz(q4) Ry(q5) Rx(q6), singular at q5 = +-90 degrees
@@ -85,7 +85,6 @@ _GRAVITY_3 = 0.5 * GRAVITY * (L2 * MASS_A + 2 * L3 * MASS_C - 2 * L6 * MASS_DF)
 
 @njit(cache=True)
 def _main_mass_matrix_into(q, M):
-    """Write the mass matrix of the three main axes into M (6, 6); the other entries are zero."""
     M[:, :] = 0.0
     M[0, 0] = (
         _YAW_CONSTANT
@@ -100,7 +99,7 @@ def _main_mass_matrix_into(q, M):
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the Jacobian of the stylus E, rows [v; omega] in the base B, into J (6, 6)."""
     s1, c1 = math.sin(q[0]), math.cos(q[0])
     s2, c2 = math.sin(q[1]), math.cos(q[1])
     s3, c3 = math.sin(q[2]), math.cos(q[2])
@@ -125,7 +124,7 @@ def jacobian_into(q, J):
 def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
     """Write the mass matrix with wrist, hand and reflected motors into M (6, 6).
 
-    `J` is the Jacobian at q. Each wrist link and the hand is a point mass at E with equal moments
+    J is the Jacobian at q. Wrist links and hand are point masses at the stylus with equal moments
     of inertia.
     """
     _main_mass_matrix_into(q, M)
@@ -146,10 +145,7 @@ def mass_matrix_into(q, J, hand_mass, hand_inertia, M):
 
 @njit(cache=True)
 def gravity_torque_into(q, out):
-    """Write the torque (6,) that compensates the weight of device and wrist.
-
-    The operator carries the weight of the hand.
-    """
+    """Write the torque (6,) that compensates the weight of device and wrist, without the hand."""
     weight = WRIST_MASS * GRAVITY
     out[0] = 0.0
     out[1] = (_GRAVITY_2 + weight * L1) * math.cos(q[1])
@@ -159,7 +155,6 @@ def gravity_torque_into(q, out):
 
 @njit(cache=True)
 def _subtract_coriolis(q, v, J, hand_mass, hand_inertia, torque):
-    """Subtract the Coriolis torque C(q, v) v of device, wrist and hand from `torque` (6,)."""
     # Main axes: Christoffel symbols of their closed-form M.
     coupling = _COUPLING * math.cos(q[1] - q[2])
     yaw_2 = -2.0 * (_YAW_2 * math.sin(2.0 * q[1]) + _COUPLING * math.sin(q[1]) * math.sin(q[2]))
@@ -229,7 +224,6 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
     Args:
         q, v, motor_torque: (6,) joint positions, speeds and motor torques.
         hand_wrench: (6,) [f; tau] of the hand on the stylus at E, in B.
-        device: (NUMBERS,) device parameters, see `numbers`.
         work: (2, 6, 6) scratch.
     """
     J, M = work[0], work[1]
@@ -247,7 +241,7 @@ def acceleration_into(q, v, hand_wrench, motor_torque, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
+    """Write the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s1, c1 = math.sin(0.5 * q[0]), math.cos(0.5 * q[0])
     s3, c3 = math.sin(-0.5 * q[2]), math.cos(0.5 * q[2])
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
@@ -268,7 +262,7 @@ def pose_into(q, pose):
 
 
 def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the geometric Jacobian of E (6, 6), rows [v; omega] in B."""
+    """Return the Jacobian (6, 6) of the stylus E at q (6,), rows [v; omega] in the base B."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     return J
@@ -277,21 +271,21 @@ def jacobian(q: NDArray[np.float64]) -> NDArray[np.float64]:
 def mass_matrix(
     q: NDArray[np.float64], hand_mass: float = 0.0, hand_inertia: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the mass matrix (6, 6) with wrist, reflected motors and hand."""
+    """Return the mass matrix (6, 6) at q (6,) with wrist, reflected motors and hand."""
     M = np.empty((6, 6))
     mass_matrix_into(q, jacobian(q), hand_mass, hand_inertia, M)
     return M
 
 
 def gravity_torque(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the torque (6,) [N m] that compensates the weight of device and wrist."""
+    """Return the torque (6,) [N m] that compensates the weight of device and wrist at q (6,)."""
     torque = np.empty(6)
     gravity_torque_into(q, torque)
     return torque
 
 
 def forward_kinematics(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
+    """Return the stylus pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at the joint angles q (6,)."""
     pose = np.empty(7)
     pose_into(q, pose)
     return pose
@@ -328,7 +322,7 @@ def inverse_kinematics(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 def serial_joint_angles(q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the joint angles of the serial tree in `phantom.sdf` for q (..., 6).
 
-    The tree's third joint is relative to the inner link; the device's q3 is absolute.
+    Its third joint is relative to the inner link; the device's q3 is absolute.
     """
     serial = np.array(q, dtype=float)
     serial[..., 2] -= serial[..., 1]
@@ -343,7 +337,7 @@ def at_an_end(q: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def check_limits(q: NDArray[np.float64]) -> None:
-    """Raise a DrakeTeleopError for the first of six joint angles [rad] that is out of range."""
+    """Raise a DrakeTeleopError if one of six joint angles [rad], or q2 - q3, is out of range."""
     margin = 1e-9
     for i in range(6):
         if not JOINT_LOWER[i] - margin <= q[i] <= JOINT_UPPER[i] + margin:

@@ -2,9 +2,8 @@
 
     q (6,) = [x, y, z, yaw, pitch, roll] [m, rad],  p_BE = q[:3],  R_BE = Rz(q4) Ry(q5) Rx(q6)
 
-Isotropic mass and inertia (`apparent_mass`, `inertia`), Coulomb friction and damping against linear
-and angular velocity, end stops at the faces of the workspace, balanced weight. This approximates a
-delta or counterbalanced arm in the middle of its workspace.
+Isotropic mass and inertia, friction, damping, end stops at the faces of the workspace, balanced
+weight.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _ROTATION_STOP_STIFFNESS, _ROTATION_STOP_DAMPING = 5.0, 0.01  # N m/rad, N m s/r
 
 @njit(cache=True)
 def jacobian_into(q, J):
-    """Write the geometric Jacobian of E, rows [v; omega] in B, into J (6, 6)."""
+    """Write the Jacobian of the grip E, rows [v; omega] in the base B, into J (6, 6)."""
     s4, c4 = math.sin(q[3]), math.cos(q[3])
     s5, c5 = math.sin(q[4]), math.cos(q[4])
     J[:, :] = 0.0
@@ -51,7 +50,7 @@ def jacobian_into(q, J):
 
 @njit(cache=True)
 def mass_matrix_into(q, J, device, M):
-    """Write the mass matrix of device and hand (6, 6) into M; `J` is the Jacobian at q."""
+    """Write the mass matrix (6, 6) of device and hand into M; `J` is the Jacobian at q."""
     M[:, :] = 0.0
     inertia = device[INERTIA] + device[HAND_INERTIA]
     for i in range(3):
@@ -71,7 +70,6 @@ def _friction_factor(motion, coulomb, viscous, speed_of_tanh):
 
 @njit(cache=True)
 def _stop_force(beyond, rate, stiffness, damping):
-    """Return the force of an end stop at penetration `beyond` (either sign); a stop never pulls."""
     if beyond > 0.0:
         return min(0.0, -stiffness * beyond - damping * rate)
     if beyond < 0.0:
@@ -126,7 +124,7 @@ def acceleration_into(q, v, hand_wrench, motor, device, work, vdot):
 
 @njit(cache=True)
 def pose_into(q, pose):
-    """Write the pose X_BE (7,) [qw, qx, qy, qz, px, py, pz]; the quaternion is continuous in q."""
+    """Write the grip pose X_BE (7,) [qw, qx, qy, qz, px, py, pz] at q (6,) into `pose`."""
     s4, c4 = math.sin(0.5 * q[3]), math.cos(0.5 * q[3])
     s5, c5 = math.sin(0.5 * q[4]), math.cos(0.5 * q[4])
     s6, c6 = math.sin(0.5 * q[5]), math.cos(0.5 * q[5])
@@ -142,7 +140,7 @@ def pose_into(q, pose):
 def damping_matrix(
     q: NDArray[np.float64], device: NDArray[np.float64], creeping: bool
 ) -> NDArray[np.float64]:
-    """Return the damping matrix (6, 6) at the axes q, as `HapticDevice.damping_matrix`."""
+    """Return the damping matrix (6, 6) at q (6,): `HapticDevice.damping_matrix` in task space."""
     J = np.empty((6, 6))
     jacobian_into(q, J)
     of_tanh = np.array([FRICTION_SPEED, FRICTION_ANGULAR_SPEED])
@@ -164,7 +162,6 @@ def inverse_kinematics(
 def _outside_workspace(
     q: NDArray[np.float64], device: NDArray[np.float64], margin: float
 ) -> NDArray[np.bool_]:
-    """Return (..., 6) booleans: True where q exceeds the workspace by over `margin` [m, rad]."""
     centre = np.append(device[CENTRE], np.zeros(3))
     return np.abs(q - centre) > np.append(device[HALF_SIZE], device[TURN]) + margin
 
@@ -172,7 +169,7 @@ def _outside_workspace(
 def at_an_end(q: NDArray[np.float64], device: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (N,) booleans: True where an end stop is active at q (N, 6).
 
-    Fixed rotations have none.
+    Fixed rotations have no end stop.
     """
     return (_outside_workspace(q, device, 0.0) & np.append([True] * 3, device[TURN] > 0.0)).any(
         axis=1

@@ -1,9 +1,7 @@
-"""Decisions of the operator during a task, from vision and perceived force.
+"""Decisions of the simulated operator during a task, from vision and perceived force.
 
-The hand moves by submovements (`minimum_jerk`), planned from delayed perception. The next one waits
-until the effect of the last is visible: move and wait (Ferrell, IEEE Trans. Hum. Factors Electron.
-6, 1965). From training the operator has the scales of motion and force and the mean delay.
-`docs/operator.md` contains all assumptions and sources. `decide` runs every `PERIOD`.
+The hand moves by planned displacements, and waits until their effect is visible (Ferrell 1965). All
+assumptions and sources: `docs/operator.md`.
 """
 
 from __future__ import annotations
@@ -55,12 +53,12 @@ _AIM_ERROR, _WEBER, _R_WB = 12, 13, 14
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """Station properties that the operator learns in training.
+    """Station properties that the operator learns in training, before a task.
 
     Args:
         R_WB: (3, 3) orientation of the master's base in the world.
         translation_scale: displacement of the tool over displacement of the hand.
-        force_gain: rendered force over true contact force, gamma * force_scale.
+        force_gain: rendered force over true contact force.
         forward, backward: mean one-way delays [s].
         seed: random seed of the operator's noise.
     """
@@ -74,7 +72,7 @@ class Training:
 
 
 def pack_person(training: Training, perception: Perception, movement: Movement) -> Array:
-    """Return the operator's parameters (23,) for `decide`."""
+    """Return the operator's parameters (23,) for the compiled `decide`."""
     there_and_back = training.forward + training.backward + _EFFECT_DELAY_S
     # 53 bits of a key are exact in a float.
     key = float(random_bits(np.uint64(training.seed % 2**64), _STREAM))
@@ -92,7 +90,7 @@ def pack_person(training: Training, perception: Perception, movement: Movement) 
 
 
 def pack_task(task: Task) -> Array:
-    """Return the task's parameters (15,) for `decide`."""
+    """Return the task's parameters (15,) for the compiled `decide`."""
     packed = np.zeros(_TASK)
     packed[[_KIND, _T_START, _TIMEOUT]] = KINDS.index(type(task)), task.t_start, task.timeout
     packed[_GOAL : _GOAL + 3] = task.translation
@@ -140,7 +138,7 @@ _FLOOR_SHARE = 0.8  # share of the depth beyond which contact counts as the floo
 
 
 def initial_memory() -> Array:
-    """Return the memory (MEMORY,) at the start, for `decide`."""
+    """Return the memory (MEMORY,) for `decide` at the start."""
     memory = np.zeros(MEMORY)
     memory[_MET_SINCE], memory[_STIFFNESS], memory[PLAN + 1] = -1.0, _INITIAL_STIFFNESS, 1.0
     return memory
@@ -148,7 +146,6 @@ def initial_memory() -> Array:
 
 @njit(cache=True)
 def _to_hand(person, vector_W, out):
-    """Convert a displacement or velocity of the tool, in W, to the hand's, in B."""
     for i in range(3):
         out[i] = 0.0
         for k in range(3):
@@ -162,7 +159,11 @@ def _random_number(person, step, draw):
 
 @njit(cache=True)
 def look_into(person, step, displacement_W, seen_W):
-    """Write the seen displacement `seen_W` (3,) [m]; its error is constant during a fixation."""
+    """Write the seen displacement of the tool from its start (3,), in W [m], into `seen_W`.
+
+    Its random error is constant for 50 steps, a fixation of the eyes. `person` is from
+    `pack_person`, `displacement_W` (3,) is the true displacement.
+    """
     for i in range(3):
         noise = person[_VISION_NOISE] * _random_number(person, step // _FIXATION_STEPS, 4 + i)
         seen_W[i] = displacement_W[i] + noise
@@ -196,7 +197,6 @@ def _pressed_force(task, person, felt):
 
 @njit(cache=True)
 def _is_met(memory, time, good, still_good):
-    """Return whether an aim is met: since `good` was true, until `still_good` is false."""
     if memory[_MET_SINCE] < 0.0 and good:
         memory[_MET_SINCE] = time
     elif not still_good:
@@ -217,7 +217,7 @@ def _enter_phase(state, memory, phase, ready):
 
 @njit(cache=True)
 def decide(task, person, time, seen_W, felt, state, memory):
-    """Update the operator's decisions by one step; inputs are not checked.
+    """Update the operator's decisions by one step of `PERIOD`; inputs are not checked.
 
     Args:
         task: from `pack_task`.
@@ -260,7 +260,6 @@ def decide(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _seen_target(task, person, out):
-    """Write the perceived target (3,), minus the standoff, from the tool's start, in W [m]."""
     depth = 0.0 if task[_KIND] == REACH else person[_DEPTH_ERROR] * _random_number(person, 0, 15)
     for i in range(3):
         out[i] = task[_GOAL + i] + (depth - task[_STANDOFF]) * task[_AXIS + i]
@@ -301,7 +300,6 @@ def _move_by_vision(task, person, step, time, seen_W, state, memory):
 
 @njit(cache=True)
 def _approach(task, person, time, seen_W, felt, state, memory):
-    """Approach along the axis, at a speed proportional to trust, until contact is detected."""
     if task[_KIND] == INSERT:
         if state[FELT] > 0.0 and _is_stuck(task, person, felt):
             plan_stop(memory, time)
@@ -327,17 +325,13 @@ def _approach(task, person, time, seen_W, felt, state, memory):
 
 @njit(cache=True)
 def _perceived_force(task, person, felt, memory):
-    """Return the perceived contact force against the axis [N], with one error per judgement."""
     error = person[_WEBER] * _random_number(person, int(memory[_NEXT_TIME] / PERIOD), 3)
     return (1.0 + error) * _pressed_force(task, person, felt)
 
 
 @njit(cache=True)
 def _press_displacement(task, memory, force):
-    """Return the displacement towards the set force along the axis [m].
-
-    The contact stiffness is learned from the effect of the last displacement.
-    """
+    """Return the displacement towards the set force along the axis [m]; update the stiffness."""
     effect = force - memory[_LAST_FORCE]
     if effect * memory[_LAST_MOVE] > 0.0:
         stiffness = 0.5 * (memory[_STIFFNESS] + effect / memory[_LAST_MOVE])
@@ -363,7 +357,6 @@ def _control_force(task, person, step, time, felt, state, memory):
 
 @njit(cache=True)
 def _sideways_into(task, person, felt, out):
-    """Write the contact force lateral to the task's axis (3,), in W [N]; return its magnitude."""
     along, size = _pressed_force(task, person, felt), 0.0
     for i in range(3):
         out[i] = along * task[_AXIS + i]
@@ -376,7 +369,6 @@ def _sideways_into(task, person, felt, out):
 
 @njit(cache=True)
 def _is_stuck(task, person, felt):
-    """Return whether the axial or lateral contact force is too large for a sliding peg."""
     limit = _STUCK_SHARE * task[_FORCE]
     sideways = _sideways_into(task, person, felt, np.empty(3))
     return _pressed_force(task, person, felt) >= limit or sideways >= limit
@@ -384,7 +376,6 @@ def _is_stuck(task, person, felt):
 
 @njit(cache=True)
 def _search_slot(task, person, step, time, seen_W, felt, state, memory):
-    """Push with the set force; yield to a lateral force, or search on a spiral without one."""
     force = _perceived_force(task, person, felt, memory)
     if not (state[FELT] > 0.0 and _is_stuck(task, person, felt)):
         _enter_phase(state, memory, FEELING, time)

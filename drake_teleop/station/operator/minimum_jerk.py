@@ -1,7 +1,7 @@
-"""Minimum-jerk movements of the hand from any initial motion.
+"""Minimum-jerk movements of the hand (Hoff and Arbib, J. Motor Behav. 25, 1993).
 
-Hoff and Arbib, J. Motor Behav. 25, 1993. A plan in the operator's memory: start [s], duration [s],
-and for each axis coefficients of a quintic in normalised time.
+A plan (20,), part of the operator's memory, has start and duration [s], and for each axis six
+coefficients of a quintic in normalised time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ STOP = 0.15  # s, stopping time of the hand, estimate
 
 @njit(cache=True)
 def plan_at(plan, time, i):
-    """Return position, speed and acceleration of axis i; after the plan the speed is constant."""
+    """Return position [m], speed and acceleration of axis `i` in a plan (20,) at `time` [s].
+
+    After the plan the speed is constant.
+    """
     h = plan[1]
     u = min((time - plan[0]) / h, 1.0)
     c = plan[2 + 6 * i : 8 + 6 * i]
@@ -32,7 +35,7 @@ def plan_at(plan, time, i):
 
 @njit(cache=True)
 def add_plan_into(memory, time, pose, twist):
-    """Add the plan's displacement and velocity at `time` to an intended pose and twist."""
+    """Add the plan's displacement and velocity at `time` [s] to a pose (7,) and twist (6,)."""
     plan = memory[PLAN : PLAN + PLAN_SIZE]
     for i in range(3):
         x, v, _ = plan_at(plan, time, i)
@@ -42,7 +45,7 @@ def add_plan_into(memory, time, pose, twist):
 
 @njit(cache=True)
 def plan_move(memory, time, length, change, end_speed):
-    """Plan a minimum-jerk motion by the displacement `change` (3,) in the time `length` [s].
+    """Plan a minimum-jerk motion by the displacement `change` (3,) [m] in the time `length` [s].
 
     It continues the present motion and ends without acceleration, with the velocity `end_speed`
     (3,).
@@ -61,7 +64,7 @@ def plan_move(memory, time, length, change, end_speed):
 
 @njit(cache=True)
 def plan_stop(memory, time):
-    """Plan a stop of the hand within `STOP` seconds."""
+    """Plan a stop of the hand within `STOP` seconds, from `time` [s] on."""
     plan, change = memory[PLAN : PLAN + PLAN_SIZE], np.empty(3)
     for i in range(3):
         change[i] = 0.5 * STOP * plan_at(plan, time, i)[1]

@@ -1,9 +1,4 @@
-"""The operator: intended path of the hand, followed through the hand's impedance.
-
-The hand pulls the stylus towards the intended pose and yields to forces. Its passive mass is part
-of the device. With a task the operator is closed-loop: delayed vision and force perception
-determine its movements (`decision.py`, `perception.py`), which add to the intent's segments.
-"""
+"""The simulated operator: intended path of the hand, followed through the hand's impedance."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import math
@@ -39,11 +34,7 @@ _MAX_TORQUE_NM = 2.0  # N m, estimate
 
 @dataclass(frozen=True)
 class HandImpedance:
-    """Impedance between intended and actual pose of the hand; all values are estimates.
-
-    Translational values are common in the haptics literature. The radius of gyration is 30 mm; the
-    rotational damping ratio is about 0.7.
-    """
+    """Impedance between intended and actual pose of the hand; all values are estimates."""
 
     mass: float  # kg, passive mass that moves with the stylus
     damping: float  # N s/m
@@ -108,12 +99,12 @@ class OperatorConfig:
 
     @property
     def hand(self) -> HandImpedance:
-        """Impedance of the hand."""
+        """Impedance of the hand for the configured grip."""
         return GRIPS[self.grip]
 
 
 def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
-    """Return the segments of the intent as an array (n, 12) for compiled functions.
+    """Return the segments of the intended motion as an array (n, 12) for compiled functions.
 
     Columns: ramp in [start, length], ramp out [start, length], 2 pi frequency, phase, translation
     (3), rotation (3). A minimum-jerk move has no ramp out and the factor sin(pi / 2).
@@ -134,7 +125,6 @@ def pack_intent(segments: Sequence[MinimumJerk | Sine]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _ramp(time, length):
-    """Return the minimum-jerk ramp from 0 at time 0 to 1 at `length` [s], and its rate."""
     u = time / length
     if u <= 0.0:
         return 0.0, 0.0
@@ -145,7 +135,7 @@ def _ramp(time, length):
 
 @njit(cache=True)
 def intent_into(packed, start, t, pose, twist):
-    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) at time t [s].
+    """Write the intended pose X_BE (7,) and twist [v; omega] (6,) of the hand at time t [s].
 
     `packed` (n, 12) is from `pack_intent`, `start` (7,) is X_BE before the first segment.
     Translations add; rotations apply in the order of the list, each about axes of B.
@@ -177,7 +167,10 @@ def intent_into(packed, start, t, pose, twist):
 
 @njit(cache=True)
 def unit_pose_into(pose, twist, out):
-    """Write a pose (7,) with unit quaternion; return True if pose and twist (6,) are valid."""
+    """Write a pose (7,) with unit quaternion into `out`; return whether the input was valid.
+
+    Valid are a finite pose and twist (6,) with a quaternion that is not zero.
+    """
     square, rest = 0.0, 0.0
     for k in range(4):
         square += pose[k] * pose[k]
@@ -205,8 +198,8 @@ def _limit(vector, limit):
 def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
     """Write the wrench [f; tau] (6,) of the hand on the stylus at E, in B.
 
-    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector (in B) of the
-    shorter rotation. Both are limited to the strength of a hand.
+    f = K (x_intent - x) + B (v_intent - v); tau likewise with the rotation vector of the shorter
+    rotation. Both are limited to 60 N and 2 N m.
 
     Args:
         impedance: (4,) [K, B, rotational K, rotational B].
@@ -226,10 +219,6 @@ def hand_wrench_into(impedance, intent_pose, intent_twist, pose, twist, wrench):
 
 @njit(cache=True)
 def _intended_motion_into(packed, start, moving, memory, time, pose, twist):
-    """Write the intended pose (7,) and twist (6,): the intent's segments plus the task's plan.
-
-    `start` (7,) moves with the twist `moving` (6,). An empty `memory` means no task.
-    """
     intent_into(packed, start, time, pose, twist)
     for k in range(6):
         twist[k] += moving[k]
@@ -250,18 +239,6 @@ def _look_feel_decide(
     task, person, senses, hand_mass, arm, tip, time, hand_wrench, twist, slave_q, task_state,
     memory, feelings, sights, touches,
 ):  # fmt: skip
-    """Update perception and decision by one step; inputs are not checked.
-
-    Args:
-        task, person, senses: from `pack_task`, `pack_person`, `Perception.parameters`.
-        arm: `ArmModel.table` of the slave.
-        tip: (6,) position of the tool's tip in S, and at the start in W [m].
-        hand_wrench, twist: (6,) wrench of the hand on the stylus, twist of the stylus, in B.
-        slave_q: (n,) joint positions of the slave [rad].
-        task_state, memory, feelings: states of `decide` and `perceive_into`, updated.
-        sights: (m, 3) ring buffer of delayed vision; updated.
-        touches: (n, 5) ring buffer of delayed force perception; updated.
-    """
     step = int(memory[0])
     R_WS, p_WS, displacement = np.empty((3, 3)), np.empty(3), np.empty(3)
     forward_kinematics(arm, slave_q, R_WS, p_WS)
@@ -286,7 +263,7 @@ def _ring_buffer(delay: float, start: NDArray[np.float64]) -> NDArray[np.float64
 
 
 class Operator(LeafSystem):
-    """Operator that moves the stylus towards the intended pose and perceives contact.
+    """Simulated operator: moves the stylus towards the intended pose and perceives contact.
 
     .. pydrake_system::
 
@@ -304,7 +281,6 @@ class Operator(LeafSystem):
           the rendered force [N], trust (with a task)
 
     Args:
-        config: grip, intent and task.
         start: (7,) X_BE to which the intent is relative.
         training, arm, tip: required for a task: station properties, the slave's arm, and the
             position of the tool's tip in S and at the start in W (6,) [m].

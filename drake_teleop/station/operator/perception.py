@@ -1,14 +1,12 @@
-"""Contact detection by the operator, from the perceived force.
+"""Contact detection by the operator, from the force u on the skin and the hand's velocity v.
 
-The stylus exerts the force u on the skin: the reaction to the hand's wrench minus the inertial
-force of the hand. u and the hand's velocity v pass a low-pass. The expected force (internal model:
-Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994) is
+The expected force (internal model: Shadmehr and Mussa-Ivaldi, J. Neurosci. 14, 1994) is
 
     u_expected = m a + b v + c v / sqrt(|v|^2 + v_0^2) + u_0
 
-A Kalman filter with random walks estimates m, b, c, u_0 while there is no contact. Contact is
-detected if |u - u_expected| reaches max(absolute threshold, Weber fraction * held |u_expected|);
-the held value decays (forward masking). Slowly rising forces become expected: `docs/operator.md`.
+A Kalman filter estimates m, b, c, u_0 without contact. Contact is detected if the excess u -
+u_expected reaches the absolute threshold and the Weber fraction of recent expected forces. See
+`docs/operator.md`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -59,7 +57,7 @@ class Perception:
     aim_error: float = quantity(1e-3, "m", 0.0, 0.1, "of the perceived position of a slot, lateral")
 
     def parameters(self, dt: float) -> Array:
-        """Return (4,) Weber fraction, threshold [N], decay and smoothing factors per step."""
+        """Return (4,) Weber fraction, threshold [N], and decay and smoothing factors per step."""
         fade = math.exp(-dt / self.masking_time)
         smooth = -math.expm1(-2 * math.pi * self.bandwidth_hz * dt)
         return np.array([self.weber_fraction, self.absolute_threshold, fade, smooth])
@@ -74,7 +72,7 @@ def initial_memory() -> Array:
 
 @njit(cache=True)
 def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, attentive, out):
-    """Update the force perception by one step; inputs are not checked.
+    """Update the operator's force perception by one step; inputs are not checked.
 
     Args:
         memory: (MEMORY_SIZE,) from `initial_memory`, updated.
@@ -84,7 +82,8 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
         hand_force: (3,) force of the hand on the stylus [N].
         velocity: (3,) velocity of the stylus, in the same axes [m/s].
         attentive: if false, update only the expectation and detect no contact.
-        out: (5,) output: excess force on the hand (3) [N], threshold [N], 1 if detected.
+        out: (5,) written: force on the hand beyond the expected one (3) [N], threshold [N], 1 if
+            contact is detected.
     """
     weber, absolute, fade, smooth = parameters
     first = memory[_COUNT] == 0.0
@@ -126,7 +125,6 @@ def perceive_into(memory, parameters, dt, hand_mass, hand_force, velocity, atten
 
 @njit(cache=True)
 def _update_expectation(theta, P, rows, excess, dt):
-    """Update the Kalman filter of the expected force, row by row."""
     gain = np.empty(_NUM_PARAMETERS)
     for j in range(_NUM_PARAMETERS):
         P[j, j] += _WALK[j] * _WALK[j] * dt
@@ -160,18 +158,18 @@ def perceive(
     hand_mass: float,
     attentive: float = 0.3,
 ) -> Array:
-    """Return the contact detection for a recorded motion, without reaction time.
+    """Return the operator's contact detection for a recorded motion, without reaction time.
 
     Args:
         t: (N,) evenly spaced times [s].
         hand_force, velocity: (N, 3) force of the hand [N] and velocity of the stylus [m/s], in the
             same axes, as in the signals `hand_wrench_E` and `twist_master`.
-        perception: parameters.
         hand_mass: mass of the hand that moves with the stylus [kg].
         attentive: start time of detection [s]; before, only the expectation is updated.
 
     Returns:
-        (N, 5) excess of the force on the hand (3) [N], threshold [N], 1 while contact is detected.
+        (N, 5) force on the hand beyond the expected one (3) [N], threshold [N], 1 while contact is
+            detected.
 
     Raises:
         DrakeTeleopError: for wrong shapes, values that are not finite, or times not increasing.

@@ -106,10 +106,9 @@ class Movement:
 
 
 def check_task(task: Task, where: str) -> None:
-    """Check that the target is farther from the tool's start than its tolerance or standoff.
+    """Raise a DrakeTeleopError if the target is too near to the tool's start.
 
-    Raises:
-        DrakeTeleopError: with `where` and the field.
+    The least distance is the target's radius or the standoff. `where` is the block's path.
     """
     least = task.width / 2 if isinstance(task, Reach) else task.standoff
     if task.distance <= least:

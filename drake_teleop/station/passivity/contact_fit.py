@@ -1,10 +1,6 @@
-"""Estimation of a contact's stiffness k and damping b from force, depth and speed.
+"""Least-squares fit of a contact's stiffness k and damping b, with forgetting.
 
-Over successive pieces of displacement (stretches),
-
-    change of force = k displacement + b change of speed
-
-is solved by least squares with forgetting.
+Each piece of displacement adds one equation: change of force = k displacement + b change of speed.
 """
 
 from __future__ import annotations
@@ -19,17 +15,14 @@ _RIDGE = 0.05
 
 @njit(cache=True)
 def update_fit(sums, force_change, displacement, speed_change, keep):
-    """Add one stretch to the sums of the fit and return the present stiffness and damping.
+    """Add one piece of displacement to the fit; return stiffness [N/m] and damping [N s/m].
 
     Args:
         sums: (NUM_SUMS,) products of displacement, speed change and force change; updated.
         force_change: change of the contact force [N].
         displacement: displacement into the contact [m], not 0.
         speed_change: change of the speed into the contact [m/s].
-        keep: share of the old sums that is kept, 0 to 1.
-
-    Returns:
-        Stiffness [N/m] and damping [N s/m], both at least 0.
+        keep: weight of the previous sums, 0 to 1.
     """
     for i in range(NUM_SUMS):
         sums[i] *= keep
@@ -48,17 +41,16 @@ def update_fit(sums, force_change, displacement, speed_change, keep):
 
 @njit(cache=True)
 def smooth_slip(displayed, component, explained, share, max_slip):
-    """Return the force to render along the contact's mean direction, without steps by slips [N].
+    """Return the force to render along the contact's mean direction [N], without steps by slips.
 
-    Friction f tilts the mean direction of the contact wrench w. A slip then changes the component
-    along it by up to f^2 / |w|. Changes of up to this size that depth and speed do not explain are
-    rendered gradually (step S3).
+    A slip changes this component of the contact wrench w by up to f^2 / |w|, with the friction f.
+    Up to this size, changes that depth and speed do not explain are rendered gradually.
 
     Args:
-        displayed: previous result [N].
-        component: present component of w along the mean direction, not negative [N].
+        displayed: result of the last step [N].
+        component: component of w along the mean direction, at least 0 [N].
         explained: change that depth and speed explain [N].
-        share: share of the remaining change that is rendered now.
+        share: share of the remaining change that is rendered in this step.
         max_slip: f^2 / |w| for the largest recent f [N].
     """
     displayed += explained
@@ -68,14 +60,12 @@ def smooth_slip(displayed, component, explained, share, max_slip):
 
 @njit(cache=True)
 def slip_change(force_change, largest_change, max_slip):
-    """Return the part of a stretch's force change that friction explains [N].
-
-    It is the part that no stiffness from 0 to the largest one explains, at most `max_slip`.
+    """Return the part of a force change that no stiffness explains, but a slip may [N].
 
     Args:
-        force_change: change of the contact force [N].
-        largest_change: change by the largest stiffness, with the sign of the displacement [N].
-        max_slip: as in `smooth_slip` [N].
+        force_change: change of the contact force during a displacement [N].
+        largest_change: change that the largest stiffness would cause by this displacement [N].
+        max_slip: largest size of the result [N].
     """
     rest = force_change - min(max(force_change, min(largest_change, 0.0)), max(largest_change, 0.0))
     return min(max(rest, -max_slip), max_slip)

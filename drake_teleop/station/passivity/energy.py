@@ -1,12 +1,7 @@
-"""Energy observers: energy through a port from recorded wrenches and poses.
+"""Energy through a port of the station, computed from recorded wrenches f and poses x.
 
-The work of a step pairs a wrench with a displacement:
-
-- `held`: f_(k-1) . (x_k - x_(k-1)), exact for a wrench that is held between samples: the hand's
-  port and a motor's.
-- `backward`: f_k . (x_k - x_(k-1)), known when a method selects f_k. The energy balances of TDPA
-  and wave variables are exact for it.
-- `mean`: mean of both, of second order for a steadily changing wrench such as contact.
+The work of a step from x_(k-1) to x_k uses the wrench `held` f_(k-1) (exact for hand and motors),
+`backward` f_k (the balance of TDPA and wave variables) or the `mean` of both (contact).
 """
 
 from __future__ import annotations
@@ -28,16 +23,15 @@ PAIRS = {"held": 0.0, "backward": 1.0, "mean": 0.5}
 
 
 def port_work(wrench: Array, pose: Array, pair: str = "held") -> Array:
-    """Return the cumulative work of a wrench at a port for translation and rotation.
+    """Return the cumulative work of a wrench on a moving body, for translation and rotation.
 
     Args:
         wrench: (N, 6) [f; tau], in W [N, N m].
-        pose: (N, 7) pose of the port [qw qx qy qz px py pz], in W, at the same instants.
-        pair: one of `PAIRS`.
+        pose: (N, 7) pose of the body [qw qx qy qz px py pz], in W, at the same instants.
+        pair: wrench of step k: `held` f_(k-1), `backward` f_k or `mean` of both.
 
     Returns:
-        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample. This is the
-        environment's energy input at the slave's port, and minus the hand's at the master's port.
+        (N, 2) sums of f . dx and tau . log(R_k R_(k-1)^T) [J], 0 at the first sample.
 
     Raises:
         DrakeTeleopError: for an unknown pair or arrays of wrong shape.
@@ -73,21 +67,21 @@ def created(energy: Array) -> Array:
     """Return the energy created up to each sample: the running maximum of max(0, -energy) [J].
 
     Args:
-        energy: (N, ...) energy input of an element without stored energy at the start [J].
+        energy: (N, ...) net energy that flowed into an element, which starts without energy [J].
     """
     return np.maximum.accumulate(np.maximum(-np.asarray(energy), 0.0), axis=0)
 
 
 @dataclass(frozen=True)
 class Ledger:
-    """Energy balance at one end of the channel; fields (..., 2): translation, rotation [J].
+    """Energy balance of a passivity method at one end of the channel.
 
     Attributes:
-        stored: energy that the end may still release.
+        stored: energy that this end may still release. All fields are (..., 2), for translation and
+            rotation [J].
         received: energy received from the other end so far.
         sent: energy sent so far.
-        lost: energy removed from the loop. `tdpa`: work of the withheld wrench and motion;
-            `two_layer`, `pspm`, `ledger`: overflow; `wave`: dissipation of the matching damper.
+        lost: energy removed from the loop (damper, overflow, withheld work).
     """
 
     stored: Array
@@ -97,7 +91,13 @@ class Ledger:
 
 
 def ledger(memory: Array) -> Ledger:
-    """Return the energy balance in the memory (..., MEMORY) of an end; zero if it keeps none."""
+    """Return the energy balance that one end's memory (..., MEMORY) contains.
+
+    It is 0 for methods without one.
+
+    Raises:
+        DrakeTeleopError: if the last dimension of `memory` is not MEMORY.
+    """
     if memory.shape[-1] != MEMORY:
         raise DrakeTeleopError(
             f"memory {memory.shape} is not one", where="memory", remedy=f"give (..., {MEMORY})"

@@ -1,7 +1,6 @@
-"""Local force limit: force and torque rendered at the hand never exceed configured values.
+"""Passivity method "local_force_limit": bounds force and torque rendered at the hand.
 
-There is no energy balance. An unstable loop stays unstable, but the limit bounds its limit cycle.
-Safety standards require a force limit independent of the other end.
+There is no energy balance. An unstable loop stays unstable, but its limit cycle is bounded.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -29,13 +28,13 @@ class ForceLimitConfig:
     torque: float = quantity(0.03, "N m", 0.0, 1e3, "largest torque at the hand")
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[_LOCAL_LIMIT] = np.divide([self.force, self.torque], p[MOTION_SCALE])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     none.master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet)
     for g in range(2):
         limit(wrench, g, p[_LOCAL_LIMIT][g])
@@ -44,5 +43,5 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     none.slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet)

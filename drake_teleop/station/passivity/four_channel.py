@@ -1,10 +1,6 @@
-"""Lawrence's four-channel architecture with local force feedback, tuned for transparency.
+"""Passivity method "four_channel": Lawrence's architecture with local force feedback.
 
-Equations and sources: docs/theory.md, "Over a network", (T39). C_m is a spring and damper between
-hand and slave; it also damps the hand in free motion. The slave's controller is its servo with
-stiffness K: a force F shifts the command by F / K. C5 and C6 are local force feedback at slave and
-hand; C3 and C6 need a sensor of the hand's force. There is no energy balance: any delay makes the
-channel active.
+docs/theory.md, (T39). There is no energy balance: any delay makes the channel active.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -65,14 +61,17 @@ class FourChannelConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
         p[_SLAVE_FEEDBACK], p[_HAND_FEEDBACK] = self.slave_feedback, self.hand_feedback
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`; send the hand's wrench."""
+    """Compute the rendered wrench and the packet, which contains the hand's measured wrench.
+
+    Arguments: `methods.master_step`.
+    """
     difference = memory[_DIFFERENCE]
     difference[:] = 0.0
     connected = arrived(received)
@@ -92,7 +91,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     if arrived(received):
         shift = memory[_DIFFERENCE]
         for i in range(6):

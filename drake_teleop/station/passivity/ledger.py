@@ -1,8 +1,7 @@
-"""Energy ledger, a passivity method at the slave's actual motion: parameters and master's end.
+"""Passivity method "ledger" with an energy balance at the slave's actual motion: master's end.
 
-docs/theory.md, section "The energy ledger", contains the equations, the guarantees, the purpose of
-each constant, and the steps M1 to M7 (master) and S1 to S6 (slave). `ledger_slave` is the slave's
-end.
+docs/theory.md, "The energy ledger", has equations, guarantees, constants, and the steps M1 to M7
+(master) and S1 to S6 (slave, in `ledger_slave`).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -139,7 +138,7 @@ class LedgerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[INITIAL], p[SLAVE_RESERVE], p[MASTER_RESERVE] = (
             self.initial,
             self.reserve,
@@ -157,11 +156,9 @@ def initialize(p: NDArray[np.float64], memory: NDArray[np.float64]) -> None:
 
 
 def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the largest speed (2,) of the slave that a full reserve permits [m/s, rad/s].
+    """Return the slave's largest speed (2,) that its reserve of energy permits [m/s, rad/s].
 
-    Args:
-        config: parameters; `reserve` is the bound of the kinetic energy (step S4).
-        mass: (2,) mass and inertia of the slave, in the master's power units [kg, kg m^2].
+    `mass` (2,) is the slave's mass and inertia in the master's power units [kg, kg m^2].
     """
     left = (1.0 - MARGIN) * np.asarray(config.reserve)
     return np.sqrt(2.0 * left / (MASS_FACTOR * mass))
@@ -169,7 +166,7 @@ def fastest(config: LedgerConfig, mass: NDArray[np.float64]) -> NDArray[np.float
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     velocity, offset_to_slave = memory[OWN_VELOCITY], wrench  # overwritten below
     smooth_velocity(twist, min(T / _VELOCITY_FILTER_S, 1.0), memory)
     memory[_WALL_DEPTH] += work_along(memory[_INWARD], dx)
@@ -207,7 +204,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _update_hand_ledger(g, dx, in_contact, p, memory):
-    """Update the master's ledger by the work on the hand (step M1)."""
     work, ledger = dot(memory[HELD_WRENCH], dx, g), memory[LEDGER]
     memory[_WORK_ON_HAND][g] = max(memory[_WORK_ON_HAND][g] + work, 0.0)
     if work < 0.0 and in_contact and ledger[g] > _FORWARD_LEVEL * p[MASTER_RESERVE][g]:
@@ -220,8 +216,7 @@ def _update_hand_ledger(g, dx, in_contact, p, memory):
 def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
     """Write the predicted contact wrench (M2, M3) into `wrench`.
 
-    `offset_to_slave` (6,), which may be `wrench`, contains x_M - z: pose of the hand minus pose of
-    the slave without a wall.
+    `offset_to_slave` (6,) is the pose of the hand minus the slave's pose without a wall.
     """
     contact_wrench, normal, inward = received[WRENCH], memory[NORMAL], memory[_INWARD]
     k = min(_STIFFNESS_MARGIN * received[CONTACT_STIFFNESS], _MAX_STIFFNESS)
@@ -292,7 +287,6 @@ def _predict_contact(received, dx, T, p, memory, offset_to_slave, wrench):
 
 @njit(cache=True)
 def _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, memory):
-    """Update the friction wrench and its limit (M2, (T68))."""
     normal, friction, largest = memory[NORMAL], memory[_FRICTION_WRENCH], memory[_MAX_FRICTION]
     # A torque's weight in the metric is 0 where rotation is not transmitted.
     metric, displacement, total = max(p[METRIC][g], 1e-12), work_along(normal, dx), 0.0
@@ -310,7 +304,6 @@ def _update_friction(g, T, size, force_ratio, contact_wrench, received, dx, p, m
 
 @njit(cache=True)
 def _add_friction(dx, force_ratio, p, memory, wrench):
-    """Write the friction wrench h, advanced by one step (M2), into `wrench`."""
     normal, displacement = memory[NORMAL], work_along(memory[NORMAL], dx)
     for g in range(2):
         metric = max(p[METRIC][g], 1e-12)
@@ -323,7 +316,6 @@ def _add_friction(dx, force_ratio, p, memory, wrench):
 
 @njit(cache=True)
 def _cross_fade(g, T, p, memory, wrench):
-    """Bound the change of the wrench after missing packets or a change of contact."""
     last, fading = memory[_LAST_WRENCH], memory[_CROSS_FADING]
     for i in range(3 * g, 3 * g + 3):
         wrench[i] -= last[i]
@@ -339,7 +331,6 @@ def _cross_fade(g, T, p, memory, wrench):
 
 @njit(cache=True)
 def _limit_to_ledger(g, dx, T, p, memory, wrench):
-    """Shorten the wrench to the energy that it may use until the next step (M5)."""
     size, cost = length(wrench, g), 0.0
     if size > 0.0:
         displacement = dot(wrench, memory[OWN_VELOCITY], g) / size * T
@@ -358,11 +349,7 @@ def _limit_to_ledger(g, dx, T, p, memory, wrench):
 
 @njit(cache=True)
 def _opposing_share(g, dx, T, p, memory):
-    """Return the share of a braking wrench that the ledger permits, 0 to 1.
-
-    The velocity filter detects a reversal at least one encoder step late: with an empty ledger the
-    wrench must not push the hand until then (M5).
-    """
+    """Return the share of a wrench against the motion that the master's energy permits, 0 to 1."""
     if memory[LEDGER][g] >= MARGIN * p[SLAVE_RESERVE][g]:
         return 1.0
     velocity = memory[OWN_VELOCITY]
@@ -372,7 +359,6 @@ def _opposing_share(g, dx, T, p, memory):
 
 @njit(cache=True)
 def _add_drag(g, received, dx, T, p, memory, wrench):
-    """Add drag on the hand to the wrench (M6)."""
     velocity, drag, active = memory[OWN_VELOCITY], 0.0, memory[_DRAG_ACTIVE]
     speed, master_level = length(velocity, g), memory[LEDGER][g] / p[MASTER_RESERVE][g]
     # Sent energy counts as arrived: its confirmation takes a round trip.

@@ -1,7 +1,4 @@
-"""Slave's end of the energy ledger (long: all steps of one end).
-
-See docs/theory.md, section "The energy ledger": steps S1 to S6, guarantees, constants.
-"""
+"""Slave's end of the method "ledger" (long: all steps of one end): S1 to S6 of docs/theory.md."""
 
 from __future__ import annotations
 
@@ -115,7 +112,7 @@ _DISPLAYED_FORCE, _LAST_SPEED, _MAX_FRICTION = (_places.number() for _ in range(
 
 @njit(cache=True)
 def smooth_velocity(twist, share, memory):
-    """Low-pass the velocity of this end; `share` is the weight of the new twist."""
+    """Low-pass the velocity of this end in `memory`; `share` is the weight of the new twist."""
     velocity = memory[OWN_VELOCITY]
     for i in range(6):
         velocity[i] += share * (twist[i] - velocity[i])
@@ -123,28 +120,28 @@ def smooth_velocity(twist, share, memory):
 
 @njit(cache=True)
 def is_contact(wrench, p):
-    """Return whether force or torque exceeds the contact threshold."""
+    """Return whether force or torque of the wrench exceeds the contact threshold."""
     threshold = p[CONTACT_THRESHOLD]
     return length(wrench, 0) > threshold[0] or length(wrench, 1) > threshold[1]
 
 
 @njit(cache=True)
 def component_along(a, b, p):
-    """Return the component of the wrench `a` along the unit wrench `b` [N]."""
+    """Return the component of the wrench `a` (6,) along the unit wrench `b` (6,) [N]."""
     return p[METRIC][0] * dot(a, b, 0) + p[METRIC][1] * dot(a, b, 1)
 
 
 @njit(cache=True)
 def work_along(wrench, displacement):
-    """Return the work of a wrench [J]; for a unit wrench, the displacement along it [m]."""
+    """Return the work of a wrench (6,) over a displacement (6,) [J]; for a unit wrench [m]."""
     return dot(wrench, displacement, 0) + dot(wrench, displacement, 1)
 
 
 @njit(cache=True)
 def find_direction(wrench, round_trip, T, p, memory):
-    """Update the contact's direction, a unit wrench; return the component of `wrench` along it [N].
+    """Update the mean direction of the contact; return the component of `wrench` (6,) along it [N].
 
-    A much larger wrench or the opposite direction is a new contact and replaces the mean at once.
+    The direction is a unit wrench. A much larger or opposite wrench replaces the mean at once.
     """
     mean, normal = memory[MEAN_WRENCH], memory[NORMAL]
     rate = 1.0
@@ -165,7 +162,7 @@ def find_direction(wrench, round_trip, T, p, memory):
 
 @njit(cache=True)
 def receive(g, received, memory):
-    """Add newly received energy to the ledger of group `g`; return this energy [J]."""
+    """Add newly received energy to this end's balance for group `g`; return this energy [J]."""
     new = new_energy(g, received, memory)
     memory[LEDGER][g] += new
     return new
@@ -173,7 +170,7 @@ def receive(g, received, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     error, now, velocity = command[:6], memory[COMMAND_POSE], memory[COMMAND_TWIST]
     connected = arrived(received)
     memory[_PERIOD] = T
@@ -226,7 +223,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _update_slave_ledger(g, received, connected, in_contact, twist, dx, wrench, T, p, memory):
-    """Update the slave's ledger and send surplus energy to the master (S1, S2)."""
     # The wrench between two samples is unknown: the smaller of both works is credited.
     work = min(dot(wrench, dx, g), dot(memory[HELD_WRENCH], dx, g))
     new = receive(g, received, memory)
@@ -259,7 +255,7 @@ def _servo_lag(p):
 
 @njit(cache=True)
 def _max_displayed_stiffness(received, T, p, memory):
-    """Return k_d, the largest stiffness that is displayed (S3) [N/m]."""
+    """Return k_d, the largest stiffness that is rendered to the hand (S3) [N/m]."""
     normal, fill_level = memory[NORMAL], 0.0
     depth, base = _PRESS_SPEED * (memory[_LONGEST_ROUND_TRIP] + _servo_lag(p)), math.inf
     for g in range(2):
@@ -280,7 +276,6 @@ def _max_displayed_stiffness(received, T, p, memory):
 
 @njit(cache=True)
 def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
-    """Estimate direction, stiffness, damping, displayed share and depth of the contact (S3)."""
     normal, k, velocity = memory[NORMAL], memory[_CONTACT_STIFFNESS], memory[OWN_VELOCITY]
     if not in_contact:
         if memory[IN_CONTACT] > 0.0 and _wall_is_removed(dx, memory):
@@ -337,7 +332,6 @@ def _identify_contact(received, in_contact, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _wall_is_removed(dx, memory):
-    """Return whether the contact ended with the step `dx` because the wall was removed (S6)."""
     normal = memory[NORMAL]
     speed_change = work_along(normal, memory[OWN_VELOCITY]) + memory[_LAST_SPEED]
     explained = abs(memory[_CONTACT_STIFFNESS] * work_along(normal, dx))
@@ -347,7 +341,6 @@ def _wall_is_removed(dx, memory):
 
 @njit(cache=True)
 def _max_slip_change(wrench, size, T, p, memory):
-    """Return f^2 / |w|, the largest force change along n that a slip can cause (S3) [N]."""
     mean_wrench = memory[MEAN_WRENCH]
     mean = max(math.sqrt(component_along(mean_wrench, mean_wrench, p)), 1e-12)
     friction = math.sqrt(max(component_along(wrench, wrench, p) - size * size, 0.0))
@@ -358,10 +351,6 @@ def _max_slip_change(wrench, size, T, p, memory):
 
 @njit(cache=True)
 def _generate_command(received, connected, T, p, memory, error):
-    """Compute the velocity of the slave's command (S3, S4).
-
-    `error` (6,) contains the difference between received pose and command. It is overwritten.
-    """
     velocity, normal, feed = memory[COMMAND_TWIST], memory[NORMAL], received[VELOCITY]
     compliance, beyond_wall, inward_speed = 0.0, 0.0, 0.0
     if memory[IN_CONTACT] > 0.0:
@@ -392,10 +381,7 @@ def _generate_command(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def _limit_motor_energy(command, pose, twist, p, memory):
-    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved.
-
-    The command generator continues from the moved command, at most as fast as the slave.
-    """
+    """Move the command (7,) so that the motors' energy suffices (S5); return whether it moved."""
     motor_wrench, changed = memory[_MOTOR_WRENCH], False
     difference_into(command, pose, motor_wrench)
     for g in range(2):
@@ -417,7 +403,6 @@ def _limit_motor_energy(command, pose, twist, p, memory):
 
 @njit(cache=True)
 def _limit_motor_wrench(g, damping, twist, p, memory):
-    """Limit the motors' wrench to the available energy, or brake; return whether it was changed."""
     motor_wrench, velocity = memory[_MOTOR_WRENCH], memory[OWN_VELOCITY]
     contact = memory[_CONTACT_WRENCH]
     size, speed, mass = length(motor_wrench, g), length(twist, g), MASS_FACTOR * p[MASS][g]
@@ -453,7 +438,6 @@ def _limit_motor_wrench(g, damping, twist, p, memory):
 
 @njit(cache=True)
 def _step_servo_model(received, connected, T, p, memory, error):
-    """Advance the servo model (S6) by implicit Euler, which is stable for all K and D."""
     model, velocity = memory[SERVO_MODEL], memory[_SERVO_MODEL_TWIST]
     error[:] = 0.0
     if connected:
@@ -467,7 +451,7 @@ def _step_servo_model(received, connected, T, p, memory, error):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Limit the command if the safe state changed it (S5); see `methods.Methods`."""
+    """Limit the motors' energy for a changed command; see `methods.command_sent`."""
     for i in range(7):
         if command[i] != requested[i]:
             if _limit_motor_energy(command, pose, twist, p, memory):

@@ -1,8 +1,4 @@
-"""Layout of the memory vector and the parameter vector of one end of the channel.
-
-Both are plain float64 vectors, so that they fit a Drake discrete state and a compiled loop. The
-module of a method declares its own places with `own_memory` and `own_parameters`.
-"""
+"""Layout of the float64 vectors that contain memory and parameters of one end of the channel."""
 
 from __future__ import annotations
 
@@ -11,7 +7,7 @@ PARAMETERS = 26  #: length of the parameter vector, which `methods.parameters` f
 
 
 class Slots:
-    """Allocator of consecutive places in a vector.
+    """Allocator of consecutive places in a vector: hands out indices and slices.
 
     Args:
         size: length of the vector.
@@ -22,14 +18,14 @@ class Slots:
         self._size, self._next = size, first
 
     def number(self) -> int:
-        """Reserve a place and return its index."""
+        """Reserve one place and return its index."""
         return self.vector(1).start
 
     def vector(self, length: int) -> slice:
-        """Reserve `length` places and return their slice; ``array[slice]`` is a view of them.
+        """Reserve `length` places and return their slice.
 
         Raises:
-            IndexError: if the vector does not fit.
+            IndexError: if fewer places remain.
         """
         first, self._next = self._next, self._next + length
         if self._next > self._size:
@@ -37,7 +33,7 @@ class Slots:
         return slice(first, self._next)
 
     def rest(self) -> slice:
-        """Reserve all remaining places."""
+        """Reserve all remaining places and return their slice."""
         return self.vector(self._size - self._next)
 
 
@@ -76,10 +72,10 @@ _METHOD = _parameters.rest()
 
 
 def own_memory() -> Slots:
-    """Return an allocator for a method's own part of the memory, which starts with zeros."""
+    """Return an allocator for a method's own part of the memory; this part starts with zeros."""
     return Slots(MEMORY, _OWN.start)
 
 
 def own_parameters() -> Slots:
-    """Return an allocator for a method's own part of the parameters."""
+    """Return an allocator for a method's own part of the parameter vector."""
     return Slots(PARAMETERS, _METHOD.start)

@@ -1,14 +1,9 @@
 """Passivity methods by name, their parameters, and one step of each end of the channel.
 
-Ports of the bilateral part of the station:
-
-- master: the wrench to render, and the motion of the master's command (after kinematic scaling,
-  before the channel);
-- slave: the contact wrench, and the actual motion of the slave.
-
-Motion and wrenches are in world axes. Wrenches are in the *master's power units*: wrench times
-motion of the slave's command is the work at the hand, docs/theory.md (T29). The hand puts in the
-energy -f . dx, the environment f . dx.
+Ports: at the master the wrench to render and the motion of its command (after kinematic scaling,
+before the channel); at the slave the wrench of contact (with sigma > 0 also of the load) and the
+actual motion, all in world axes W. Wrenches are in the *master's power units*: wrench times motion
+of the slave's command is the work at the hand, docs/theory.md (T29).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -58,12 +53,10 @@ from drake_teleop.station.passivity.wave import WaveConfig
 class Methods:
     """Parameters of all passivity methods; each field registers the method of its name.
 
-    The module of the field's class implements the method. The class has `pack_into(p)`. The module
-    contains the compiled `master_step` and `slave_step`, with the arguments of those below except
-    `steps`. Optional: `initialize(p, memory)` prepares the memory of an end; the compiled
-    `command_sent(requested, command, pose, twist, p, memory)` receives the command after the safe
-    state; `AT_THE_MOTOR = True` marks an energy balance at the slave's motors instead of its
-    command.
+    The module of the field's class implements the method: compiled `master_step` and `slave_step`,
+    with the arguments of those below except `steps`; the class has `pack_into(p)`. Optional:
+    `initialize(p, memory)` of an end; compiled `command_sent`; `AT_THE_MOTOR = True` for an energy
+    balance at the slave's motors instead of its command.
     """
 
     wave: WaveConfig = field(default_factory=WaveConfig)
@@ -137,13 +130,12 @@ def parameters(
     """Return the parameters of the selected method as one vector for the compiled steps.
 
     Args:
-        config: method and parameters.
         power_scale: (2,) factors from the slave's wrench to the master's power units, for force and
             torque: force scale over kinematic scale.
         motion_scale: (2,) kinematic scale, slave over master, of translation and rotation.
 
     Returns:
-        (PARAMETERS,) vector in the layout of `drake_teleop.station.passivity.memory`.
+        (PARAMETERS,) vector in the layout of `memory`.
     """
     p = np.zeros(PARAMETERS)
     p[LIMIT] = np.divide([config.force_limit, config.torque_limit], motion_scale)
@@ -160,10 +152,9 @@ def parameters(
 def initial_memory(
     method: str, parameters: NDArray[np.float64], pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the memory (MEMORY,) of an end before its first step.
+    """Return the memory (MEMORY,) of one end of the channel before its first step.
 
     Args:
-        method: one of `METHODS`.
         parameters: result of `parameters`.
         pose: (7,) slave's pose X_WS at the start, its command until a packet arrives.
 
@@ -186,7 +177,7 @@ def initial_memory(
 
 @njit(cache=True)
 def _ignore_command(requested, command, pose, twist, p, memory):
-    """Ignore the command, for a method without `command_sent`."""
+    """Substitute for `command_sent` in methods without one."""
 
 
 _ROW = types.Array(types.float64, 1, "C")
@@ -200,10 +191,7 @@ _master_step, _slave_step, _command_sent = map(
 
 @cache
 def steps_of(method: str) -> tuple[int, int, int]:
-    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`.
-
-    A channel calls them by address: a channel with all methods would compile nine times as long.
-    """
+    """Return the addresses of a method's `master_step`, `slave_step` and `command_sent`."""
     file = _MODULES[method]
     return (
         address_of(file.master_step, _MASTER_ARGUMENTS),
@@ -214,7 +202,7 @@ def steps_of(method: str) -> tuple[int, int, int]:
 
 @njit(cache=True)
 def _number_packet(healthy, memory, packet):
-    """Write the packet's number; if the inputs are not finite, repeat the last good packet."""
+    """Write the packet's number; repeat the last good packet if the inputs are not finite."""
     if healthy:
         packet[HEALTHY] = 1.0
         put(memory, PACKET.start, packet, 0, PACKET_SIZE)
@@ -229,7 +217,7 @@ def _number_packet(healthy, memory, packet):
 def master_step(
     steps, received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet
 ):  # fmt: skip
-    """Compute the wrench at the hand and the packet of one step at the master's end.
+    """Compute the wrench to render at the hand and the packet of one step at the master's end.
 
     Args:
         steps: result of `steps_of(method)`.
@@ -238,7 +226,7 @@ def master_step(
         pose: (7,) commanded pose X_WS, after kinematic scaling, before the channel.
         twist: (6,) twist of this command [v; omega], in W.
         dx: (6,) increment of this command since the last step [dp; log(R_k R_(k-1)^T)], in W.
-        hand: (6,) wrench of the hand on the device, in W and master power units; only
+        hand: (6,) wrench of the hand on the device, in W and master's power units; only
             `four_channel` uses it.
         limits: (2,) largest force and torque, in the master's power units [N, N m].
         T: time between steps [s].
@@ -269,7 +257,8 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
         pose: (7,) actual pose X_WS of the slave.
         twist: (6,) actual twist of the slave [v; omega], in W.
         dx: (6,) increment of this pose since the last step, in W.
-        wrench: (6,) contact wrench on the slave, in W and master power units.
+        wrench: (6,) wrench on the slave from contact, with sigma > 0 also from the load, in W and
+            master's power units.
         command: (13,) written: pose (7,) and twist (6,) of the slave's command. If an input is not
             finite, it is the last pose with zero twist.
     """
@@ -287,5 +276,13 @@ def slave_step(steps, received, fresh, pose, twist, dx, wrench, T, p, memory, co
 
 @njit(cache=True)
 def command_sent(steps, requested, command, pose, twist, p, memory):
-    """Pass the command that the safe state returned to the method; see `Methods`."""
+    """Report to the method the command that is sent; a stop by the safe state may have changed it.
+
+    Args:
+        steps: result of `steps_of(method)`.
+        requested: (7,) command X_WS of the method.
+        command: (7,) command after the safe state; the method may change it.
+        pose, twist: (7,) and (6,) actual pose and twist of the slave, in W.
+        p, memory: as for `master_step`.
+    """
     _command_sent(steps[2], requested, command, pose, twist, p, memory)

@@ -1,4 +1,4 @@
-"""No passivity method: wrench and pose are passed on unchanged.
+"""Passivity method "none": wrench and pose are passed on unchanged.
 
 Delay or loss creates energy in this channel. It is the baseline for comparisons.
 """
@@ -13,7 +13,7 @@ from drake_teleop.station.passivity.packet import POSE, VELOCITY, WRENCH, arrive
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     requested = received[WRENCH]
     for i in range(6):
         wrench[i] = requested[i]
@@ -25,7 +25,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     if arrived(received):
         put(memory, COMMAND_POSE.start, received, POSE.start, 7)
         put(memory, COMMAND_TWIST.start, received, VELOCITY.start, 6)

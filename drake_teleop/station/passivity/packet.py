@@ -1,9 +1,6 @@
-"""Layout of a packet, and small vector operations of all passivity methods.
+"""Layout of a packet, (38,) float64, and small vector operations of all passivity methods.
 
-One layout, (38,) float64, serves every method and both directions. Counters and integrals are
-cumulative, so lost, late or duplicate packets do no harm. A vector of six has two *groups* of
-three, translation first. A ledger is one number for each group. A limit shortens the vector of a
-group and keeps its direction.
+Vectors (6,) have two *groups* g of three: 0 is translation, 1 rotation.
 """
 
 from __future__ import annotations
@@ -44,14 +41,14 @@ MAX_WRENCH_RATE = (450.0, 4.5)
 
 @njit(cache=True)
 def arrived(received):
-    """Return whether `received` is a packet; before the first packet it contains zeros."""
+    """Return whether a packet has arrived: before the first, `received` contains zeros."""
     pose = received[POSE]
     return pose[0] != 0.0 or pose[1] != 0.0 or pose[2] != 0.0 or pose[3] != 0.0
 
 
 @njit(cache=True)
 def new_energy(g, received, memory):
-    """Return the energy of group `g` that was received since the last call [J]."""
+    """Return the energy of group `g` received since the last call [J]; credit it in `memory`."""
     new = max(received[ENERGY][g] - memory[RECEIVED][g], 0.0)
     memory[RECEIVED][g] += new
     return new
@@ -59,7 +56,7 @@ def new_energy(g, received, memory):
 
 @njit(cache=True)
 def fill(pose, twist, wrench, packet):
-    """Write pose, twist and wrench of the sender into the packet."""
+    """Write the sender's pose (7,), twist (6,) and wrench (6,) into the packet."""
     now, velocity, force = packet[POSE], packet[VELOCITY], packet[WRENCH]
     for i in range(7):
         now[i] = pose[i]
@@ -69,28 +66,28 @@ def fill(pose, twist, wrench, packet):
 
 @njit(cache=True)
 def dot(a, b, g):
-    """Return the scalar product a . b over group `g` (0: translation, 1: rotation)."""
+    """Return the scalar product of group `g` (0: translation, 1: rotation) of two vectors (6,)."""
     i = 3 * g
     return a[i] * b[i] + a[i + 1] * b[i + 1] + a[i + 2] * b[i + 2]
 
 
 @njit(cache=True)
 def length(a, g):
-    """Return the norm of group `g` of `a` without overflow."""
+    """Return the norm of group `g` (0: translation, 1: rotation) of the vector `a` (6,)."""
     i = 3 * g
     return math.hypot(math.hypot(a[i], a[i + 1]), a[i + 2])
 
 
 @njit(cache=True)
 def scale(a, g, s):
-    """Multiply group `g` of `a` by `s`."""
+    """Multiply group `g` (0: translation, 1: rotation) of the vector `a` (6,) by `s`."""
     for i in range(3 * g, 3 * g + 3):
         a[i] *= s
 
 
 @njit(cache=True)
 def limit(a, g, most):
-    """Shorten group `g` of `a` to at most the length `most`."""
+    """Shorten group `g` of the vector `a` (6,) to at most the length `most`, in its direction."""
     size = length(a, g)
     if size > most:
         scale(a, g, most / size)
@@ -116,7 +113,7 @@ def difference_into(a, b, e):
 
 @njit(cache=True)
 def moved_into(pose, e, out):
-    """Write the moved pose [exp(e_r) R; p + e_p] into `out` (7,), which may be `pose`."""
+    """Write the pose moved by `e` (6,), [exp(e_r) R; p + e_p], into `out` (7,)."""
     turn = exponential((e[3], e[4], e[5]))
     q = normalized(multiply(turn, (pose[0], pose[1], pose[2], pose[3])))
     for i in range(4):

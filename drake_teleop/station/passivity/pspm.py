@@ -1,12 +1,7 @@
 """Passive set-position modulation (Lee and Huang, T-RO 26(2), 2010); docs/theory.md, (T38).
 
-A spring K pulls each end to a set position y. The set position moves as near to the requested one
-as the stored energy E permits. The master sends energy above a ceiling to the slave (energy
-shuffling). The slave discards energy above its ceiling: a limit cycle could use circulating energy.
-
-The energy balance is exact at the ports of hand and slave's *motors*. It also holds at the actual
-motion if K and D of the servo are configured correctly. At the hand the requested set position is
-x + f / K_h for the received force f; a damper is in parallel.
+A spring pulls each end to a set position, which moves as near to the requested one as the stored
+energy permits. The energy balance holds if K and D of the servo are configured correctly.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -74,24 +69,20 @@ class PspmConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[_INITIAL], p[_CEILING] = self.initial, self.ceiling
         p[_SPRING], p[_DAMPER] = self.stiffness, self.damping
 
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Write the initial energy into the memory."""
+    """Write the initial energy of an end into its memory."""
     memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
-    """Move the set position of group g as near to the requested one as the energy permits.
-
-    `before` is the squared offset of the set position at the last step. Energy above the ceiling is
-    sent (`shuffle`) or discarded.
-    """
+    """Move the set position of group `g` as near to the requested one as the energy permits."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     stored, required = dot(offset, offset, g), dot(requested, requested, g)
     damped = -dot(memory[HELD_WRENCH], dx, g) - 0.5 * stiffness * (stored - before)
@@ -114,7 +105,7 @@ def _modulate(received, g, stiffness, dx, before, shuffle, p, memory, packet):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     offset, requested, received_wrench = memory[_OFFSET], memory[_REQUESTED], received[WRENCH]
     K, B = p[_SPRING], p[_DAMPER]
     for g in range(2):
@@ -135,7 +126,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     offset, requested = memory[_OFFSET], memory[_REQUESTED]
     now, held, K, D = memory[COMMAND_POSE], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     before = dot(offset, offset, 0), dot(offset, offset, 1)
@@ -155,10 +146,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Use the command after the safe state as set position; see `methods.Methods`.
-
-    The spring's additional energy is subtracted from the stored energy.
-    """
+    """Adopt the command that is sent as the spring's set position; see `methods.command_sent`."""
     offset, other, held = memory[_OFFSET], np.empty(6), memory[HELD_WRENCH]
     K, D = p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, offset)

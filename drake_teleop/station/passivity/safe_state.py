@@ -1,8 +1,8 @@
-"""Safe state of both ends for silence and faulty data; docs/delay.md has the table of causes.
+"""Safe state of both ends of the channel for silence and faulty data; docs/delay.md.
 
-An end is *silent* if it received no new packet of a healthy sender for `timeout` seconds. It is
-silent at once if its own data are not finite (or beyond 1e6 in SI units), or if the newest packet
-reports this of the other end. Both ends begin silent. A pose that is not finite adds no work.
+An end is *silent* without new packets of a healthy sender for `timeout` seconds, or if data of
+either end are not finite or beyond 1e6 in SI units. Both ends begin silent. A silent master fades
+the wrench to zero; a silent slave stops.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ _LAST_COMMAND, _PREVIOUS_COMMAND = (
 
 
 def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-    """Return the master's monitor state (MASTER_WATCH,) before the first packet.
+    """Return the state (MASTER_WATCH,) of the master's silence monitor before the first packet.
 
-    With `full` (2,), the device's limits, it is that of normal operation.
+    With `full` (2,), the device's limits [N, N m], it is the state of normal operation.
     """
     watch = np.zeros(MASTER_WATCH)
     if full is None:
@@ -52,7 +52,7 @@ def initial_master_watch(full: NDArray[np.float64] | None = None) -> NDArray[np.
 
 
 def initial_slave_watch(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the slave's initial monitor state (SLAVE_WATCH,), with the command at `pose`."""
+    """Return the initial state (SLAVE_WATCH,) of the slave's silence monitor, with its command."""
     watch = np.zeros(SLAVE_WATCH)
     watch[SILENT] = np.inf
     for part in (_STOP_POSE, _LAST_COMMAND, _PREVIOUS_COMMAND):
@@ -70,7 +70,7 @@ def _update_silence(alive, fault, T, watch):
 
 @njit(cache=True)
 def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
-    """Write the limits of the wrench at the hand for this step.
+    """Write the limits of the rendered wrench for this step: they fall to zero during silence.
 
     Args:
         alive: whether a new packet of a healthy slave came at this step.
@@ -102,13 +102,13 @@ def master_limits_into(alive, fault, T, timeout, full, held, watch, limits):
 
 @njit(cache=True)
 def slave_command_into(alive, fault, T, timeout, requested, watch, command):
-    """Write the command that is sent to the slave at this step.
+    """Write the command that is sent to the slave at this step; during silence it stops.
 
     Args:
         alive: whether a new packet of a healthy master came at this step.
         fault: whether the slave's data are not finite, or a new packet reports this of the hand.
         T, timeout: as for `master_limits_into`.
-        requested: (7,) pose X_WS from the method.
+        requested: (7,) pose X_WS from the passivity method.
         watch: (SLAVE_WATCH,) monitor state, updated.
         command: (7,) written: commanded pose X_WS.
     """
@@ -146,15 +146,15 @@ def slave_command_into(alive, fault, T, timeout, requested, watch, command):
 
 @njit(cache=True)
 def retreat(twist, T, p, memory, wrench):
-    """Shorten the wrench at the hand if the hand moves along it faster than `RETREAT`.
+    """Reduce a rendered wrench that pushes the hand, so that a released hand stays slow.
 
-    At twice this speed it is 0, except for the slave's inertial force while the hand decelerates.
+    For hand speeds along the wrench between `RETREAT` and twice this, it falls to 0. While the hand
+    decelerates, the slave's inertial force remains.
 
     Args:
         twist: (6,) twist of the command before the channel [v; omega], in W.
         T: time between steps [s].
-        p: parameters of the method.
-        memory: memory of the master's end, updated.
+        p, memory: parameters and memory of the master's end; memory is updated.
         wrench: (6,) in W and the master's power units, updated.
     """
     velocity, rate = memory[HAND_VELOCITY], min(T / _RETREAT_FILTER_S, 1.0)

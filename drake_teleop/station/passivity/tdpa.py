@@ -1,15 +1,8 @@
-"""Time-domain passivity approach (TDPA) of a delayed two-port, with clipping controllers.
+"""Time-domain passivity approach (TDPA) of a delayed two-port, docs/theory.md, (T31), (T32), (T44).
 
-See docs/theory.md, (T31), (T32), (T44). Passivity is guaranteed at the hand and the slave's
-*command*, for the backward pair (`energy`). A shortened wrench recovers slowly (force-jump filter).
-A step uses only a share of the stored energy. The master keeps a part of the hand's energy input,
-so that the wrench can push the hand back.
-
-`charged_tdpa` adds a drag on the hand that stores energy in free motion (level controller of
-Franken et al. 2011, with bounded force), and a filter of the slave's wrench that stabilises the
-delayed loop.
-
-At the actual motion, behind the servo, about m v^2 / 2 can be created at the speed `speed`.
+Passivity is guaranteed at the hand and the slave's *command*, for the `backward` work of module
+`energy`. `charged_tdpa` adds a drag on the hand that stores energy in free motion (Franken et al.
+2011), and a filter of the slave's wrench.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -133,7 +126,7 @@ class TdpaConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[_RELEASE], p[_DRAIN], p[_DRIFT_RATE] = self.release, self.drain_rate, self.drift_rate
         p[_RESERVE], p[_DRAG] = self.reserve, np.divide(self.drag, p[MOTION_SCALE])
         p[_HAND_STIFFNESS] = np.divide(self.hand_stiffness, np.square(p[MOTION_SCALE]))
@@ -141,13 +134,13 @@ class TdpaConfig:
 
 
 def charged() -> TdpaConfig:
-    """Return the parameters of `charged_tdpa` for a medium grip; drag fills 60 mJ in 0.4 m."""
+    """Return the parameters of `charged_tdpa`, TDPA with drag on the hand, for a medium grip."""
     return TdpaConfig(reserve=[0.06, 1e-3], drag=[0.28, 3e-3], hand_stiffness=[300.0, 1.5])
 
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     drain, release = min(T * p[_DRAIN], 1.0), T / p[_RELEASE] if p[_RELEASE] > 0.0 else 1.0
@@ -179,11 +172,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
-    """Return the share of the wrench that may be rendered in this step.
-
-    The full wrench would use the energy `drained`. The rendered wrench may use the share `drain` of
-    the energy `stored`, or all of it if the wrench would otherwise drop abruptly.
-    """
+    """Return the share of the wrench that may be rendered within the stored energy."""
     least, size = length(held, g) - MAX_WRENCH_RATE[g] * T / p[MOTION_SCALE][g], length(wrench, g)
     share = min(share, max(drain * stored / drained, least / size))
     return min(share, stored / drained)
@@ -191,7 +180,6 @@ def _permitted_share(g, drained, drain, stored, share, T, p, held, wrench):
 
 @njit(cache=True)
 def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
-    """Add drag along -dx to the wrench while an end has less than its reserve."""
     drag, level = p[_DRAG][g], memory[LEDGER][g] + memory[_RESERVED_ENERGY][g]
     if drag > 0.0 and min(level, slave_ledger) < p[_RESERVE][g]:
         damping = drag / max(length(dx, g), _DRAG_SPEED[g] * T)
@@ -202,7 +190,6 @@ def _add_drag(g, slave_ledger, dx, limits, T, p, memory, wrench):
 
 @njit(cache=True)
 def _send_surplus(g, p, memory):
-    """Send the master's energy above its reserve to the slave."""
     ledger = memory[LEDGER]
     surplus = ledger[g] + memory[_RESERVED_ENERGY][g] - p[_RESERVE][g]
     surplus = min(max(surplus, 0.0), ledger[g])
@@ -212,7 +199,6 @@ def _send_surplus(g, p, memory):
 
 @njit(cache=True)
 def _account_for_work(g, drained, p, memory):
-    """Subtract work on the hand from ledger and kept energy, or keep and send work by it."""
     ledger, kept = memory[LEDGER], memory[_RESERVED_ENERGY]
     if drained > 0.0:
         more = min(ledger[g] - drained, 0.0)
@@ -225,7 +211,7 @@ def _account_for_work(g, drained, p, memory):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     for g in range(2):
         memory[LEDGER][g] += new_energy(g, received, memory)
     put(memory, _LAST_COMMAND.start, memory, COMMAND_POSE.start, 7)
@@ -251,7 +237,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _filter(g, received, dx, wrench, T, p, memory):
-    """Low-pass the wrench that the slave sends (T44)."""
     filtered, hand = memory[_FILTERED], p[_HAND_STIFFNESS][g]
     rate, onset, gain = 1.0, 0.0, 0.0
     if hand > 0.0:
@@ -277,7 +262,6 @@ def _filter(g, received, dx, wrench, T, p, memory):
 
 @njit(cache=True)
 def _contact_stiffness(g, dx, wrench, T, memory):
-    """Return the contact stiffness -df.dx / dx.dx, averaged over travel [N/m, N m/rad]."""
     size, stiffness = length(dx, g), memory[_STIFFNESS_ESTIMATE]
     if size > _STIFFNESS_TRAVEL[g] * T:
         change = dot(wrench, dx, g) - dot(memory[HELD_WRENCH], dx, g)
@@ -288,13 +272,11 @@ def _contact_stiffness(g, dx, wrench, T, memory):
 
 @njit(cache=True)
 def _available_energy(memory, g):
-    """Return received energy minus output [J], negative if the servo released too much."""
     return memory[RECEIVED][g] - max(memory[_OUTPUT][g], memory[_COMMAND_OUTPUT][g])
 
 
 @njit(cache=True)
 def _move_command(received, wrench, T, p, memory):
-    """Move the command towards the received pose within the available energy."""
     now, withheld = memory[COMMAND_POSE], memory[_WITHHELD]
     step = memory[COMMAND_TWIST]
     remaining_share = 1.0 - min(T * p[_DRIFT_RATE], 1.0)
@@ -318,7 +300,6 @@ def _move_command(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _account_command(command, sign, memory):
-    """Add (`sign` 1) or subtract (-1) the work of the command step that ends at `command`."""
     step = np.empty(6)
     difference_into(command, memory[_LAST_COMMAND], step)
     for g in range(2):
@@ -330,7 +311,7 @@ def _account_command(command, sign, memory):
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Correct the energy balance if the safe state changed the command; see `methods.Methods`."""
+    """Correct the energy balance for a changed command; see `methods.command_sent`."""
     for i in range(7):
         if command[i] != requested[i]:
             _account_command(requested, -1.0, memory)

@@ -1,12 +1,8 @@
 """Two-layer control with energy tanks (Franken et al., T-RO 27(4), 2011); docs/theory.md, (T37).
 
-Each end has an energy tank, which must cover the energy that the wrench can use until the next
-step. At the slave this is the motors' wrench. The tanks are never overdrawn if hand and walls
-accelerate less than `acceleration` and if servo and mass are configured correctly.
-
-Only braking uses the last 1 % of the slave's tank: otherwise a slave slower than `acceleration`
-times period would coast with an empty tank. A damper on the hand fills the master's tank up to
-`level`.
+The tank of each end must cover the energy that the wrench can use until the next step. It is never
+overdrawn if hand and walls accelerate less than `acceleration` and if servo and mass are configured
+correctly.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -89,7 +85,7 @@ class TwoLayerConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[_SEND], p[_DRAIN] = self.send_rate, self.drain_rate
         p[_INITIAL], p[_LEVEL], p[_CAPACITY] = self.initial, self.level, self.capacity
         p[_DAMPER], p[ACCELERATION] = self.damper, self.acceleration
@@ -97,13 +93,12 @@ class TwoLayerConfig:
 
 @njit(cache=True)
 def initialize(p, memory):
-    """Fill the tank with its initial energy."""
+    """Write the initial energy of the tank into the memory of an end."""
     memory[LEDGER] = p[_INITIAL]
 
 
 @njit(cache=True)
 def _exchange(received, dx, T, p, memory, packet):
-    """Update the energy tank by the work of the held wrench and by received and sent energy."""
     ledger, sent_so_far = memory[LEDGER], memory[SENT]
     held, capacity = memory[HELD_WRENCH], p[_CAPACITY]
     for g in range(2):
@@ -120,13 +115,12 @@ def _exchange(received, dx, T, p, memory, packet):
 
 @njit(cache=True)
 def _cost(f, dx, g, acceleration, T):
-    """Return the largest energy that a wrench can use until the next step [J]."""
+    """Return the largest energy that the wrench `f` can use until the next step [J]."""
     return dot(f, dx, g) + length(f, g) * acceleration * T * T
 
 
 @njit(cache=True)
 def _limit_to_tank(f, dx, g, acceleration, T, memory):
-    """Shorten group `g` of the wrench `f` to the energy in the tank."""
     cost, level = _cost(f, dx, g, acceleration, T), max(memory[LEDGER][g], 0.0)
     if cost > level:
         scale(f, g, level / cost)
@@ -134,7 +128,7 @@ def _limit_to_tank(f, dx, g, acceleration, T, memory):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     _exchange(received, dx, T, p, memory, packet)
     ledger, requested = memory[LEDGER], received[WRENCH]
     for g in range(2):
@@ -153,7 +147,7 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     spring, brake = memory[_SPRING_WRENCH], memory[_BRAKE_WRENCH]
     _exchange(received, dx, T, p, memory, packet)
     target = memory[COMMAND_POSE]
@@ -189,7 +183,7 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def command_sent(requested, command, pose, twist, p, memory):
-    """Store the servo's wrench for the command after the safe state; see `methods.Methods`."""
+    """Store the servo's wrench for the command that is sent; see `methods.command_sent`."""
     spring, held, K, D = memory[_SPRING_WRENCH], memory[HELD_WRENCH], p[STIFFNESS], p[DAMPING]
     difference_into(command, pose, spring)
     for i in range(6):

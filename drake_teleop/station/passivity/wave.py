@@ -1,14 +1,8 @@
-"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991).
+"""Wave variables (Anderson and Spong 1989; Niemeyer and Slotine 1991), theory.md (T33) to (T36).
 
-Equations: docs/theory.md, (T33) to (T36). An end releases only the energy of the received wave,
-for the backward pair (`energy`) at the hand and the slave's *command*. It sends integral and energy
-of its wave. The receiver outputs the integral through a first-order filter within the received
-energy (Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold
-create no energy. Lost packets cause no drift. Uneven arrival slows the filter; a playout buffer
-avoids this.
-
-A damper at the slave's command matches the line's impedance b: free motion then reflects no wave,
-and the rendered force is b v. Without packets the slave keeps its command and reflects.
+The receiver outputs the integral of the wave through a filter, within the received energy
+(Yokokohji, Imaida, Yoshikawa 1999; Niemeyer and Slotine 2004). So jitter, loss and hold create no
+energy at the hand and the slave's *command*, for the `backward` work of module `energy`.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -87,18 +81,14 @@ class WaveConfig:
     )
 
     def pack_into(self, p: NDArray[np.float64]) -> None:
-        """Write the parameters into `p`."""
+        """Write these parameters into the parameter vector `p`."""
         p[IMPEDANCE], p[_FILTER], p[_MATCHING] = self.impedance, self.filter, self.matching
         p[_PATIENCE], p[_DRIFT_RATE] = self.patience, self.drift_rate
 
 
 @njit(cache=True)
 def _play(received, T, p, memory, wave):
-    """Write the wave (6,) of this step, taken from the integral of the received wave.
-
-    Each step outputs the share a of the rest d, which costs a |d|^2 / (2 T (2 - a)) in all. a is
-    the share of the filter, or less if the stored energy requires it (T34).
-    """
+    """Write the wave (6,) of this step, taken from the integral of the received wave (T34)."""
     ledger, played = memory[LEDGER], memory[_PLAYED_INTEGRAL]
     integral = received[INTEGRAL]
     for g in range(2):
@@ -117,7 +107,7 @@ def _play(received, T, p, memory, wave):
 
 @njit(cache=True)
 def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wrench, packet):
-    """Run the master's step, see `methods.master_step`."""
+    """Compute the rendered wrench and the packet; arguments: `methods.master_step`."""
     wave, integral, sent = memory[_WAVE], memory[_SENT_INTEGRAL], packet[INTEGRAL]
     _play(received, T, p, memory, wave)
     catching_up, newest = memory[_CATCHING_UP], received[SEQUENCE]
@@ -148,10 +138,6 @@ def master_step(received, fresh, pose, twist, dx, hand, limits, T, p, memory, wr
 
 @njit(cache=True)
 def _limit_change(g, energy, dx, most, held, wrench):
-    """Limit the change of the wrench to `most`; return whether it was larger.
-
-    If the limited wrench would use more than `energy`, the change is enlarged until it does not.
-    """
     size = 0.0
     for i in range(3 * g, 3 * g + 3):
         size += (wrench[i] - held[i]) ** 2
@@ -168,7 +154,7 @@ def _limit_change(g, energy, dx, most, held, wrench):
 
 @njit(cache=True)
 def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, packet):
-    """Run the slave's step, see `methods.slave_step`."""
+    """Compute the slave's command and the packet; arguments: `methods.slave_step`."""
     now, step = memory[COMMAND_POSE], memory[COMMAND_TWIST]
     memory[_SILENCE] = 0.0 if fresh else memory[_SILENCE] + T
     if memory[FILL_TIME] > 0.0:
@@ -194,7 +180,6 @@ def slave_step(received, fresh, pose, twist, dx, wrench, T, p, memory, command, 
 
 @njit(cache=True)
 def _reflect(received, wrench, T, p, memory):
-    """Compute the command's step from wave and contact wrench, and the reflected wave."""
     wave, step, integral = memory[_WAVE], memory[COMMAND_TWIST], memory[_SENT_INTEGRAL]
     _play(received, T, p, memory, wave)
     for g in range(2):
@@ -210,10 +195,6 @@ def _reflect(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _play_rest(wrench, T, p, memory):
-    """Output the wave that keeps the slave at rest, if the stored energy suffices.
-
-    To the master this is the reflection of a rigid wall.
-    """
     wave, ledger = memory[_WAVE], memory[LEDGER]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
@@ -230,11 +211,7 @@ def _play_rest(wrench, T, p, memory):
 
 @njit(cache=True)
 def _fill_line(received, wrench, T, p, memory):
-    """Reflect as a rigid wall while a new channel fills, and prepare the steady state.
-
-    The channel then begins with the energy of the contact force f, f^2 / 4 b over a round trip and
-    both filter times. This energy is added once.
-    """
+    """Reflect as a rigid wall while a new channel fills, and prepare the steady state."""
     wave, ledger, accounted = memory[_WAVE], memory[LEDGER], memory[RECEIVED]
     played, integral = memory[_PLAYED_INTEGRAL], memory[_SENT_INTEGRAL]
     for g in range(2):
@@ -249,7 +226,6 @@ def _fill_line(received, wrench, T, p, memory):
 
 @njit(cache=True)
 def _correct_drift(received, wrench, T, p, memory):
-    """Add a step towards the received pose in each group where it increases no contact force."""
     drift, step = memory[_DRIFT], memory[COMMAND_TWIST]
     difference_into(received[POSE], memory[COMMAND_POSE], drift)
     for g in range(2):

@@ -1,4 +1,4 @@
-"""Force scaling, and elimination of the load's wrench (Figs. 2 and 4 of the paper)."""
+"""Scaling of the slave's wrench for the master, and removal of the load's wrench (Figs. 2, 4)."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -57,10 +57,11 @@ class ForceScalingConfig:
     )
 
     def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
-        """Return (sigma_gripper, sigma_object, gamma); `where` is the place in error messages.
+        """Return the scales (sigma_gripper, sigma_object, gamma).
 
         Raises:
-            DrakeTeleopError: if eta is given and sigma is not 0 or gamma is not 1 (section V).
+            DrakeTeleopError: if eta is given without gripper_phi, sigma = 0 and gamma = 1 (section
+                V); `where` is the block's path.
         """
         if self.eta is None:
             return self.sigma, self.sigma, self.gamma
@@ -75,7 +76,7 @@ class ForceScalingConfig:
 
 @njit(cache=True)
 def wrench_to_master_into(wrench_S, R_WS, R_WB, force_scale, torque_scale, out):
-    """Write the result of `wrench_to_master` for one wrench (6,) into `out`; compiled."""
+    """Write the result of `wrench_to_master` for one wrench (6,) into `out` (6,); compiled."""
     for part in range(2):
         scale = torque_scale if part == 1 else force_scale
         base = 3 * part
@@ -93,9 +94,7 @@ def wrench_to_master(
 ) -> NDArray[np.float64]:
     """Return the wrench to render at the master for a wrench at the slave's sensor.
 
-    The device displays the reaction of Eq. (1)'s wrench: for a load that is held up, the hand is
-    pulled down. The moment about the origin of S becomes the moment about E. Equal power at both
-    ends needs the translation scale as force scale; the paper's 1/17.5 is smaller.
+    It is the reaction, rotated and scaled: for a load that is held up, the hand is pulled down.
 
     Args:
         wrench_S: (..., 6) [f; tau] of Eq. (1), sensor on load, about the origin of S, in S.
@@ -105,7 +104,7 @@ def wrench_to_master(
         torque_scale: torque at the master over torque at the slave.
 
     Returns:
-        (..., 6) F_E_B, [f; tau] on the hand at E, in B [N, N m].
+        (..., 6) F_E_B, [f; tau] on the hand at the grip E, in B [N, N m].
     """
     R_BS = np.swapaxes(R_WB, -1, -2) @ R_WS
     force = np.einsum("...ij,...j->...i", R_BS, wrench_S[..., :3])
@@ -131,10 +130,6 @@ def scales_at(change, time, scales):
 
 @njit(cache=True)
 def _scaled_into(sample, estimate, gripper, scales, out):
-    """Write the scaled wrench F' of one sample; the object is the load without the gripper.
-
-    `estimate` and `gripper` are (16,) [offsets; phi] of load and gripper.
-    """
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -147,7 +142,7 @@ def _scaled_into(sample, estimate, gripper, scales, out):
 
 @njit(cache=True)
 def fault_of(sample, estimate, time, valid_range):
-    """Return the `Fault` of a sample and a load estimate.
+    """Return the code (`Fault`) of the first fault in a sample and a load estimate.
 
     Args:
         sample: sample of the wrist sensor, see `drake_teleop.load.regressor`.
@@ -169,7 +164,6 @@ def fault_of(sample, estimate, time, valid_range):
 
 @njit(cache=True)
 def _scaled_now_into(sample, estimate, gripper, change, time, out):
-    """Write the scaled wrench F' of one sample with the scales at `time`."""
     scales = np.empty(4)
     scales_at(change, time, scales)
     _scaled_into(sample, estimate, gripper, scales, out)
@@ -177,7 +171,6 @@ def _scaled_now_into(sample, estimate, gripper, change, time, out):
 
 @njit(cache=True, borrows=True)
 def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_range, out):
-    """Write a log row: scaled wrench F' with the scales at `time`, contact wrench, fault."""
     _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
     _scaled_into(sample, estimate, gripper, elimination, out[6:12])
     out[12] = fault_of(sample, estimate, time, valid_range)
@@ -185,10 +178,6 @@ def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_ra
 
 @njit(cache=True)
 def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_range, contact, out):
-    """Write the wrench to render, from the scaled wrench F' and the sensor's orientation.
-
-    Both are of the same sample. `contact` is 1, or 0 for the load's part alone.
-    """
     if fault_of(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
         return
@@ -201,10 +190,11 @@ def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_ran
 
 
 class ForceScaling(LeafSystem):
-    """Removal or scaling of the non-contact wrench, and transformation to the hand.
+    """Scaling of contact wrench and load's wrench, and transformation to the hand.
 
-    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj). The scales are a numeric parameter of
-    the context; `SetScales` changes them during a simulation without a step of the force.
+    F' = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj) has contact wrench F_c, regressor V,
+    and inertial parameters phi of gripper and object. `SetScales` changes the scales during a
+    simulation.
 
     .. pydrake_system::
 
@@ -217,13 +207,12 @@ class ForceScaling(LeafSystem):
         - contact_wrench_S: contact wrench F_c of Eq. (13)
         - fault: `Fault` of sample or estimate
         - scaled_contact_and_fault: the three above in one vector, for a log
-        - non_contact_wrench_S: wrench of the load, Eq. (12)
+        - non_contact_wrench_S: wrench of the load (weight and inertia), Eq. (12)
         - wrench_B: F_E_B to render: -force_scale F', in the master's base B; NaN during a fault
         - load_wrench_B: part of wrench_B from weight and inertia of the load, zero for sigma = 0
 
     Args:
         config: initial scales.
-        arm: the slave's kinematics.
         R_WB: (3, 3) alignment of the master's base with the world.
         largest_wrench: (6,) largest valid reading [N, N m]; None for no limit.
         oldest: largest valid age of a sample [s].
@@ -330,7 +319,6 @@ class ForceScaling(LeafSystem):
         _rendered_into(*self._inputs(context), *constants, output.get_mutable_value())
 
     def _inputs(self, context: Context) -> tuple[Any, ...]:
-        """Return sample, load estimate, gripper's part of it, change of the scales, and time."""
         estimate = self._estimate.Eval(context)
         return (
             self._sample.Eval(context),

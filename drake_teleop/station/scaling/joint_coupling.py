@@ -1,8 +1,4 @@
-"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home).
-
-Both arms have the same joints in the same order. The wrench is rendered through the leader's
-Jacobian.
-"""
+"""Joint-by-joint command of the slave by a leader arm: q_slave = q_start + (q_leader - q_home)."""
 
 from __future__ import annotations
 
@@ -18,10 +14,10 @@ Array = NDArray[np.float64]
 
 
 class JointCoupling(LeafSystem):
-    """Coupling of the slave's joint positions to those of the leader, with a clutch.
+    """Coupling of the slave's joint positions to those of the leader arm, with a clutch.
 
-    While the clutch is open the commanded joints are constant. When it closes they are the leader's
-    again; `JointFollower` limits the speed.
+    While the clutch is open the commanded joints are constant. When it closes they follow the
+    leader again with a jump; `JointFollower` limits the speed.
 
     .. pydrake_system::
 
@@ -34,7 +30,6 @@ class JointCoupling(LeafSystem):
         - pose_command: (7,) X_WS for these joints
 
     Args:
-        slave: the slave's arm.
         start: (n,) joints of the slave when the leader is at `home` [rad].
         home: (n,) joints of the leader [rad].
         period: sampling period of the clutch [s].

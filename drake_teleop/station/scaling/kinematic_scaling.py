@@ -1,7 +1,4 @@
-"""Kinematic scaling (Fig. 4 of the paper): the master's motion becomes the slave's command.
-
-Translation is scaled. The rotation since the clutch was closed keeps its axis; its angle is scaled.
-"""
+"""Kinematic scaling (Fig. 4 of the paper): the master's motion becomes the slave's command."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
@@ -39,7 +36,7 @@ class KinematicScalingConfig:
 
 @njit(cache=True)
 def scaled_rotation(rotation, scale):
-    """Return the rotation (quaternion) about the same axis by `scale` times the (shorter) angle.
+    """Return the quaternion of the rotation about the same axis by `scale` times the angle.
 
     For a scale that is not an integer the result jumps where the angle passes 180 degrees.
     """
@@ -76,7 +73,6 @@ def scale_pose_into(pose, master, command, alignment, translation_scale, rotatio
 
 @njit(cache=True, borrows=True)
 def _command_into(pose, references, alignment, translation_scale, rotation_scale, out):
-    """Write the commanded pose X_WS (7,); `references` is the state of `KinematicScaling`."""
     if references[14] > 0.5:
         command, master = references[:7], references[7:14]
         scale_pose_into(pose, master, command, alignment, translation_scale, rotation_scale, out)
@@ -88,8 +84,8 @@ class KinematicScaling(LeafSystem):
     """Scaling of the master's motion into the slave's commanded pose, with a clutch.
 
     While the clutch is open the command is constant. When it closes, the master's present pose is
-    the new reference, so the command does not jump. A clutch that is engaged at the start closes
-    before the first sample. The clutch keeps its state while the master's pose is not finite.
+    the new reference, so the command does not jump. The clutch keeps its state while the master's
+    pose is not finite.
 
     .. pydrake_system::
 
@@ -101,7 +97,6 @@ class KinematicScaling(LeafSystem):
         - pose_command: (7,) commanded pose X_WS of the slave
 
     Args:
-        config: scales and alignment.
         period: sampling period of the clutch [s].
         start: (7,) commanded pose X_WS at the start.
     """

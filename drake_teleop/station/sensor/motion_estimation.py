@@ -1,14 +1,12 @@
 """Estimated motion of the sensor frame S (long: each source with its delay and noise).
 
-- `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
-  No accelerometer; the whole sample has the delay of the low-pass.
-- `accelerometer` (default, as in the paper): measured alpha, s moved to So, omega from encoders.
-- `fused`: a steady-state Kalman filter per axis integrates s and alpha and corrects omega and the
-  accelerometer's drift, gain and alignment with the encoders. Fast motion follows the
-  accelerometer, slow motion the encoders.
+It is specific force s of the origin So, angular velocity omega and acceleration alpha. Sources:
 
-All delays are known. The angles pass the wrench's low-pass, and faster paths wait for the slowest,
-so that wrench and motion of a sample belong to one instant.
+- `encoders`: low-pass and second differences of the joint angles, then kinematics of the arm.
+- `accelerometer` (default, as in the paper): measured s and alpha, omega from encoders.
+- `fused`: a steady-state Kalman filter per axis integrates s and alpha, corrected by the encoders.
+
+Faster paths wait for the slowest one, so that a sample belongs to one instant.
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -103,8 +101,7 @@ class Delays:
     """Delays of the signal paths at low frequencies [s].
 
     Args:
-        wrench, acceleration, encoders: delay of each path before it waits for slower ones; that of
-            the encoders includes the low-passes of this module.
+        wrench, acceleration, encoders: delay of each path before it waits for slower ones.
         sample: delay of a sample, equal to that of the slowest path in use.
     """
 
@@ -134,22 +131,21 @@ class SteadyState:
 def steady_state(
     position_std: float, acceleration_std: float, drift: float, period: float
 ) -> SteadyState:
-    """Return the filter for white noise of position and acceleration, and an acceleration walk.
+    """Return the Kalman filter for a measured position x and acceleration a with the error e.
 
-    The model is x_k = x_{k-1} + T v_k, v_k = v_{k-1} + T (a_{k-1} - e_{k-1} - noise). With
-    u = (1 - z)(1 - 1/z) the spectrum of the innovations is, up to a factor,
-    u^3 + (acceleration_std T^2 / position_std)^2 u + (drift T^2.5 / position_std)^2. Its roots give
-    the poles and the gains (spectral factorisation; Anderson and Moore, Optimal Filtering, ch. 9).
+    The model is x_k = x_{k-1} + T v_k, v_k = v_{k-1} + T (a_{k-1} - e_{k-1} - noise). The gains
+    follow by spectral factorisation (Anderson and Moore, Optimal Filtering, ch. 9).
 
     Args:
         position_std: standard deviation of a measured position, in any unit.
         acceleration_std: standard deviation of a measured acceleration [that unit / s^2].
-        drift: random walk of the acceleration's error [that unit / s^2 / sqrt(s)], positive.
+        drift: random walk of e [that unit / s^2 / sqrt(s)], positive.
         period: sampling period T [s].
     """
     white = (acceleration_std * period**2 / position_std) ** 2
     walk = (drift * period**2.5 / position_std) ** 2
-    # Scaled, the roots are of order one and well conditioned.
+    # With u = (1 - z)(1 - 1/z) the spectrum of the innovations is u^3 + white u + walk, up to a
+    # factor. Its roots give the poles. Scaled, they are of order one and well conditioned.
     scale = max(np.sqrt(white), np.cbrt(walk))
     u = scale * np.roots([1.0, 0.0, white / scale**2, walk / scale**3]).astype(complex)
     root = np.sqrt(u * u - 4.0 * u)
@@ -169,10 +165,7 @@ def steady_state(
 
 
 def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, period: float) -> Delays:
-    """Return the delays of all signal paths and of the sample.
-
-    The wrench is delayed by whole samples, so that only the encoders' angles are interpolated.
-    """
+    """Return the delays of all signal paths and of the sample, for a sampling period [s]."""
     wrench, acceleration, encoders = sensor.delays(period)
     encoders += _group_delay(_filters(config, sensor, period)) * period
     sources = (encoders,) if config.source == "encoders" else (acceleration, encoders)
@@ -184,7 +177,7 @@ def path_delays(config: MotionEstimationConfig, sensor: WristSensorConfig, perio
 def motion_gains(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[SteadyState, SteadyState]:
-    """Return the filters of source `fused` for angles [rad] and displacements of So [m]."""
+    """Return the Kalman filters of source `fused` for angles [rad] and displacements [m]."""
     s_std, alpha_std = _accelerometer_std(sensor)
     angle_std, drift = _angle_std(sensor, num_joints), config.angular_acceleration_drift
     return (
@@ -196,10 +189,10 @@ def motion_gains(
 def estimated_motion_std(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> NDArray[np.float64]:
-    """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2] in a sample.
+    """Return standard deviations (9,) of specific force, angular velocity and its derivative.
 
-    They hold before a low-pass after the converter, as those of `WristSensorConfig.wrench_std`. The
-    small noise of omega counts as 0.
+    Units are m/s^2, rad/s (counted as exact) and rad/s^2. A low-pass after the converter is
+    excluded.
     """
     if config.source != "encoders":
         s_std, alpha_std = _accelerometer_std(sensor)
@@ -218,10 +211,7 @@ def estimated_motion_std(
 
 
 def _angle_std(sensor: WristSensorConfig, num_joints: int) -> float:
-    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad].
-
-    Assumption: n joint axes of random direction; each direction has a third of their variance.
-    """
+    """Return the encoders' rounding error as rotation about any axis of S, 1 sigma [rad]."""
     rounding = max(sensor.encoder_resolution / np.sqrt(12.0), _MIN_ANGLE_STD)
     return float(rounding * np.sqrt(num_joints / 3.0))
 
@@ -242,8 +232,6 @@ def motion_estimator(
     config: MotionEstimationConfig, sensor: WristSensorConfig, num_joints: int, period: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `estimate_into` for an arm with n joints.
-
-    `sensor` contains the nominal delays, filter, noise and pose of the accelerometer.
 
     Raises:
         DrakeTeleopError: if the encoders' bandwidth is 0.45 of the sensor's rate or more.
@@ -275,7 +263,6 @@ def motion_estimator(
 def _filters(
     config: MotionEstimationConfig, sensor: WristSensorConfig, period: float
 ) -> NDArray[np.float64]:
-    """Return second-order sections (4, 5) for the angles; unused ones are [1, 0, 0, 0, 0]."""
     filters = np.zeros((_SECTIONS, 5))
     filters[:, 0] = 1.0
     if sensor.low_pass != "none" and not sensor.ideal:
@@ -299,14 +286,15 @@ def _group_delay(sections: NDArray[np.float64]) -> float:
 
 @njit(cache=True)
 def estimate_into(constants, memory, arm, reading, sample):
-    """Convert one reading (13 + n,) of `read_into` to one sample (16 + n,) of a single instant.
+    """Convert one reading of the sensor to one sample whose values belong to a single instant.
 
     Call it once per period. At the first reading all filters settle on it, at rest.
 
     Args:
         constants, memory: results of `motion_estimator`; memory is updated.
-        arm: `ArmModel.table`.
-        sample: written, see `drake_teleop.load.regressor`.
+        arm: `ArmModel.table` of an arm with n joints.
+        reading: (13 + n,) output of `sensor_chain.read_into`.
+        sample: (16 + n,) written, see `drake_teleop.load.regressor`.
     """
     n = arm.shape[0] - 1
     starts = memory[0] == 0.0
@@ -331,10 +319,6 @@ def estimate_into(constants, memory, arm, reading, sample):
 
 @njit(cache=True)
 def _delay_paths(constants, memory, n, reading, sample):
-    """Delay wrench, accelerometer (written in place of s and omega) and angles.
-
-    The saturation flag stays set while any part of the saturated reading waits.
-    """
     angles, width = sample[JOINT_POSITION], 12 + n
     line = memory[_JOINTS + _PER_JOINT * n :]
     rows = line.shape[0] // width
@@ -365,10 +349,6 @@ def _delay_paths(constants, memory, n, reading, sample):
 
 @njit(cache=True)
 def _differentiate(constants, joints, angles):
-    """Update joint velocity and acceleration by backward differences of second order.
-
-    The acceleration is for source `encoders` only: without its low-pass, rounding dominates.
-    """
     n, period = angles.shape[0], constants[_PERIOD]
     for i in range(n):
         q0, q1, q2, q3 = angles[i], joints[2 * n + i], joints[3 * n + i], joints[4 * n + i]
@@ -380,10 +360,6 @@ def _differentiate(constants, joints, angles):
 
 @njit(cache=True)
 def _convert_accelerometer(constants, memory, gravity, motion, sample):
-    """Convert the accelerometer's reading in `sample` to s, omega and alpha.
-
-    `motion` is the motion of S from the encoders, without accelerations; it is overwritten.
-    """
     period, fused, starts = constants[_PERIOD], constants[_FUSED] != 0.0, memory[0] == 0.0
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     R_SA, R = nine(constants, _ORIENTATION), motion[12:21]
@@ -430,7 +406,6 @@ def _convert_accelerometer(constants, memory, gravity, motion, sample):
 
 @njit(cache=True)
 def _rotation_vector_into(before, R, angle):
-    """Write the small rotation vector from R_WS `before` (by rows) to `R`, in S, into `angle`."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         value = 0.0
@@ -441,17 +416,7 @@ def _rotation_vector_into(before, R, angle):
 
 @njit(cache=True)
 def _update_filters(gains, period, moved, acceleration, kept):
-    """Update the filters of `steady_state` for three axes.
-
-    The rate belongs to the middle between two samples. The mean acceleration is Numerov's, so that
-    both integrations are of fourth order.
-
-    Args:
-        moved: (3,) encoder displacement since the last sample; becomes the acceleration correction.
-        acceleration: (3,) present acceleration.
-        kept: estimated position error (3), rate half a sample ago (3), last acceleration and the
-            one before (6); updated, except for the last acceleration.
-    """
+    """Update the filters of `steady_state` for three axes, with Numerov's mean acceleration."""
     for i in range(3):
         mean = (acceleration[i] + 10.0 * kept[6 + i] + kept[9 + i]) / 12.0
         rate = kept[3 + i] + period * mean

@@ -18,10 +18,9 @@ def _with_imu(
     torque_noise: float,
     **others: Any,
 ) -> WristSensorConfig:
-    """Return the settings of a force/torque sensor with the IMU of the ATI record.
+    """Return a force/torque sensor with the IMU of the ATI record.
 
     Ranges: `side` for fx, fy and `along` for fz [N], `bending` for tx, ty and `twist` for tz [N m].
-    White noise: standard deviation of a sample [N, N m].
     """
     figures: dict[str, Any] = {
         "p_SoAo_S": [0.0, 0.0, 0.05],
@@ -138,9 +137,9 @@ accordingly.
 
 
 def preset_of(block: Mapping[str, Any] | None) -> WristSensorConfig:
-    """Return the default settings for a scenario's block `wrist_sensor`, from the block's preset.
+    """Return the default settings for a scenario's block `wrist_sensor`, from its `preset`.
 
-    The check of the loaded block rejects unknown names.
+    An unknown name gives the general defaults; the check of the loaded block rejects it.
     """
     name = (block or {}).get("preset")
     return copy.deepcopy(PRESETS.get(str(name), WristSensorConfig()))

@@ -6,10 +6,8 @@
                 -> offset + drift -> quantisation -> saturation -> [low-pass] -> latency of its path
     joints' angles           -> quantisation --------------------------------> latency of its path
 
-The accelerometer at Ao with axes A measures specific force and angular acceleration. The low-pass
-is analog or mechanical (`before_noise`), or digital as in the JR3 (`after_converter`). Each part is
-a group of fields of `WristSensorConfig`; `without` switches parts off. Calibration errors are off
-by default.
+The accelerometer with origin Ao and axes A measures specific force and angular acceleration. The
+low-pass is analog or mechanical (`before_noise`), or digital as in the JR3 (`after_converter`).
 """
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
@@ -144,15 +142,15 @@ class WristSensorConfig:
     )
 
     def noise_std(self) -> NDArray[np.float64]:
-        """Return the standard deviations (12,) of raw white noise [N, N m, m/s^2, rad/s^2]."""
+        """Return the standard deviations (12,) of white noise in raw samples, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["noise"]], 3)
 
     def random_walk(self) -> NDArray[np.float64]:
-        """Return the standard deviations (12,) of the random walks after 1 s [unit / sqrt(s)]."""
+        """Return the standard deviations (12,) of the random walks after 1 s, in SI units."""
         return np.repeat([getattr(self, name) for name in PARTS["random_walk"]], 3)
 
     def ranges(self) -> NDArray[np.float64]:
-        """Return the ranges (12,) of force, torque, acceleration and angular acceleration."""
+        """Return the ranges (12,) of force, torque, specific force and angular acceleration."""
         return np.concatenate(
             [
                 self.force_range,
@@ -163,44 +161,46 @@ class WristSensorConfig:
         )
 
     def largest_wrench(self) -> NDArray[np.float64]:
-        """Return the largest valid readings (6,) of force and torque [N, N m]."""
+        """Return the largest plausible readings (6,) of force and torque [N, N m].
+
+        They are 1.5 ranges for a sensor that saturates, else 10.
+        """
         share = _OVERSHOOT_FACTOR if self.saturates and not self.ideal else _OVERLOAD_FACTOR
         return share * self.ranges()[:6]
 
     def wrench_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (6,) of force and torque for an estimator [N, N m].
+        """Return standard deviations (6,) of force and torque in raw samples [N, N m].
 
-        They contain noise and quantisation of raw samples, before a low-pass after the converter,
-        and are at least 1e-6.
+        They contain noise and quantisation, and are at least 1e-6.
         """
         quantum = self.resolution * self.ranges()[:6]
         return np.maximum(np.hypot(self.noise_std()[:6], quantum / np.sqrt(12)), 1e-6)
 
     def motion_std(self) -> NDArray[np.float64]:
-        """Return standard deviations (9,) of s [m/s^2], omega [rad/s], alpha [rad/s^2].
+        """Return standard deviations (9,) of s [m/s^2], omega [rad/s] and alpha [rad/s^2].
 
-        They contain noise and quantisation of raw samples. The angular velocity omega counts as
-        exact, because filtered encoder rounding is small.
+        They contain noise and quantisation of raw samples; the angular velocity omega counts as
+        exact.
         """
         quantum = self.resolution * self.ranges()[6:]
         std = np.hypot(self.noise_std()[6:], quantum / np.sqrt(12))
         return np.concatenate([std[:3], np.zeros(3), std[3:]])
 
     def accelerometer(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return p_SoAo_S (3,) [m] and R_SA (3, 3) of the accelerometer; 0 and I if ideal."""
+        """Return position p_SoAo_S (3,) [m] and axes R_SA (3, 3) of the accelerometer."""
         if self.ideal:
             return np.zeros(3), np.eye(3)
         return np.array(self.p_SoAo_S), np.reshape(self.R_SA, (3, 3))
 
     def latencies(self, period: float) -> NDArray[np.int64]:
-        """Return the latencies (3,) of force, acceleration and encoders, in whole samples."""
+        """Return the latencies (3,) of wrench, acceleration and encoders, in whole samples."""
         seconds = (self.force_latency, self.acceleration_latency, self.encoder_latency)
         return np.rint(np.array(seconds) * (not self.ideal) / period).astype(np.int64)
 
     def delays(self, period: float) -> NDArray[np.float64]:
-        """Return the delays (3,) of force, acceleration and encoder readings [s].
+        """Return the delays (3,) of wrench, acceleration and encoder readings [s].
 
-        A delay is the latency; for force and acceleration plus the low-pass's group delay at zero
+        They are latencies plus, for wrench and acceleration, the low-pass's group delay at zero
         frequency.
         """
         delays = self.latencies(period) * np.float64(period)
@@ -211,7 +211,10 @@ class WristSensorConfig:
         return delays
 
     def check(self, where: str, rate_hz: float) -> None:
-        """Raise DrakeTeleopError for an invalid R_SA or a low-pass bandwidth that is too high."""
+        """Raise a DrakeTeleopError for an invalid R_SA or a bandwidth too high for the rate [Hz].
+
+        `where` is the block's path for the message.
+        """
         R_SA = np.reshape(self.R_SA, (3, 3))
         error = np.abs(R_SA @ R_SA.T - np.eye(3)).max()
         if error > _ROTATION_TOLERANCE or np.linalg.det(R_SA) < 0:
@@ -253,7 +256,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
-    """Return a copy of the configuration with some `PARTS` switched off.
+    """Return a copy of the configuration without some parts of the sensor (keys of `PARTS`).
 
     >>> without(WristSensorConfig(), "noise", "offset").force_noise
     0.0
@@ -265,8 +268,7 @@ def without(config: WristSensorConfig, *parts: str) -> WristSensorConfig:
 def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64]:
     """Return the sections (2, 5) [b0, b1, b2, a1, a2] of a fourth-order Butterworth low-pass.
 
-    Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires. The
-    poles equal those of `scipy.signal.butter`, whose import is slow.
+    Bilinear, prewarped, each section with unit gain at zero frequency, as `settle` requires.
     """
     warped = np.tan(np.pi * cutoff_hz / rate_hz)
     sections = np.empty((_SECTIONS, 5))
@@ -286,10 +288,14 @@ def butterworth_sections(cutoff_hz: float, rate_hz: float) -> NDArray[np.float64
 def calibration_matrices(
     config: WristSensorConfig,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the calibration matrices: (6, 6) for [f; tau] in S, (3, 3) for s and alpha in A.
+    """Return matrices that multiply true values by the calibration errors.
 
-    Each is (1 + gains + cross-talk) times the rotation of the misalignment. Gains and cross-talk
-    are uniform within their bounds; the rotation axis is random. All draws depend only on `unit`.
+    Each is (1 + gains + cross-talk) times the rotation of the misalignment, drawn with the seed
+    `unit`.
+
+    Returns:
+        (6, 6) for [f; tau] in S, (3, 3) for specific force in A, (3, 3) for angular acceleration in
+            A.
     """
     random = np.random.default_rng(config.unit)
     gains, talk = random.uniform(-1, 1, 6), random.uniform(-1, 1, (6, 6))
@@ -341,8 +347,8 @@ def sensor_chain(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return constants and initial memory of `read_into` for an arm with n joints.
 
-    `constants[OFFSET]` is the wrench's offset [N, N m], which may change during a run.
-    `memory[0]` counts samples.
+    `constants[OFFSET]` is the wrench's offset [N, N m], which may change during a run. `memory[0]`
+    counts samples.
     """
     wrench, force, angular = calibration_matrices(config)
     p_SoAo_S, R_SA = config.accelerometer()
@@ -383,8 +389,7 @@ def sensor_chain(
 def is_plausible(constants, truth):
     """Return whether the true values are finite and do not overload the sensor.
 
-    Args:
-        constants, truth: as for `read_into`. A NaN offset marks a dead channel.
+    Arguments as for `read_into`. A NaN offset marks a dead channel.
     """
     good = True
     for i in range(6):
@@ -396,17 +401,17 @@ def is_plausible(constants, truth):
 
 @njit(cache=True)
 def read_into(constants, memory, noise, truth, reading):
-    """Convert true values `truth` (15 + n,) to the sensor's `reading` (13 + n,) at one instant.
+    """Convert true values to the sensor's reading at one instant.
 
     Call it once per period. At the first sample filters and delay lines settle on it.
 
     Args:
         constants, memory: results of `sensor_chain`; memory is updated.
         noise: (NOISE_SIZE,) standard normal numbers for this block of NOISE_BLOCK samples.
-        truth: [wrench (6) of the sensor on the tool at So in S | specific force of So (3),
-            angular velocity (3), angular acceleration (3) in S | joint angles (n)].
-        reading: [wrench (6) | specific force at Ao (3), angular acceleration (3) in A |
-            1 if a channel is saturated, else 0 | joint angles (n)].
+        truth: (15 + n,) [wrench (6) of the sensor on the tool at So in S | specific force of So
+            (3), angular velocity (3), angular acceleration (3) in S | joint angles (n)].
+        reading: (13 + n,) written: [wrench (6) | specific force at Ao (3), angular acceleration (3)
+            in A | 1 if a channel is saturated, else 0 | joint angles (n)].
     """
     angles = truth[TRUE_ANGLES]
     if constants[_IDEAL] != 0.0:
@@ -468,17 +473,13 @@ def read_into(constants, memory, noise, truth, reading):
 
 @njit(cache=True)
 def shift(line, width):
-    """Shift the delay line `line`, newest row of `width` values first, by one row.
-
-    A ring buffer is not faster, and its memory would not be periodic.
-    """
+    """Shift the delay line by one row of `width` values; the newest row is first."""
     for i in range(line.shape[0] - 1, width - 1, -1):
         line[i] = line[i - width]
 
 
 @njit(cache=True)
 def _calibrate(constants, truth, out):
-    """Write the 12 channels with calibration errors and the accelerometer's axes and position."""
     wrench, s = truth[WRENCH], truth[SPECIFIC_FORCE]
     omega, alpha = truth[ANGULAR_VELOCITY], truth[ANGULAR_ACCELERATION]
     for i in range(6):
@@ -494,7 +495,6 @@ def _calibrate(constants, truth, out):
 
 @njit(cache=True)
 def _convert(constants, first, end, channels):
-    """Quantise and saturate channels in place; return 1.0 if one of them is saturated, else 0."""
     saturated = 0.0
     for i in range(first, end):
         quantum, limit, value = constants[_QUANTA + i], constants[_LIMITS + i], channels[i]
@@ -533,7 +533,7 @@ def low_pass(sections, memory, values):
 
 @njit(cache=True)
 def settle(sections, memory, values):
-    """Set the memory of `low_pass` to its steady state at `values`."""
+    """Set the memory of the filter `low_pass` to its steady state at `values` (n,)."""
     n = values.shape[0]
     for k in range(sections.shape[0] // 5):
         b1, b2 = sections[5 * k + 1], sections[5 * k + 2]

@@ -2,12 +2,8 @@
 
     truth --[sensor_chain]--> reading --[motion_estimation]--> sample
 
-The true wrench on the tool is V phi minus the wrench of the environment (Eqs. 1, 2).
-
-Sampling needs no events: after each integration step, position and velocity at each sampling
-instant in the step are interpolated (Hermite), and accelerations follow from the dynamics. A tool
-near a shape of `Contact.watched` gets its contact wrench from Drake (`ContactTwin`). With contact
-outside the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
+The state at each sampling instant is interpolated within an integration step. With contact outside
+the compiled law (`Contact.beyond`) each sample is an event at the end of a step.
 """
 
 from __future__ import annotations
@@ -100,10 +96,15 @@ _USE_CONTACT_LAW = np.zeros(0)
 
 @njit(cache=True)
 def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
-    """Write the true [f, tau, s, omega, alpha] of S into `out` (15,); `motion` (21,) is scratch.
+    """Write the true wrench and motion [f, tau, s, omega, alpha] of S into `out` (15,).
 
-    The wrench is that of Eqs. (1)-(2) minus `contact_W` (6,), the wrench of the environment on the
-    tool about the world's origin, in W.
+    Args:
+        arm: `ArmModel.table` of an arm with n joints.
+        phi: (10,) inertial parameters of the tool.
+        q, v, vdot: (n,) joint positions, speeds and accelerations.
+        contact_W: (6,) wrench of the environment on the tool about the world's origin, in W, which
+            is subtracted from that of Eqs. (1)-(2).
+        motion: (21,) scratch.
     """
     sensor_motion(arm, q, v, vdot, motion)
     put(out, MOTION.start, motion, 0, 9)
@@ -119,7 +120,6 @@ def true_sample(arm, phi, q, v, vdot, contact_W, motion, out):
 
 @njit(cache=True)
 def _interpolate(h, u, x, xdot, end, end_dot, out):
-    """Write the state at the fraction u of a step: quintic positions, cubic velocities."""
     half = x.shape[0] // 2
     for i in range(half):
         q, v, a = x[i], x[half + i], xdot[half + i]
@@ -136,7 +136,6 @@ def _interpolate(h, u, x, xdot, end, end_dot, out):
 
 @njit(cache=True)
 def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
-    """Take one sample of the arm at the state x and write it into `memory`, see `sample_step`."""
     arm, phi, _, _, _, _ = physics
     constants, motion_constants, middle, end, ideal = sensor
     half = x.shape[0] // 2
@@ -167,7 +166,7 @@ def _take_sample(physics, sensor, x, xdot, wrench_W, noise, memory):
 
 @njit(cache=True)
 def queue_step(tail, time, state, around):
-    """Append time and state of a step's end to the sample queue, see `sample_step`, `memory`."""
+    """Append time and state of a step's end to the queue `tail`, see `sample_step`."""
     width = state.shape[0] + 1 + around.shape[0]
     entry = tail[2 + int(tail[1]) * width :][:width]
     entry[0] = time
@@ -196,7 +195,7 @@ def sample_step(
     physics, sensor, period, time, state, around, held, applied_W, noise, memory, until_now,
     touching_W, scratch, result,
 ):  # fmt: skip
-    """Take the samples that are due in the steps since the last call.
+    """Take the samples that are due in the integration steps since the last call.
 
     Args:
         physics: (arm's table, phi of the tool, contact pairs, leaf (4,): mass, stiffness, damping,
@@ -209,15 +208,12 @@ def sample_step(
         around: present [deflection and rate of the sheet, plant's state if other bodies move].
         held: present motor torque (n,) [N m], and its rate in these steps; (0,) for held torque.
         applied_W: (6,) additional wrench on the tool, see `environment_wrench`.
-        noise: random numbers for the chain.
-        memory: [last sample (16 + n) | the one before (16 + n) | chain's | estimator's | tail:
-            samples taken, length of the queue, time and x of each step's end in it].
-        until_now: whether to take a sample that is due now.
+        memory: [last two samples (16 + n each) | chain's | estimator's | tail: samples taken,
+            length of the queue, time and x of each step's end in it].
         touching_W: (6,) contact wrench on the tool now, from the plant, about the world's origin,
-            in W; or (0,) to calculate it with `physics`. The plant's own penetration avoids
-            rounding errors of stiff contacts.
+            in W; or (0,) to calculate it with `physics`.
         scratch: (9, 2 n + 6 + size of the plant's state).
-        result: output: [last sample before now (16 + n) | its time [s] | memory with now's end as
+        result: written: [last sample before now (16 + n) | its time [s] | memory with now's end as
             the only queue entry].
     """
     n = state.shape[0] // 2
@@ -303,8 +299,6 @@ class WristSensor(LeafSystem):
 
     Args:
         slave: the plant; source of the tool's true inertial parameters and contact shapes.
-        config: parts of the sensor.
-        motion: estimation of the motion of S.
         period: sampling period [s].
         held: duration for which the motors hold a torque, or its rate [s].
         q_start: (n,) joint angles at rest before the first sample [rad].
@@ -406,7 +400,7 @@ class WristSensor(LeafSystem):
 
     @property
     def contact_pairs(self) -> Array:
-        """Contact pairs (k, 28), see `Pairs`; a view."""
+        """Table (k, 28) of pairs of shapes that can touch, see `Pairs`; a view."""
         return self._physics[2]
 
     @property
@@ -416,13 +410,13 @@ class WristSensor(LeafSystem):
 
     @property
     def moves(self) -> str:
-        """Sentence that names the moving bodies of the surroundings except a leaf, or ""."""
+        """Sentence that names the moving bodies around the arm except a sheet spring, or ""."""
         names = ", ".join(self._moving)
         return f"{names} can move" if names else ""
 
     @property
     def remembered(self) -> NDArray[np.intp]:
-        """Indices of the discrete state's numbers that depend on the motion.
+        """Indices of the numbers in the discrete state that depend on the motion.
 
         Counters, flags, random walks and the sample before the last one are excluded.
         """
@@ -441,10 +435,7 @@ class WristSensor(LeafSystem):
         context.SetDiscreteState(self._result[self._memory_slice])
 
     def reset_queue(self, context: Context) -> None:
-        """Reset the sample queue to the current time.
-
-        Call this after setting states manually.
-        """
+        """Reset the queue of steps to the current time; call this after setting states manually."""
         memory = context.get_mutable_discrete_state_vector().get_mutable_value()
         tail, time = memory[self._sensor[3] :], context.get_time()
         tail[0], tail[1] = np.ceil(time / self._period - _TIME_TOLERANCE), 0.0
@@ -454,7 +445,6 @@ class WristSensor(LeafSystem):
         return self._state.Eval(context), self._surroundings(context)
 
     def _surroundings(self, context: Context) -> Array:
-        """Return [deflection, rate] of the leaf, or [0, 0, the plant's state]."""
         if self._plant is not None:
             self._around[2:] = self._plant.Eval(context)
         return self._around if self._sheet is None else self._sheet.Eval(context)
@@ -601,8 +591,8 @@ def AddWristSensor(
 ) -> dict[str, OutputPort]:
     """Add the block "wrist_sensor", its noise source, and demultiplexers of its output.
 
-    The arguments are those of `WristSensor`. The caller must connect state, acceleration and torque
-    of the arm.
+    Arguments as for `WristSensor`. The caller must connect state, acceleration and torque of the
+    arm.
 
     Returns:
         The output ports by name: "sample", each of its parts (`sample_parts`), and "sample_time".
