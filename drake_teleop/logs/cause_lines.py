@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML, UNITS, Description
+from drake_teleop.logs.read.description_fields import FORCE_UNITS, TORQUE_UNITS
 from drake_teleop.logs.read.tables import FORMATS
 
 Fields = dict[str, Any]
@@ -24,7 +25,6 @@ _MAX_MASS_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
 _FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
-_FORCE_UNITS, _TORQUE_UNITS = ("N", "lbf"), ("N m", "N mm", "lbf in")
 _SAME_RATIO = 1e-3
 _POSITIONS = ("pose.position_in_sensor", "imu.position")
 _ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
@@ -162,8 +162,8 @@ def _weight(fields: Fields, values: dict[str, Any]) -> None:
 
 def _factor(fields: Fields, values: dict[str, Any]) -> None:
     force, torque = UNITS[fields[_FORCE_UNIT]], UNITS[fields[_TORQUE_UNIT]]
-    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in _TORQUE_UNITS]
-    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in _FORCE_UNITS]
+    ratios = [(torque / UNITS[unit], _TORQUE_UNIT, unit) for unit in TORQUE_UNITS]
+    ratios += [(UNITS[unit] / force, _FORCE_UNIT, unit) for unit in FORCE_UNITS]
     for ratio, name, unit in ratios:
         if unit != fields[name] and abs(values["factor"] / ratio - 1.0) < _SAME_RATIO:
             fields[name] = unit

@@ -24,7 +24,7 @@ from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import shortest_gap
+from drake_teleop.logs.read.clocks import seconds, shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
 from drake_teleop.logs.read.tables import Table, read_table
 
@@ -135,22 +135,19 @@ def _inspect(
     description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
 ) -> None:
     findings: list[Finding] = []
-    needed: dict[Path, list[str]] = {}
+    bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name in ("wrench", "imu", "pose", "static"):
         stream = getattr(description, name)
         if stream is None:
             continue
         if stream.source not in tables:
             tables[stream.source] = read_stream(stream)
-        figures, more, columns = _stream(name, stream, tables[stream.source], description, source)
+        table = tables[stream.source].filled(stream.columns)
+        figures, more, rows = _stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more
-        needed.setdefault(stream.source, []).extend(columns)
-    clean = {path: _finite(tables[path], columns) for path, columns in needed.items()}
-    for name in ("wrench", "imu", "pose"):
-        stream = getattr(description, name)
-        if stream is not None and stream.time.column is not None:
-            clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
+        bad.setdefault(stream.source, []).append(rows)
+    clean = {path: _without(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
     try:
         found = check_log(Path(source), check_conventions(description, source, clean))
     except DrakeTeleopError as error:
@@ -173,7 +170,8 @@ def _inspect(
 
 def _stream(
     name: str, stream: Any, table: Table, description: Description, source: str
-) -> tuple[dict[str, Any], list[Finding], list[str]]:
+) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
+    """Return figures and findings of a stream, and the rows of its file that cannot be used."""
     columns = [
         str(column)
         for field in _QUANTITIES
@@ -186,10 +184,11 @@ def _stream(
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
     if time is not None:
-        findings += _clock(at, time, table, description, len(values), figures)
+        more, usable = _clock(at, time, table, len(values), figures)
+        findings += more
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
     if not good.all():
-        first = int(np.argmin(good)) + table.first_row
+        first = table.line(int(np.argmin(good)))
         findings.append(
             Finding(
                 "nan",
@@ -224,8 +223,8 @@ def _stream(
                     f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
                 )
             )
-    used = columns if time is None or time.column is None else [*columns, str(time.column)]
-    return figures, findings, used
+    rows = np.flatnonzero(~(good & usable if time is not None else good))
+    return figures, findings, rows if table.kept is None else table.kept[rows]
 
 
 def _repeated(
@@ -257,13 +256,17 @@ def _repeated(
 
 
 def _clock(
-    at: str, time: Any, table: Table, description: Description, rows: int, figures: dict[str, Any]
-) -> list[Finding]:
+    at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
+) -> tuple[list[Finding], NDArray[np.bool_]]:
+    """Return findings of the clock, and (N,) booleans: True for rows with increasing stamps."""
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
-        return []
-    t = table.single(time.column, at) * description.scale(time.unit)
-    t = t[np.isfinite(t)]
+        return [], np.ones(rows, bool)
+    stamps, figures["episodes"] = seconds(time, table, at)
+    highest = np.fmax.accumulate(stamps)
+    usable = np.isfinite(stamps)
+    usable[1:] &= stamps[1:] > highest[:-1]
+    t = stamps[np.isfinite(stamps)]
     steps = np.diff(t)
     forward = steps[steps > 0]
     if not len(forward):
@@ -290,7 +293,7 @@ def _clock(
             )
         )
     if back:
-        row = int(np.argmax(steps <= 0)) + 1 + table.first_row
+        row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
         findings.append(
             Finding(
                 "clock jump",
@@ -299,7 +302,7 @@ def _clock(
                 " stamps is refused: cut it there, or give time.rate",
             )
         )
-    return findings
+    return findings, usable
 
 
 def _labels(columns: Sequence[str], table: Table) -> list[str]:
@@ -335,14 +338,13 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=kept)
 
 
-def _increasing(table: Table, column: str) -> Table:
-    t = table.single(column, column)
-    later = np.ones(len(t), bool)
-    later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
-    if later.all():
+def _without(table: Table, rows: NDArray[np.intp]) -> Table:
+    """Return the table without some rows."""
+    if not len(rows):
         return table
-    kept = {n: x[later] if len(x) == len(t) else x for n, x in table.columns.items()}
-    return replace(table, columns=kept)
+    kept = np.setdiff1d(np.arange(table.rows), rows)
+    whole = {n: x[kept] if len(x) == table.rows else x for n, x in table.columns.items()}
+    return replace(table, columns=whole)
 
 
 def _print(summary: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.rotations import right_angled_rotations
+from drake_teleop.logs.read.rotations import EULER_AXES, right_angled_rotations
 
 EFFECTS = ("lag", "units", "payload")
 """Findings that may be the effect of a cause, such as drift."""
@@ -136,8 +136,13 @@ def pose_edits(description: Description) -> Iterator[Edit]:
         text = f"the quaternions are not {orientation.form}"
         other = forms[orientation.form]
         yield _edit(description, "quaternion order", text, f"{field}.form", other)
-    if orientation.form == "rotation_vector":
-        text = f"the rotation vectors are not in {orientation.unit}"
+    if orientation.form == "euler":
+        for axes in EULER_AXES:
+            if axes != orientation.axes:
+                text = f"the Euler angles do not turn about {orientation.axes}"
+                yield _edit(description, "Euler axes", text, f"{field}.axes", axes)
+    if orientation.form in ("rotation_vector", "euler"):
+        text = f"the angles are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
         yield _edit(description, "degrees", text, f"{field}.unit", unit)
 

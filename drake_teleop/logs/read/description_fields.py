@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
@@ -137,13 +137,26 @@ class _Quantity(Strict):
 class Force(_Quantity):
     """Columns of a force and their unit."""
 
-    unit: Literal["N", "lbf"] = "N"
+    unit: Literal["N", "mN", "kN", "daN", "gf", "kgf", "ozf", "lbf"] = "N"
 
 
 class Torque(_Quantity):
     """Columns of a torque and their unit."""
 
-    unit: Literal["N m", "N mm", "lbf in"] = "N m"
+    unit: Literal[
+        "N m",
+        "mN m",
+        "kN m",
+        "daN m",
+        "N cm",
+        "N mm",
+        "gf cm",
+        "kgf cm",
+        "kgf m",
+        "ozf in",
+        "lbf in",
+        "lbf ft",
+    ] = "N m"
 
 
 class Acceleration(_Quantity):
@@ -170,4 +183,9 @@ class AngularAcceleration(_Quantity):
 class Position(_Quantity):
     """Columns of a position and their unit."""
 
-    unit: Literal["m", "mm"] = "m"
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+
+
+FORCE_UNITS, TORQUE_UNITS, POSITION_UNITS = (
+    get_args(quantity.model_fields["unit"].annotation) for quantity in (Force, Torque, Position)
+)

@@ -180,7 +180,8 @@ class _Reader:
     def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream(stream)
-        return self._tables[stream.source]
+        table = self._tables[stream.source]
+        return table if isinstance(stream, Static) else table.filled(stream.columns)
 
     def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
@@ -360,12 +361,8 @@ class _Reader:
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         """Return the times of a stream; record notes and gaps of the stream."""
-        columns = [
-            column
-            for field in type(stream).model_fields
-            for column in getattr(getattr(stream, field), "columns", ())
-        ]
-        clock = read_clock(stream.time, table, columns, f"{self._source}:{name}.time")
+        clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
+        self._check_episodes(name, clock)
         t = clock.t
         if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
             raise DrakeTeleopError(
@@ -388,6 +385,16 @@ class _Reader:
             half_window = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock
+
+    def _check_episodes(self, name: str, clock: Clock) -> None:
+        described = self._description
+        streams = (described.wrench, described.imu, described.pose)
+        if clock.episodes > 1 and len({stream.source for stream in streams if stream}) > 1:
+            raise DrakeTeleopError(
+                f"the clock starts {clock.episodes} times, and the streams are in several files",
+                where=f"{self._source}:{name}.time",
+                remedy="write all streams into one table, or each episode into files of its own",
+            )
 
     def _half_window(self, dt: float) -> float:
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0

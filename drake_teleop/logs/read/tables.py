@@ -8,7 +8,7 @@ import os
 import zipfile
 from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -45,16 +45,42 @@ class Table:
         columns: arrays (N,) of any type by name; also (N, ...) with columns `name[0]`, row-major.
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
+        whole: table of all rows, if these are a part of them.
+        kept: numbers of these rows in `whole`, counted from 0; None: all rows.
     """
 
     path: Path
     columns: MutableMapping[str, NDArray]
     first_row: int = 1
     absent: tuple[str, ...] = ()
+    whole: Table | None = None
+    kept: NDArray[np.intp] | None = None
+
+    def line(self, row: int) -> int:
+        """Return the number in the file of a row of this table, for messages."""
+        return self.first_row + int(row if self.kept is None else self.kept[row])
+
+    def filled(self, names: Sequence[str | int]) -> Table:
+        """Return the rows in which at least one of the named columns has a number.
+
+        Recorders of several topics write one table, and leave the cells of other topics empty.
+        """
+        names = [str(name) for name in names if str(name) in self.columns]
+        if not names or np.isfinite(self.raw(names[0], "")).all():
+            return self
+        columns = [self.raw(name, "") for name in names]
+        if len({len(column) for column in columns}) > 1:
+            return self
+        rows = np.flatnonzero(np.isfinite(np.hstack(columns)).any(axis=1))
+        if not 0 < len(rows) < self.rows:
+            return self
+        return replace(self, columns=_SelectedRows(self.columns, rows), whole=self, kept=rows)
 
     @property
     def rows(self) -> int:
         """Number of rows of the longest column."""
+        if self.kept is not None:
+            return len(self.kept)
         return max(len(column) for column in self.columns.values())
 
     def numbers(
@@ -129,7 +155,7 @@ class Table:
             first = int(np.argmax(bad))
             worst = values[first][np.argmax(np.abs(values[first]))]
             raise DrakeTeleopError(
-                f"{worst:g} {unit}".rstrip() + f" in row {first + self.first_row} of"
+                f"{worst:g} {unit}".rstrip() + f" in row {self.line(first)} of"
                 f" {self.path.name} is outside {-largest:g} to {largest:g}",
                 where=where,
                 remedy=remedy,
@@ -155,8 +181,7 @@ class Table:
         if bad.any():
             first = int(np.argmax(bad))
             raise DrakeTeleopError(
-                f"no finite number in {int(bad.sum())} rows, the first is row"
-                f" {first + self.first_row}",
+                f"no finite number in {int(bad.sum())} rows, the first is row {self.line(first)}",
                 where=f"{self.path}:{name}",
                 remedy="cut the log before it or repair the rows",
             )
@@ -169,7 +194,7 @@ class Table:
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
-            f"{cell!r} in row {row + self.first_row} is not a number",
+            f"{cell!r} in row {self.line(row)} is not a number",
             where=f"{self.path}:{name}",
             remedy="correct the cell or delete the row"
             + (", if it holds units: the log description has them" if row == 0 else ""),
@@ -242,6 +267,18 @@ def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
     small = {name.lower(): column for name, column in columns.items()}
     canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
     return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
+
+
+class _SelectedRows(UserDict[str, Any]):
+    """Columns of another table, reduced to some of its rows on access."""
+
+    def __init__(self, columns: MutableMapping[str, NDArray], rows: NDArray[np.intp]) -> None:
+        super().__init__(dict.fromkeys(columns))
+        self._columns, self._rows = columns, rows
+
+    def __getitem__(self, key: str) -> NDArray:
+        column = self._columns[key]
+        return column[self._rows] if self._rows[-1] < len(column) else column
 
 
 class _ParquetColumns(UserDict[str, Any]):

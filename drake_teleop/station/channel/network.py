@@ -202,7 +202,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     ):
         if bad.any():
             raise DrakeTeleopError(
-                f"row {int(np.argmax(bad)) + table.first_row} {what}",
+                f"row {table.line(int(np.argmax(bad)))} {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )
