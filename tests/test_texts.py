@@ -16,7 +16,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.read.description import load_description
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario

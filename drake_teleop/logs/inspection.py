@@ -19,20 +19,23 @@ from drake_teleop.common.files import make_folder, output_folder, write_json, wr
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.draft import draft_description
+from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
 from drake_teleop.logs.read.clocks import seconds, shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import Table
 
 BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
 MIN_REPEATED_BLOCK = 5
+_MAX_CORRECTIONS = 5
+"""Largest number of corrections of a draft by its data."""
 _QUANTITIES = (
     "force",
     "torque",
@@ -45,10 +48,16 @@ _QUANTITIES = (
 )
 
 
-def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
+def inspect_command(
+    log: Path, out: Path, *, others: Sequence[Path] = (), quiet: bool = False
+) -> dict[str, Any]:
     """Inspect a canonical log, a log description, any table or a bag.
 
-    Write summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
+    Write summary.json into the folder `out`, and draft.yaml for unknown tables and bags: a
+    description of all of them, in which signs, axes and units are those that fit the data.
+
+    Args:
+        others: further tables or bags of the same recording.
 
     Returns:
         the summary.
@@ -68,45 +77,54 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         "draft": None,
     }
     make_folder(out)
-    description: Description | None = None
-    draft = ""
-    if is_bag(log):
-        topics = topics_of(log)
-        draft = draft_of_bag(log, topics, out)
-        summary["kind"] = "bag"
-        summary["topics"] = {
-            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
-            for topic in topics
-        }
-    elif log.suffix.lower() in (".yaml", ".yml"):
-        description = load_description(log)
-        tables = {}
+    if not others and log.suffix.lower() in (".yaml", ".yml"):
+        _inspect(load_description(log), str(log), {}, summary)
+    elif not others and not is_bag(log) and _is_canonical(table := read_table(log)):
+        summary["kind"] = "canonical"
+        _inspect(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
-        table = read_table(log)
-        try:
-            description = describe_canonical(log, table)
-            summary["kind"] = "canonical"
-        except DrakeTeleopError:
-            known = "f_x" in table.columns and "tau_x" in table.columns
-            if known:
-                # A canonical log with NaN or a missing column gets the specific message.
-                description = describe_canonical(log, _finite(table, list(table.columns)))
-                summary["kind"] = "canonical"
-        tables = {log: table}
-        if description is None:
-            header = not _are_numbers(list(table.columns))
-            table = table if header else read_table(log, header=False)
-            draft = draft_description(table, out, header=header)
-            summary["kind"] = "unknown"
-    if description is not None:
-        _inspect(description, str(log), tables, summary)
+        drafts = [_draft(path, out, summary) for path in (log, *others)]
+        with output_folder(out):
+            _write_draft(join_drafts(drafts), out / "draft.yaml", summary)
     with output_folder(out):
-        if description is None:
-            _write_draft(draft, out / "draft.yaml", summary)
         write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary)
     return summary
+
+
+def _is_canonical(table: Table) -> bool:
+    return "f_x" in table.columns and "tau_x" in table.columns
+
+
+def _describe_canonical(log: Path, table: Table) -> Description:
+    try:
+        return describe_canonical(log, table)
+    except DrakeTeleopError:
+        # A canonical log with NaN or a missing column gets the specific message.
+        return describe_canonical(log, _finite(table, list(table.columns)))
+
+
+def _draft(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
+    if is_bag(path):
+        topics = topics_of(path)
+        summary["kind"] = "bag"
+        summary["topics"] |= {
+            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
+            for topic in topics
+        }
+        return Draft(*draft_of_bag(path, topics, out))
+    if path.suffix.lower() in (".yaml", ".yml"):
+        raise DrakeTeleopError(
+            "is a description, which contains all files of a recording",
+            where=str(path),
+            remedy="inspect it alone, or give only tables and bags",
+        )
+    summary["kind"] = "unknown"
+    table = read_table(path)
+    header = not _are_numbers(list(table.columns))
+    table = table if header else read_table(path, header=False)
+    return draft_description(table, out, header=header)
 
 
 def _are_numbers(names: Sequence[str]) -> bool:
@@ -117,23 +135,45 @@ def _are_numbers(names: Sequence[str]) -> bool:
     return False
 
 
-def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
-    write_text(path, draft)
+def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
+    """Write a draft; correct it by the data, and add what is missing as comments and findings."""
+    write_text(path, draft.text())
     summary["draft"] = str(path)
-    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft else []
+    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
     try:
         load_description(path)
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
+    if not lacking:
+        write_text(path, _fitted_draft(draft, path, summary).text())
+        return
+    text = draft.text()
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        draft += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
-    write_text(path, draft)
+        text += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
+    write_text(path, text)
+
+
+def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
+    """Return the draft with the corrections that its data require, and inspect it.
+
+    Each round applies the first finding that names the right values of fields.
+    """
+    tables: dict[Path, Table] = {}
+    for _ in range(_MAX_CORRECTIONS):
+        found = _inspect(load_description(path), str(path), dict(tables), summary)
+        finding = next((finding for finding in found if finding.fields), None)
+        if finding is None:
+            break
+        draft = draft.corrected(finding)
+        write_text(path, draft.text())
+    return draft
 
 
 def _inspect(
     description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
-) -> None:
+) -> list[Finding]:
+    """Write figures and findings to the summary, and return the findings."""
     findings: list[Finding] = []
     bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name in ("wrench", "imu", "pose", "static"):
@@ -166,6 +206,7 @@ def _inspect(
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
+    return findings
 
 
 def _stream(
@@ -274,7 +315,9 @@ def _clock(
             "the time stamps never increase", where=at, remedy="name another column, or time.rate"
         )
     median = float(np.median(forward))
-    gaps, back = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()), int((steps <= 0).sum())
+    between = figures["episodes"] - 1
+    gaps = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()) - between
+    back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
         "duration_s": float(t[-1] - t[0]),

@@ -214,7 +214,7 @@ def _identified(
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = tuple(Finding(cause.name, cause.message) for cause in causes)
+    findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
     if errors:
         findings = errors
     elif not causes and not raw.free:
@@ -273,7 +273,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
     if identified.causes and all(finding.name in EFFECTS for finding in findings):
-        causes = tuple(Finding(cause.name, cause.message) for cause in identified.causes)
+        causes = tuple(
+            Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
+        )
         return replace(
             checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
         )

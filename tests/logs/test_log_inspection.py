@@ -26,7 +26,8 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import Table
 
 PLANTED: list[tuple[Callable[[Columns], None], str, str, dict[str, bool]]] = [
     (planted.sign, "sign", "wrench.sign: -1", {}),

@@ -16,7 +16,8 @@ from scipy.sparse import eye_array
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log, write_log
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.tables import decimal_step, read_table
+from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import decimal_step
 
 
 def write(path: Path, text: str) -> Path:
@@ -376,7 +377,7 @@ def test_complex_array_raises_error(tmp_path: Path, shape: tuple[int, ...]) -> N
 FORKS = """
 import multiprocessing, sys
 from pathlib import Path
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.result import SimulationResult
 
 def rows(_):

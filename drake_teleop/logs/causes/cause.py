@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ class Cause:
         message: cause, value with its interval, and remedy.
         start_s, stop_s: time span since the start of the record [s]; None: unlimited.
         values: figures by name, in SI.
+        fields: fields of the description and their corrected values, as in YAML.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Cause:
     start_s: float | None = None
     stop_s: float | None = None
     values: dict[str, object] = field(default_factory=dict)
+    fields: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

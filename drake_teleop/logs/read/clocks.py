@@ -34,8 +34,9 @@ MIN_GAP_STEPS = 4.0
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
 _MAX_STEP_RATIO = 4.0
-# Of an episode: largest distance of its first stamp from that of the first, and least length.
-_MAX_START_STEPS, _MIN_EPISODE_ROWS = 10.0, 8
+# Of an episode: largest distance of its start from that of the first, largest of its first steps,
+# and least number of rows.
+_MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
 _WINDOW = 50
 
 
@@ -134,7 +135,7 @@ def seconds(time: Time, table: Table, where: str) -> tuple[Array, int]:
 def join_episodes(t: Array) -> tuple[Array, int]:
     """Return increasing times (N,) for a clock that starts again, and the number of its starts.
 
-    A new start is a step back to within ten median steps of the first stamp, from which the clock
+    A new start is a step back to within two median steps of the first stamp, from which the clock
     runs on. Other steps back are not changed. NaN stays NaN.
     """
     finite = np.isfinite(t)
@@ -148,7 +149,7 @@ def join_episodes(t: Array) -> tuple[Array, int]:
     if not again.all() or np.diff([0, *back, len(known)]).min() < _MIN_EPISODE_ROWS:
         return t, 1
     after = steps[back[:, None] + np.arange(_MIN_EPISODE_ROWS - 1)]
-    if (after > _MAX_START_STEPS * step).any():  # one wrong stamp
+    if (after > _MAX_FIRST_STEPS * step).any():  # one wrong stamp
         return t, 1
     joined = known.copy()
     for start in back:

@@ -48,7 +48,8 @@ from drake_teleop.logs.read.streams import (
     on_clock,
     wrench_in_S,
 )
-from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
+from drake_teleop.logs.read.table_files import FORMATS, read_table
+from drake_teleop.logs.read.tables import Table, decimal_step
 
 MINIMUM_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
