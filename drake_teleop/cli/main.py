@@ -223,6 +223,21 @@ def identify(log: Path, out: Path, **options: Any) -> None:
     "--eta", type=option.Number(0, 1), help="Share of a gripped object's wrench that is kept."
 )
 @click.option(
+    "--offsets",
+    type=click.Choice(["record", "load"]),
+    default="record",
+    show_default=True,
+    help="Sensor offsets: estimated from LOG, or those of the load file.",
+)
+@click.option(
+    "--untouched",
+    "untouched_s",
+    type=option.Number(0, 36000),
+    nargs=2,
+    metavar="START STOP",
+    help="Seconds of LOG without contact, which determine the offsets.  [default: all]",
+)
+@click.option(
     "--causal",
     type=click.Choice(["delayed", "predicted"]),
     help="Also eliminate causally: with the lag of the low-pass, or extrapolated over it.",

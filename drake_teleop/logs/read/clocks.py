@@ -77,11 +77,6 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
     notes = []
     if len(rows) < len(t):
         notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
-    if episodes > 1:
-        notes.append(
-            f"the clock starts {episodes} times: the episodes are joined, at least"
-            f" {EPISODE_GAP_S:g} s apart"
-        )
     _check_forward(t[rows], rows, table, where)
     if (np.diff(t[rows]) == 0).any():
         before = len(rows)

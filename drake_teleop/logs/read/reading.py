@@ -363,7 +363,6 @@ class _Reader:
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
         """Return the times of a stream; record notes and gaps of the stream."""
         clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
-        self._check_episodes(name, clock)
         t = clock.t
         if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
             raise DrakeTeleopError(
@@ -377,24 +376,32 @@ class _Reader:
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
         found_gaps = gaps(t, self._bandwidth_hz)
-        if len(found_gaps):
+        if clock.episodes > 1:
+            self._note_episodes(name, clock)
+        elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
                 f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
+        if len(found_gaps):
             half_window = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock
 
-    def _check_episodes(self, name: str, clock: Clock) -> None:
+    def _note_episodes(self, name: str, clock: Clock) -> None:
         described = self._description
         streams = (described.wrench, described.imu, described.pose)
-        if clock.episodes > 1 and len({stream.source for stream in streams if stream}) > 1:
+        if len({stream.source for stream in streams if stream}) > 1:
             raise DrakeTeleopError(
                 f"the clock starts {clock.episodes} times, and the streams are in several files",
                 where=f"{self._source}:{name}.time",
                 remedy="write all streams into one table, or each episode into files of its own",
+            )
+        if name == "wrench":
+            self._notes.append(
+                f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or"
+                " more apart; samples near their ends are not used"
             )
 
     def _half_window(self, dt: float) -> float:
