@@ -58,7 +58,7 @@ def calibrate_command(
     Args:
         source, stream_options: see `open_source`.
         until: tolerance, see `read_tolerance`.
-        largest: range of the sensor [N], [N m].
+        largest: range of the sensor: force [N], torque [N m].
 
     Raises:
         DrakeTeleopError: if an argument is invalid, or the record contains no load.
@@ -104,7 +104,7 @@ def calibrate_command(
 
 
 def shown(at: Evaluation, tolerance: Tolerance) -> Group:
-    """Return the terminal output of an intermediate result: table, doubts and advice."""
+    """Return the terminal output of an intermediate result: table, problems and advice."""
     table = Table(title=f"{at.t:.1f} s recorded", title_justify="left")
     table.add_column("")
     for heading in ("value", "+- (95 %)", "required", "unit"):

@@ -82,14 +82,13 @@ def excite_command(
         until: tolerance, see `read_tolerance`; replaces criterion, period and seconds.
         package_paths, acceleration, payload: see `RobotFromModel`.
         criterion, period, harmonics, seconds, seed: see `excite`.
-        quiet: True hides progress bars and tables.
-        progress: False hides the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The summary and the content of session.json.
+        The content of summary.json and session.json.
 
     Raises:
-        DrakeTeleopError: if the input is unusable or no trajectory respects all limits.
+        DrakeTeleopError: for unusable input, or if no trajectory respects all limits.
     """
     tolerance = None if until is None else read_tolerance(until)
     setup = LoadScenario(scenario)
@@ -191,7 +190,7 @@ def _words(name: str, robot: Robot) -> str:
 
 
 def table(found: Excitation) -> pl.DataFrame:
-    """Return trajectory.csv: one period at 1 kHz, both ends included."""
+    """Return the content of trajectory.csv: one period at 1 kHz, both ends included."""
     period = found.trajectory.period
     t = np.linspace(0, period, round(period * RATE) + 1)
     columns = {"t": t}

@@ -52,7 +52,10 @@ def experiment_command(
 
 
 def whose_turn(store: Store, trials: int, wanted: int | None = None) -> int:
-    """Return the requested participant's number, the first with trials left, or a new one."""
+    """Return a participant's number: the requested one, the first with trials left, or a new one.
+
+    `trials`: number of trials of each participant.
+    """
     if wanted is not None:
         return wanted
     known = store.participants()

@@ -50,8 +50,8 @@ def identify_command(
 ) -> dict[str, Any]:
     """Identify the load of a log, write the results into `out`, return the summary.
 
-    The files are identification.json; summary.json (docs/log-summaries.md); report.html; fit.png
-    and knowledge.png, and report.png with both. With a `gripper` file, object.json is written too.
+    Files: identification.json, summary.json (docs/log-summaries.md), report.html, fit.png,
+    knowledge.png, and report.png with both pictures. With a `gripper` file also object.json.
     """
     gripper_load = None if gripper is None else Identification.load(gripper)
     found = identify_log(log, method=method, cutoff_hz=cutoff_hz, delay=delay)

@@ -58,7 +58,6 @@ def _check_range(
     param: click.Parameter | None,
     ctx: click.Context | None,
 ) -> None:
-    """Fail with a message in words if a number is out of range; click writes `x>=0`."""
     low, high = kind.min, kind.max
     if high is not None and not (low or 0) <= number <= high:
         text = f"{in_short(number)} is outside {in_short(low or 0)} to {in_short(high)}"
@@ -161,7 +160,6 @@ def _remove_empty_at_failure(ctx: click.Context, _: click.Parameter, folder: Pat
 
 
 def _remove_empty(new: list[Path]) -> None:
-    """Remove the new folders, innermost first, if they contain only empty folders."""
     inner = sorted(new[0].rglob("*"), reverse=True)
     for folder in (*inner, *new):
         if folder.is_symlink() or not folder.is_dir():
@@ -229,7 +227,7 @@ free = click.option(
 
 
 def ask(question: str) -> bool:
-    """Return the answer of a user at a terminal; False without a terminal."""
+    """Return the answer of a user at a terminal, True for yes; False without a terminal."""
     return sys.stdin.isatty() and click.confirm(question, err=True)
 
 
@@ -270,7 +268,7 @@ def sensor_pose(text: str) -> Callable[[Any], Any]:
 
 
 def stream(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options of a live SOURCE; the options of the model become the argument `arm`."""
+    """Add the options of a live SOURCE; those of the arm's model become the argument `arm`."""
 
     @wraps(command)
     def with_arm(

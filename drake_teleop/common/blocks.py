@@ -1,9 +1,7 @@
 """Lifetime and fault codes of Drake systems.
 
-A Python `LeafSystem` and its Diagram (2.5 MB) are never freed if C++ holds a bound method, or,
-in Python 3.11, if a subclass has no empty `__slots__`. Forces computed from invalid, too large
-or too old numbers are not displayed; the signals `fault` and `fault_at_hand` contain the cause
-(docs/station.md).
+A Python `LeafSystem` and its Diagram are never freed if C++ holds a bound method, or, in Python
+3.11, if a subclass has no empty `__slots__`.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ ONE_DICT: tuple[str, ...] = ()
 
 
 def weak_callback(method: Any) -> Callable[..., None]:
-    """Return a callback for C++ with a weak reference to the system of `method`."""
+    """Return a callback for C++ that refers weakly to the system of `method`."""
     system, function = weakref.ref(method.__self__), method.__func__
 
     def call(context: Any, output: Any) -> None:
@@ -34,7 +32,7 @@ LARGEST = 1e6
 
 
 class Fault(IntEnum):
-    """Causes of a suppressed force, by priority."""
+    """Causes of a suppressed force at the hand, by priority."""
 
     NONE = 0
     STALE = 1

@@ -1,11 +1,8 @@
 """`njit` with a disk cache that processes can share and that detects changed callees in any file.
 
-numba's own cache ignores changes of callees in other files. It numbers signatures without a lock,
-so that two processes can exchange their code. Here each signature has its own file, named by a
-hash of the bytecode of the function and its callees and of their constants.
-
-The files are pickles with machine code. A file is loaded only if it belongs to the user, to root or
-to the owner of this package, and is not world-writable.
+Each signature has a file, named by a hash of the code of the function and its callees: a pickle
+with machine code. It is loaded only if it belongs to the user, to root or to the owner of this
+package, and is not world-writable.
 """
 
 from __future__ import annotations
@@ -38,8 +35,8 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
     """Return a decorator like `numba.njit`; with `cache=True` it stores the machine code.
 
     Args:
-        borrows: omit reference counting, which costs two atomic operations per view. The function
-            creates no arrays and receives none from callees; its caller owns the arguments.
+        borrows: omit reference counting. The function must create no arrays and receive none from
+            callees; its caller owns the arguments.
     """
     # Set in either case, because callees inherit unset options.
     options["_nrt"] = not borrows
@@ -56,10 +53,10 @@ def njit(*, borrows: bool = False, **options: Any) -> Callable[[Any], Any]:
 
 
 def call_at(arguments: tuple[types.Type, ...]) -> Any:
-    """Return a compiled function (address, arguments) that calls a function that returns nothing.
+    """Return a compiled function (address, arguments) that calls the function at an address.
 
-    numba inlines a function called by name at every level of the call tree. A function called by
-    its `address_of` is compiled once. Exceptions propagate.
+    That function has the given argument types, returns nothing and is compiled once, not inlined.
+    Exceptions propagate.
     """
 
     @intrinsic
@@ -99,8 +96,6 @@ class _Cache(FunctionCache):
 
 
 class _CacheFiles:
-    """Cache files of one function, one for each signature and processor."""
-
     def __init__(self, folder: Path, dispatcher: Dispatcher) -> None:
         function = dispatcher.py_func
         versions = f"{sys.implementation.cache_tag}.numba-{numba.__version__}"
@@ -164,7 +159,6 @@ def fingerprint(dispatcher: Dispatcher) -> str:
 
 @cache
 def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
-    """Return the text of a function's code and constants, and its callees."""
     function = getattr(compiled, "py_func", compiled)
     constants = dict(_referenced_values(function))
     options = getattr(compiled, "targetoptions", {})
@@ -181,13 +175,11 @@ def _code_and_callees(compiled: Any) -> tuple[str, frozenset[Any]]:
 
 
 def _is_callee(value: Any, package: str) -> bool:
-    """Return whether numba compiles `value`, a function of this package, into its caller."""
     plain = isinstance(value, FunctionType) and value.__module__.partition(".")[0] == package
     return plain or isinstance(value, Dispatcher)
 
 
 def _referenced_values(function: FunctionType) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of globals and closure variables that a function reads."""
     cells = function.__closure__ or ()
     for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
         yield name, cell.cell_contents
@@ -212,7 +204,6 @@ def _referenced_names(code: CodeType) -> Iterator[str]:
 
 
 def _constant_text(value: Any) -> str:
-    """Return a text of a constant, equal in all processes and without line numbers."""
     if isinstance(value, CodeType):
         parts = [value.co_code, value.co_names, value.co_varnames, value.co_argcount]
         # Since Python 3.11 exception handlers are in a separate table.

@@ -165,7 +165,6 @@ def kind_of(hint: Any) -> Kind:
 
 
 def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
-    """Check a value's type; in a file a block is a mapping, and 1e-3 may be a string."""
     first = kind.items[0]
     if value is None and kind.optional:
         return
@@ -187,7 +186,6 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
 
 
 def _selected_block(blocks: tuple[type, ...], value: Any, place: str) -> type:
-    """Return the dataclass that the value's tag selects, by default the first."""
     names = [block.__name__ for block in blocks]
     tag = str(value.get("_tag", "")).removeprefix("!") if isinstance(value, dict) else ""
     if tag and tag not in names:
@@ -228,7 +226,8 @@ class FieldInfo:
     """Description of a dataclass field.
 
     Attributes:
-        kind: "number", "whole number", "true or false", "word" or "block", of the innermost items.
+        kind: "number", "whole number", "true or false", "word" or "block" (a dataclass), of the
+            innermost items.
         lists: number of nested lists, 0 for one value.
         length: required length of the list, or None.
         optional: whether the value may be null.
@@ -288,7 +287,7 @@ def _set_checked_attribute(self: Any, name: str, value: Any) -> None:
 def fields_of(config: Any) -> list[FieldInfo]:
     """Return the descriptions of the fields of a settings dataclass or instance.
 
-    For an inner block pass its `default`, which depends on the outer field.
+    For an inner block pass the outer field's `default`.
     """
     return [_field_info(entry, config) for entry in dataclasses.fields(config)]
 

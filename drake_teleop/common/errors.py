@@ -20,9 +20,7 @@ LONGEST_LINE = 1000
 
 
 class DrakeTeleopError(ValueError):
-    """Error in the input, with a one-line message for the command line.
-
-    Programming errors remain ordinary exceptions.
+    """Error in the user's input, with a one-line message.
 
     Args:
         where: the place, as ``file:field`` or the name of a port.
@@ -37,7 +35,7 @@ class DrakeTeleopError(ValueError):
 
 
 def one_line(text: str, max_length: int = LONGEST_LINE) -> str:
-    """Return the text as one printable line; cut out the middle of a long text."""
+    """Return the text as one printable line; the middle of a longer text is cut out."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
     if len(text) <= max_length:
         return text
@@ -56,10 +54,7 @@ def expect(kind: type | tuple[type, ...], value: Any, where: str, remedy: str = 
 
 @contextmanager
 def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read") -> Iterator[None]:
-    """Convert any error while reading a file to DrakeTeleopError.
-
-    For damaged files zipfile, numpy and polars raise many different exceptions.
-    """
+    """Convert any error while reading a file to DrakeTeleopError."""
     try:
         with silent_stderr():  # a panic in polars writes pages from another thread
             yield
@@ -74,7 +69,7 @@ def wrap_read_errors(path: str | Path, remedy: str, what: str = "cannot be read"
 
 
 def refuse_fork() -> None:
-    """Raise DrakeTeleopError in a process forked after the first call; polars would hang there.
+    """Raise DrakeTeleopError in a process forked after the first call: polars would hang there.
 
     Call this before polars reads or writes.
     """
@@ -94,12 +89,12 @@ def suggestion(name: object, names: Sequence[str], otherwise: str) -> str:
 
 
 def install_extra(name: str) -> str:
-    """Return the remedy for a missing library: installing the extra `name`."""
+    """Return the remedy for a missing library: installing this package's extra `name`."""
     return f"install the extra `{name}`: pip install '.[{name}]' in the clone of this project"
 
 
 def require_library(module: str, library: str, extra: str, where: str) -> None:
-    """Raise DrakeTeleopError if the library of an extra is not installed."""
+    """Raise DrakeTeleopError if a module is missing, which the optional `extra` installs."""
     if importlib.util.find_spec(module) is None:
         what = f"needs the library {library}, which is not installed"
         raise DrakeTeleopError(what, where=where, remedy=install_extra(extra))

@@ -38,10 +38,9 @@ def whole_file(path: Path, *, aside: Path | None = None, shared: bool = False) -
     """Yield a temporary name to write under; then rename the file to `path`.
 
     Args:
-        aside: the temporary file is beside this path; use it if the folder of `path` is read as one
+        aside: the temporary file is beside this path, for a `path` in a folder that is read as one
             table.
-        shared: other processes may write the same file now; the temporary name is unique.
-            Otherwise it is reused, so that killed processes leave one file only.
+        shared: the temporary name is unique, because other processes may write the same file now.
 
     Raises:
         CannotWrite: if writing fails; `path` is then unchanged.
@@ -103,14 +102,14 @@ def write_table(
 def output_folder(
     out: Path, last: str = "summary.json", *, kept: Sequence[str] = ()
 ) -> Iterator[None]:
-    """Create the output folder of a command; the output is complete when `last` exists.
+    """Create a command's output folder; the output is complete when the file `last` exists.
 
     Args:
         last: final file; one of an earlier command is removed first.
         kept: earlier files that remain, for the error message.
 
     Raises:
-        CannotWrite: if writing fails; with the files written before.
+        CannotWrite: if writing fails; the message lists the files written before.
     """
     make_folder(out)
     with wrap_write_errors(out / last):
@@ -158,7 +157,7 @@ def set_aside(*paths: Path) -> Path | None:
 
 
 def part_of_log(folder: Path, first_row: int) -> Path:
-    """Return the file of a log's part, named after its first row."""
+    """Return the path of the log file that begins with a given row."""
     return folder / _PART_NAME.format(first_row)
 
 
@@ -179,7 +178,6 @@ def remove_log(path: Path) -> None:
 
 
 def _reason(error: OSError) -> str:
-    """Return the system's message without error number and file name."""
     if found := _RUST_ERROR.search(str(error)):
         return found[1].strip()
     return error.strerror or str(error) or type(error).__name__
@@ -194,7 +192,6 @@ def _finite(data: Any) -> Any:
 
 
 def _file_states(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return time and inode of each file and non-empty folder."""
     found = {}
     for path in sorted(folder.iterdir()):
         if not path.is_dir() or any(path.iterdir()):
@@ -214,7 +211,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def models_dir() -> Path:
-    """Return the folder of the models; the wheel contains it inside the package."""
+    """Return the folder of the shipped models."""
     packaged = _PACKAGE / "models"
     return packaged if packaged.is_dir() else _PACKAGE.parent / "models"
 

@@ -46,7 +46,7 @@ _SCRIPT = re.compile(r"<script[^>]*>(.*?)</script>", re.S)
 
 
 def policy(page: str, host: str = "") -> str:
-    """Return a page's security policy; `host` is its server's "address:port", "" for a file."""
+    """Return a page's Content-Security-Policy; `host`: server's "address:port", "" for a file."""
     scripts = (script.replace("\r\n", "\n") for script in _SCRIPT.findall(page))
     digests = (hashlib.sha256(script.encode()).digest() for script in scripts if script)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)

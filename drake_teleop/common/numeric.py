@@ -85,7 +85,7 @@ def number(name: str, value: Any) -> float:
 
 
 def check_identified(name: str, phi: Array) -> Array:
-    """Return `phi` (10,); raise DrakeTeleopError if it is zero, that is, unidentified."""
+    """Return the load parameters `phi` (10,); raise DrakeTeleopError if all are zero."""
     if not phi.any():
         raise DrakeTeleopError(
             "is zero throughout, so this load is not identified",
@@ -96,7 +96,7 @@ def check_identified(name: str, phi: Array) -> Array:
 
 
 def positive(name: str, value: ArrayLike, *shape: int) -> Array:
-    """Return a `checked` array; raise DrakeTeleopError unless it is positive."""
+    """Return an array as `checked`; raise DrakeTeleopError unless all values are positive."""
     array = checked(name, value, *shape)
     if not (array > 0.0).all():
         raise DrakeTeleopError("is not positive throughout", where=name)
@@ -104,7 +104,7 @@ def positive(name: str, value: ArrayLike, *shape: int) -> Array:
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Limit BLAS to one thread; several threads change the last digits of sums."""
+    """Limit BLAS to one thread in a context; several threads change the last digits of sums."""
     import scipy.linalg  # noqa: F401 (a BLAS that is loaded later is not limited)
     from threadpoolctl import threadpool_limits
 

@@ -1,12 +1,8 @@
-"""Check of the sizes in a Parquet file before polars reads it.
+"""Check of the sizes in a Parquet file, to be made before each read by polars.
 
-polars reserves memory for the number of values in a page header. A damaged number, such as -57,
-requests 2^61 bytes, and Rust aborts the process without an exception. `check_parquet` compares
-the sizes in the footer with each other and with the length of the file, and those of each page
-with the footer. Call it before each function of polars that reads Parquet.
-
-Format: https://github.com/apache/parquet-format; metadata are structs in Thrift's compact protocol
-with the field numbers of `parquet.thrift`.
+A damaged size can make polars abort the process without an exception. Format:
+https://github.com/apache/parquet-format; metadata are structs in Thrift's compact protocol with the
+field numbers of `parquet.thrift`.
 """
 
 from __future__ import annotations
@@ -72,7 +68,6 @@ def _check(content: bytes | mmap.mmap) -> None:
 
 
 def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
-    """Yield the name of each column, and whether it has one value per row (no lists)."""
     above = [(len(schema), True)]  # of each enclosing group: remaining children, is flat
     for element in schema:
         while above[-1][0] == 0:
@@ -89,7 +84,6 @@ def _columns(schema: list[_Struct]) -> Iterator[tuple[str, bool]]:
 def _check_column(
     content: bytes | mmap.mmap, end: int, column: _Struct, name: str, rows: int | None
 ) -> None:
-    """Compare the pages of a column in a row group with the footer, which starts at byte `end`."""
     values = _size(column, 5, f"values in {name}")
     _require(rows in (None, values), f"{name} has {values} values in {rows} rows")
     largest, length = _size(column, 6, f"bytes in {name}"), _size(column, 7, f"bytes in {name}")
@@ -109,7 +103,6 @@ def _check_column(
 
 
 def _values(page: _Struct, length: int, where: str) -> int:
-    """Check the sizes in a page header; return the number of column values in the page."""
     kind, what = page[1], f"values in {where}"
     if kind == _DATA_PAGE:
         return _size(page[5], 1, what)
@@ -127,7 +120,6 @@ def _values(page: _Struct, length: int, where: str) -> int:
 
 
 def _size(struct: _Struct, number: int, what: str, default: int | None = None) -> int:
-    """Return a nonnegative integer field of a struct."""
     size = struct[number] if default is None else struct.get(number, default)
     _require(isinstance(size, int) and size >= 0, f"the number of {what} is {size!r}")
     return int(size)
@@ -139,8 +131,6 @@ def _require(condition: bool, otherwise: str) -> None:
 
 
 class _CompactReader:
-    """Reader of Thrift's compact protocol; a struct becomes a dictionary by field number."""
-
     def __init__(self, content: bytes | mmap.mmap, at: int = 0) -> None:
         self._content, self.at = content, at
 

@@ -15,7 +15,7 @@ Stage: TypeAlias = Callable[[str], Progress]
 
 
 def silent(name: str) -> Progress:
-    """Return a progress function that shows nothing."""
+    """Return a progress function that shows nothing, for a stage of any name."""
     return lambda fraction, words="": None
 
 

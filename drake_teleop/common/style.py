@@ -62,13 +62,13 @@ class Picture(Figure):
 
 
 def shade_contact(axes: Axes, t: ArrayLike, contact: ArrayLike) -> None:
-    """Shade the time spans in which `contact` (N,) is true; t: (N,) times."""
+    """Shade the time spans in which `contact` (N,) is true; `t` (N,) are the times [s]."""
     for start, stop in contact_spans(t, contact):
         axes.axvspan(start, stop, color=ORANGE, alpha=0.18, linewidth=0)
 
 
 def contact_spans(t: ArrayLike, contact: ArrayLike) -> list[tuple[float, float]]:
-    """Return the time spans (start, stop) in which `contact` (N,) is true; t: (N,) times."""
+    """Return the time spans (start, stop) in which `contact` (N,) is true; `t` (N,): times."""
     times = np.asarray(t, float)
     edges = np.diff(np.concatenate([[False], np.asarray(contact, bool), [False]]).astype(int))
     starts, stops = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1

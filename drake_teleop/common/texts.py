@@ -37,8 +37,6 @@ _CORE_SCHEMA = (
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's parser with the scalar types of YAML 1.2."""
-
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012  (as PyYAML declares it)
 
     def fetch_flow_collection_start(self, TokenClass: Any) -> None:
@@ -56,8 +54,6 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """PyYAML's emitter; it quotes strings that YAML 1.1 or 1.2 reads as another type."""
-
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
@@ -127,7 +123,7 @@ def yaml_text(
 
 
 def yaml_scalar(value: Any, flow: bool | None = True) -> str:
-    """Return YAML in one line; with `flow` None, blocks have their own lines."""
+    """Return a value as YAML in one line; with `flow` None, blocks have their own lines."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,
@@ -175,8 +171,6 @@ def read_text(path: str | Path) -> str:
 
 
 class _NodeConverter:
-    """Converter of YAML nodes to data, with a limited number of values."""
-
     def __init__(self, tagged: bool) -> None:
         self._tagged = tagged
         self._values = 0

@@ -1,7 +1,7 @@
 """Vectors of 3, rotation matrices of 9 numbers (by rows) and unit quaternions for compiled code.
 
-The functions allocate no memory. In Python those of vectors accept any scalar of Drake. Sums are
-evaluated from left to right. Quaternions are tuples (w, x, y, z).
+The functions allocate no memory. In Python those of vectors accept any scalar type of Drake. Sums
+are evaluated from left to right. Quaternions are tuples (w, x, y, z).
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from drake_teleop.common.compiled import njit
 
 @register_jitable
 def three(x, i):
-    """Return the vector (3 numbers) at index i of x."""
+    """Return the 3 numbers of x from index i as a vector."""
     return x[i], x[i + 1], x[i + 2]
 
 
 @register_jitable
 def nine(x, i):
-    """Return the rotation matrix (9 numbers) at index i of x."""
+    """Return the 9 numbers of x from index i as a rotation matrix."""
     return x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5], x[i + 6], x[i + 7], x[i + 8]
 
 
 @register_jitable
 def rows(R):
-    """Return a matrix (3, 3) as a tuple of 9, by rows."""
+    """Return a matrix (3, 3) as a tuple of 9 numbers, by rows."""
     return R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2], R[2, 0], R[2, 1], R[2, 2]
 
 
 @register_jitable
 def transposed(R):
-    """Return R^T."""
+    """Return the transpose of a matrix of 9 numbers."""
     return R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]
 
 
@@ -49,10 +49,7 @@ def add_into(x, i, a):
 
 @register_jitable
 def put(x, i, a, j, n):
-    """Copy n numbers from index j of a to index i of x.
-
-    A slice assignment is slower for few numbers.
-    """
+    """Copy n numbers from index j of a to index i of x (faster than a slice assignment)."""
     for k in range(n):
         x[i + k] = a[j + k]
 
@@ -99,7 +96,7 @@ def plus_cross(c, a, b):
 
 @register_jitable
 def apply(R, a):
-    """Return the vector R a, for any 3 x 3 matrix R."""
+    """Return the vector R a for any matrix R of 9 numbers."""
     return (
         R[0] * a[0] + R[1] * a[1] + R[2] * a[2],
         R[3] * a[0] + R[4] * a[1] + R[5] * a[2],
@@ -109,17 +106,14 @@ def apply(R, a):
 
 @register_jitable
 def symmetric(x, i):
-    """Return the symmetric matrix of xx, xy, xz, yy, yz, zz at index i of x."""
+    """Return the symmetric matrix (9 numbers) of xx, xy, xz, yy, yz, zz from index i of x."""
     xx, xy, xz, yy, yz, zz = x[i], x[i + 1], x[i + 2], x[i + 3], x[i + 4], x[i + 5]
     return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
 
 @register_jitable(inline="always")
 def cholesky(M, n):
-    """Replace the lower half of M (n, n), symmetric and positive definite, by L of M = L L^T.
-
-    The compiler unrolls the loops if n is a constant.
-    """
+    """Replace the lower half of M (n, n), symmetric and positive definite, by L of M = L L^T."""
     for i in range(n):
         for j in range(i + 1):
             value = M[i, j]
@@ -130,7 +124,7 @@ def cholesky(M, n):
 
 @register_jitable(inline="always")
 def solve(M, b, n):
-    """Replace b (n,) by M^-1 b, and M as in `cholesky`."""
+    """Replace b (n,) by M^-1 b, and M (n, n) as in `cholesky`."""
     cholesky(M, n)
     for i in range(n):
         for k in range(i):
@@ -152,7 +146,7 @@ def cross_matrix(a: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def multiply(a, b):
-    """Return the quaternion a b; R(a b) = R(a) R(b)."""
+    """Return the quaternion product a b, with R(a b) = R(a) R(b)."""
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -169,7 +163,7 @@ def conjugate(a):
 
 @njit(cache=True)
 def rotate(a, v):
-    """Return the rotated vector R(a) v."""
+    """Return the vector v, rotated by the quaternion a."""
     axis = three(a, 1)
     t = times(2.0, cross(axis, v))
     return plus_cross(plus(v, times(a[0], t)), axis, t)
@@ -187,7 +181,7 @@ def exponential(v):
 
 @njit(cache=True)
 def logarithm(a):
-    """Return the rotation vector [rad], |v| <= pi; it is equal for a and -a."""
+    """Return the rotation vector [rad] of a quaternion, |v| <= pi; it is equal for a and -a."""
     sine = math.sqrt(a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
     scale = 2.0 * math.atan2(sine, abs(a[0])) / sine if sine > 1e-12 else 2.0
     if a[0] < 0.0:

@@ -51,7 +51,7 @@ class LoadIdentification:
     """Result of an identification run.
 
     Attributes:
-        estimate: (16,) final estimate [offsets; phi] of the recursive estimator, Eq. (7).
+        estimate: (16,) final recursive estimate of Eq. (7): sensor offsets [N, N m], then phi.
         batch: estimate by batch total least squares from the same record.
         kappa_w10: criterion of the trajectory, see `excitation.criteria`.
         real_time_factor: simulated time over elapsed time.
@@ -70,13 +70,13 @@ class LoadIdentification:
 
     @property
     def identification(self) -> Identification:
-        """Recursive estimate with uncertainties and residuals of the batch estimate."""
+        """Recursive estimate, with uncertainties and residuals of the batch estimate."""
         return dataclasses.replace(
             self.batch, offsets=self.estimate[:6], phi=self.estimate[6:], method=self.method
         )
 
     def noise_floor(self, arm: ArmModel) -> NoiseFloor:
-        """Fit the noise floor of the contact wrench to this contact-free motion."""
+        """Return the contact wrench's noise floor, fitted to this contact-free motion."""
         usable = self.result["saturated"][:, 0] == 0
         wrench, s, omega, alpha = (x[usable] for x in sensor_samples(self.result))
         offsets, phi = self.estimate[:6], self.estimate[6:]
@@ -99,15 +99,14 @@ def slave_arm(scenario: Scenario) -> ArmModel:
 
 
 def true_load(scenario: Scenario) -> Array:
-    """Return the true load (16,) [offsets; phi], with zero offsets."""
+    """Return the true load (16,): zero sensor offsets, then the inertial parameters phi."""
     return np.concatenate([np.zeros(6), slave_arm(scenario).phi_load])
 
 
 def identification_scenario(scenario: Scenario, seed: int) -> Scenario:
     """Return the shipped scenario "identification" with slave and sensor of `scenario`.
 
-    With contact detection, the log has the estimator's rate, because the noise floor includes the
-    correlation of consecutive samples.
+    With contact detection the log has the estimator's rate.
     """
     check_scenario(scenario)
     rates = scenario.rates
@@ -131,7 +130,7 @@ def identify_load(
     trajectory: FourierTrajectory | None = None,
     log: Path | None = None,
 ) -> LoadIdentification:
-    """Run an excitation trajectory and identify the load.
+    """Simulate an excitation trajectory and identify the load.
 
     Args:
         progress: True shows progress bars; or a `Stage` that receives the progress.
@@ -231,7 +230,7 @@ def _check_trajectory(robot: Robot, trajectory: FourierTrajectory, duration: flo
 def simulate_with_timing(
     station: Diagram, simulation: Simulation, progress: Progress, log: Path | None = None
 ) -> tuple[SimulationResult, float]:
-    """Simulate a station; return the result and the real-time factor."""
+    """Simulate a station; return the result, and simulated time over elapsed time."""
     start = time.perf_counter()
     result = simulate(station, simulation, progress=progress, log=log)
     elapsed = time.perf_counter() - start

@@ -1,8 +1,4 @@
-"""Cache of identified loads in the user's cache folder or in DRAKE_TELEOP_CACHE_DIR.
-
-A file name is a hash of scenario, sources, models, numerical libraries and processor, so a cached
-load equals a new identification bit by bit.
-"""
+"""Cache of identified loads in the user's cache folder or in DRAKE_TELEOP_CACHE_DIR."""
 
 from __future__ import annotations
 
@@ -48,7 +44,7 @@ class IdentifiedLoad:
 
     @property
     def estimate(self) -> Array:
-        """Estimate (16,) [offsets; phi] of Eq. (7)."""
+        """Estimate (16,) of Eq. (7): sensor offsets [N, N m], then phi."""
         return np.concatenate([self.identification.offsets, self.identification.phi])
 
 
@@ -85,7 +81,7 @@ def identified_load(
 
 
 def cache_folder() -> Path:
-    """Return the folder that `CACHE_VARIABLE` specifies, or the user's cache folder."""
+    """Return the folder in the variable `CACHE_VARIABLE`, or the user's cache folder."""
     from platformdirs import user_cache_path
 
     return Path(os.environ.get(CACHE_VARIABLE) or user_cache_path("drake_teleop", appauthor=False))

@@ -1,9 +1,4 @@
-"""`drake-teleop run SCENARIO`: run one scenario; write its log, picture and summary.
-
-With an enabled load estimator, the run starts without a load; if the operator has neither intent
-nor task, the slave runs an excitation trajectory. With a disabled estimator, the load is identified
-before the run or read from the cache.
-"""
+"""`drake-teleop run SCENARIO`: run one scenario; write its log, picture and summary."""
 
 from __future__ import annotations
 
@@ -42,7 +37,7 @@ _FINAL_FILES = (
 
 
 class RecordedDrive(Protocol):
-    """Recorded live session that can be simulated, see `drake_teleop.live.session.read_drive`."""
+    """Recorded live session that can be simulated again, see `live.session.read_drive`."""
 
     @property
     def folder(self) -> Path:
@@ -50,11 +45,11 @@ class RecordedDrive(Protocol):
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario of the session, with the duration of the session."""
+        """Scenario of the session, with the session's duration."""
 
     @property
     def load(self) -> IdentifiedLoad | None:
-        """Load with which the session's station was made."""
+        """Load with which the session's station was made; None: it was estimated online."""
 
     def repeat(self, progress: Progress, log: Path | None = None) -> SimulationResult:
         """Simulate the recorded session again."""
@@ -73,15 +68,14 @@ def run_command(
     """Run one scenario; write all results into `out` and delete those of an earlier run.
 
     Args:
-        scenario: name of a shipped scenario, or a YAML file.
+        scenario: shipped name or YAML file.
         drive: recorded live session that is simulated instead of `scenario`.
         seed: replaces the scenario's seed.
         fresh: True ignores the cached load.
-        quiet: True hides progress bars and tables.
-        progress: False hides the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The summary and the content of session.json.
+        The content of summary.json and session.json.
 
     Raises:
         DrakeTeleopError: for an unusable scenario, a joint outside its range, or a failed write.
@@ -150,7 +144,10 @@ def run_scenario(
     *,
     fresh: bool = False,
 ) -> ScenarioRun:
-    """Run a scenario with the load that the module's docstring describes.
+    """Run a scenario; estimate the load during the run, or use the cached or newly identified load.
+
+    If it is estimated and there is no intended motion or task, the slave runs an excitation
+    trajectory.
 
     Args:
         progress: True shows progress bars; or a `Stage` that receives the progress.

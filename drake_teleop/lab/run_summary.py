@@ -64,7 +64,7 @@ class ScenarioRun:
 
 
 def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True in true contact, with gaps below FILTER_TAIL_S closed."""
+    """Return (N,) booleans: True in true contact; gaps below `FILTER_TAIL_S` are closed."""
     if "true_contact_wrench_W" not in result:
         return np.zeros(len(result.t), dtype=bool)
     touching = np.any(result["true_contact_wrench_W"] != 0, axis=1)
@@ -72,7 +72,7 @@ def in_contact(result: SimulationResult) -> NDArray[np.bool_]:
 
 
 def calculated_contact_wrench(result: SimulationResult) -> Array:
-    """Return the contact wrench (N, 6) of Eq. (13) with the final load estimate.
+    """Return the contact wrench (N, 6) [N, N m] of Eq. (13), in S, with the final load estimate.
 
     Raises:
         DrakeTeleopError: if no load was identified.
@@ -158,7 +158,6 @@ def _detection_figures(
 
 
 def _unmodelled_contact(scenario: Scenario) -> str:
-    """Return why the compiled contact law does not apply; empty if it applies."""
     surroundings = scenario.surroundings
     if surroundings is None:
         return ""
@@ -185,7 +184,6 @@ def _peaks(prefix: str, suffix: str, wrench: Array) -> dict[str, float | None]:
 
 
 def _time_since(contact: NDArray[np.bool_], t: Array) -> Array:
-    """Return the time (N,) since the last contact [s]; at first inf."""
     last = np.maximum.accumulate(np.where(contact, np.arange(len(t)), -1))
     return np.where(last < 0, np.inf, t - t[last])
 

@@ -28,7 +28,6 @@ _PACKET_TIMEOUT_S = 0.05  # s
 
 @njit(cache=True)
 def _norm_range_into(vectors, origins, out):
-    """Write the smallest and largest norm of vectors (n, 3 or more) minus `origins`."""
     least, most = math.inf, 0.0
     for row in range(len(vectors)):
         square = 0.0
@@ -40,7 +39,6 @@ def _norm_range_into(vectors, origins, out):
 
 @njit(cache=True)
 def _columns_at_limit(values, limits):
-    """Return a bit mask of the columns of values (n, k) that reach `limits` (k,)."""
     found = 0
     for row in range(len(values)):
         for k in range(len(limits)):
@@ -71,7 +69,7 @@ def _add_work(table, t, states, contact_S, hand_E, twist, before, energy):
 
 
 class Cockpit:
-    """Calculator of the values on the page. Loops are compiled, as NumPy calls are too slow."""
+    """Calculator of the values that the browser page shows, from the log's rows."""
 
     def __init__(self, scenario: Scenario) -> None:
         arm = slave_arm(scenario)
@@ -86,11 +84,11 @@ class Cockpit:
         self._forces = np.zeros((3, 2))
 
     def frame(self, rows: dict[str, Array], inputs: Inputs) -> dict[str, Any]:
-        """Return finite values of at least one new row, for JSON.
+        """Return the page's values for at least one new row, finite and ready for JSON.
 
-        "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": of
-        the hand into the device, of the tool into the environment [J]; "tool", "stylus": positions
-        [m]; "words": warnings.
+        "t" [s]; "f": range of measured, contact and rendered force at the hand [N]; "energy": from
+        the hand into the device, from the tool into the environment [J]; "tool", "stylus":
+        positions [m]; "contact": bool; "words": warnings.
         """
         zeros = np.zeros((len(rows["t"]), 6))
         contact_S = rows.get("contact_wrench_S", zeros)

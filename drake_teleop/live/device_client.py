@@ -3,7 +3,7 @@
     python -m drake_teleop.live.device_client virtual udp://127.0.0.1:PORT [--grip light]
     python -m drake_teleop.live.device_client haply://localhost:10001 udp://127.0.0.1:PORT
 
-The client is a separate process, so that the station cannot delay its safety functions.
+It is a separate process, so that the station cannot delay its safety functions.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Device(Protocol):
         """Limits of force, torque and their slew rates."""
 
     def read(self) -> DevicePose | None:
-        """Return the next pose, None if none comes for half a second."""
+        """Return the next pose; None if none comes for half a second."""
 
     def set(self, wrench: Sequence[float]) -> None:
         """Render the wrench [f; tau] in the base frame B [N, N m]."""
@@ -61,7 +61,7 @@ class Client:
 
     Attributes:
         guard: safety functions.
-        behind: ages of the positions that the received forces answer [s].
+        behind: delay between each device position and the force that answers it [s].
     """
 
     def __init__(self, device: Device, address: str, *, observe: bool = True) -> None:
@@ -75,7 +75,7 @@ class Client:
         self._last_tick: float | None = None
 
     def tick(self, clock: Callable[[], float] = time.perf_counter) -> tuple[float, ...] | None:
-        """Exchange pose and force once; return the displayed wrench, None without a pose."""
+        """Exchange pose and force once; return the displayed wrench, or None without a pose."""
         pose = self._device.read()
         now = clock()
         self._receive()

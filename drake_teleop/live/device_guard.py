@@ -5,7 +5,7 @@
 * Limits of force, torque and their slew rates.
 * Passivity observer (Hannaford and Ryu 2002) of the stored energy E += -f_k . (x_k+1 - x_k), at
   most 0.3 J. A force that would return more than E along the extrapolated displacement is reduced,
-  at most to that of a damper of 100 N s/m; a reserve of 30 uJ covers the extrapolation error.
+  at most to that of a damper of 100 N s/m; 30 uJ cover the extrapolation error.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Limits:
 
 
 class DeviceGuard:
-    """Safety functions of one haptic device.
+    """Safety functions of one haptic device; `observe` enables the passivity observer.
 
     Attributes:
         energy: energy from the hand into the device since the start [J].

@@ -68,7 +68,7 @@ class DeviceLink:
         self._force_ages: deque[float] = deque(maxlen=_STATISTICS_PACKETS)
 
     def poll(self, now: float) -> DeviceState | None:
-        """Receive waiting packets; return the newest device state, None after silence."""
+        """Receive waiting packets; return the newest device state, None after 50 ms of silence."""
         self._polled_at = now
         for _ in range(_MAX_PACKETS):
             try:
@@ -116,7 +116,7 @@ class DeviceLink:
         self._origin, self._connected_at = self._state, now
 
     def hand_inputs(self, now: float) -> Mapping[str, float]:
-        """Return the `Inputs` of the device's pose; a silent device releases the hand."""
+        """Return the `Inputs` of the device's pose by name; a silent device releases the hand."""
         state = self.poll(now)
         if state is None or self._origin is None:
             return {"held": 0, "clutch": 0}
@@ -131,7 +131,7 @@ class DeviceLink:
         return values
 
     def figures(self, now: float) -> dict[str, float]:
-        """Return packet rate, losses, and lateness of packets and forces [ms]."""
+        """Return packet rate [Hz], lost packets, and lateness of packets and forces [ms]."""
         late = np.array(self._latencies or [0.0])
         behind = np.array(self._force_ages or [0.0])
         elapsed = (
@@ -148,7 +148,7 @@ class DeviceLink:
         }
 
     def status_text(self) -> str:
-        """Return the link's state at the last `poll` in words."""
+        """Return the link's state at the last `poll` as text for the page."""
         if not self.refused:
             return self._lateness_text()
         reason = f"the last one {self.refusal}"
@@ -183,7 +183,7 @@ def _is_loopback(host: str) -> bool:
 
 
 class DeviceConnection:
-    """Link to a haptic device, with the client process of a haply:// address.
+    """Link to a haptic device; for a haply:// address also the client process.
 
     Args:
         address: udp://127.0.0.1:PORT for a client, or haply://HOST:PORT of an Inverse3.

@@ -65,7 +65,7 @@ def packed_state(state: DeviceState) -> bytes:
 
 
 def unpacked_state(packet: bytes) -> DeviceState | None:
-    """Return the device state in a packet, None if implausible. Never raises."""
+    """Return the device state in a packet, None if it is invalid or implausible. Never raises."""
     if len(packet) != _STATE.size or packet[:4] != _FROM_DEVICE:
         return None
     _, flags, number, t, *numbers = _STATE.unpack(packet)
@@ -75,7 +75,10 @@ def unpacked_state(packet: bytes) -> DeviceState | None:
 def plausible_state(
     number: int, t: float, flags: int, numbers: Sequence[float]
 ) -> DeviceState | None:
-    """Return the state with `numbers`: position, orientation and `behind`; None if implausible."""
+    """Return the device state, None if a value is implausible.
+
+    `numbers` (8,): position [m], orientation [w, x, y, z] and `behind` [s].
+    """
     x, y, z, w, i, j, k, behind = numbers
     length = math.sqrt(w * w + i * i + j * j + k * k)
     # Comparisons with nan are False, so that nan is refused, too.
@@ -94,7 +97,7 @@ def plausible_state(
 
 
 def refusal(packet: bytes) -> str:
-    """Return the reason why a packet is refused."""
+    """Return as text why `unpacked_state` rejects a packet."""
     if len(packet) != _STATE.size:
         length = len(packet) if len(packet) < _STATE.size else f"more than {_STATE.size}"
         return f"is {length} bytes long, not {_STATE.size}"
@@ -111,7 +114,7 @@ def packed_force(command: ForceCommand) -> bytes:
 
 
 def unpacked_force(packet: bytes) -> ForceCommand | None:
-    """Return the force command in a packet, None if invalid. Never raises."""
+    """Return the force command in a packet, or None if it is invalid. Never raises."""
     if len(packet) != _FORCE.size or packet[:4] != _TO_DEVICE:
         return None
     _, _, number, t, *wrench = _FORCE.unpack(packet)

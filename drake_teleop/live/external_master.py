@@ -1,8 +1,4 @@
-"""Master side of a real haptic device, in place of operator, simulated device and force display.
-
-The pose moves to the newest received pose on a straight line, so that the slave's command has no
-steps.
-"""
+"""Master side of a real haptic device, in place of operator, simulated device and force display."""
 
 from __future__ import annotations
 
@@ -48,7 +44,6 @@ _WRENCH = float(Fault.WRENCH)
 
 @njit(cache=True)
 def _pose_on_path(path, time, out):
-    """Write the pose (7,) and twist (6,) at `time` into `out` (13,)."""
     share = min(max((time - path[_START_TIME]) / TICK, 0.0), 1.0)
     r = (share * path[_ROTATION], share * path[_ROTATION + 1], share * path[_ROTATION + 2])
     start = (path[_START_POSE], path[_START_POSE + 1], path[_START_POSE + 2], path[_START_POSE + 3])
@@ -64,7 +59,7 @@ def _pose_on_path(path, time, out):
 
 @njit(cache=True)
 def _display_step(wrench, held, period, limits, last, now):
-    """Write wrench, fault and allowed share (8,) after `period` to `now`; `limits`: [N, N m]."""
+    """Write wrench, fault and allowed share (8,) to `now`; `limits`: [N, N m]."""
     fault = 0.0
     if not sound(wrench):
         fault = _WRENCH
@@ -135,7 +130,7 @@ class ExternalMaster(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Move the device to the pose `target` (7,) X_BE; None releases it."""
+        """Move the device's pose to `target` (7,) X_BE within 2 ms; None releases the device."""
         now, path = self._present(context), np.zeros(_PATH)
         path[_START_TIME], path[_START_POSE:_DISPLACEMENT] = context.get_time(), now[:7]
         if target is not None:
@@ -190,7 +185,10 @@ class ExternalMaster(LeafSystem):
 
 
 def MakeExternalMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`."""
+    """Return the master side of a real device, with the ports of `MakeLiveMasterSide`.
+
+    `cross_fade` adds a `CrossFade` block at the wrench input.
+    """
     numbers = scenario.master.device(0.0, 0.0).numbers
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     limits = np.array([numbers[PEAK_FORCE], numbers[PEAK_TORQUE].max()])

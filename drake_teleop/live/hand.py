@@ -58,11 +58,7 @@ _INTENTION_SIZE = 16  # X_BE (7,), [v; omega] (6,), and the acceleration of E (3
 
 @njit(cache=True)
 def _intention_into(path, time, pose, out):
-    """Write the intended pose X_BE (7,), twist [v; omega] (6,) and acceleration (3,).
-
-    (d/dt + w)^3 x = 0 and (d/dt + w)^2 r = 0 have closed solutions, independent of the slices. A
-    released hand intends the present `pose` (7,).
-    """
+    """Write X_BE (7,), twist (6,), acceleration (3,): (d/dt + w)^3 x = 0, (d/dt + w)^2 r = 0."""
     if path[_HELD] < 0.5:
         out[:7] = pose
         out[7:] = 0.0
@@ -104,7 +100,6 @@ def _intention_into(path, time, pose, out):
 
 @njit(cache=True)
 def _rotation_vector_rate(r, omega):
-    """Return the rate of a rotation vector r [rad] at angular velocity omega [rad/s]."""
     square = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     c = 1.0 / 12.0 + square / 720.0
     if square > 1e-4:
@@ -116,7 +111,6 @@ def _rotation_vector_rate(r, omega):
 
 @njit(cache=True)
 def _path_into(path, time, now, target, poles):
-    """Write the path from the intention `now` (16,) to the pose `target` (7,)."""
     path[_HELD], path[_START_TIME], path[_POLES] = 1.0, time, poles
     put(path, _TARGET, target, 0, 7)
     rotation = logarithm(multiply(now, conjugate(target)))
@@ -129,7 +123,6 @@ def _path_into(path, time, now, target, poles):
 
 @njit(cache=True, borrows=True)
 def _wrench_into(path, time, impedance, mass, pose, twist, intention, wrench):
-    """Write the hand's wrench (6,); an extra spring force accelerates the hand's mass [kg]."""
     _intention_into(path, time, pose, intention)
     for k in range(3):
         intention[4 + k] += mass / impedance[0] * intention[13 + k]
@@ -163,7 +156,7 @@ class LiveHand(Operator):
         return {self.all_parameters_ticket(), self._pose.ticket()}
 
     def SetTarget(self, context: Context, target: Array | None) -> None:
-        """Start a path to the pose `target` (7,) X_BE; None releases the stylus."""
+        """Start a smooth path to the pose `target` (7,) X_BE; None releases the stylus."""
         path = np.zeros(_PATH)
         if target is not None:
             _path_into(
@@ -176,7 +169,7 @@ class LiveHand(Operator):
         context.get_mutable_numeric_parameter(self._path).SetFromVector(path)
 
     def SetImpedance(self, context: Context, before: HandImpedance, after: HandImpedance) -> None:
-        """Change the impedance; scale the intention so that the wrench has no step."""
+        """Change the hand's impedance without a step of its wrench."""
         path = context.get_mutable_numeric_parameter(self._path).CopyToVector()
         if path[_HELD] < 0.5:
             return
@@ -218,7 +211,10 @@ class LiveHand(Operator):
 
 
 def MakeLiveMasterSide(scenario: Scenario, *, cross_fade: bool = False) -> Diagram:
-    """Return `MakeMasterSide` with a `LiveHand`, optionally with a `CrossFade`."""
+    """Return `MakeMasterSide` with a `LiveHand`.
+
+    `cross_fade` adds a `CrossFade` block at the wrench input.
+    """
     builder = DiagramBuilder()
     start = np.array([1.0, 0.0, 0.0, 0.0, *scenario.master.position])
     hand = LiveHand(scenario.operator, start)

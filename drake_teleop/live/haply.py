@@ -30,7 +30,7 @@ class Message(NamedTuple):
 
 
 def read_message(text: Any) -> Message | None:
-    """Return the content of a message, None without a plausible pose. Never raises."""
+    """Return the content of a message, or None without a plausible pose. Never raises."""
     if not isinstance(text, (str, bytes)) or len(text) > _MAX_MESSAGE_BYTES:
         return None
     try:
@@ -52,7 +52,7 @@ def read_message(text: Any) -> Message | None:
 
 
 def force_message(device: str, wrench: Sequence[float]) -> str:
-    """Return the message that displays the force of a wrench [f; tau] in B."""
+    """Return the JSON message that displays the force of a wrench [f; tau] in B [N]."""
     f_x, f_y, f_z = wrench[:3]
     values = {"x": f_y, "y": -f_x, "z": f_z}
     return json.dumps(

@@ -1,7 +1,7 @@
 """Inputs of a live session as integers, so that the record is exactly the simulated input.
 
-The file `inputs.csv` has a row for each change, with its time [ms] and choices by name. The last
-row is the end. A comment contains versions on which the motion depends.
+`inputs.csv` has a row for each change: time [ms], numbers, and choices by name; the last row is the
+end. A comment contains versions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MAX_DURATION_MS = 36_000_000  # ms; ten hours, as for a scenario
 
 
 def initial_choices(scenario: Scenario) -> dict[str, int]:
-    """Return the choices that leave a scenario unchanged."""
+    """Return the choices (input -> integer) that leave a scenario unchanged."""
     return {
         "network": 0,
         "method": METHODS.index(scenario.passivity.method),
@@ -57,7 +57,7 @@ def initial_choices(scenario: Scenario) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs that a driver may change.
+    """Inputs that the driver (the page that moves the hand) may change; integers.
 
     Attributes:
         x, y, z: intended displacement of the stylus in B [10 um].
@@ -107,7 +107,7 @@ class Inputs:
         return started.changed(initial_choices(scenario))
 
     def changed(self, values: Mapping[str, Any]) -> Inputs:
-        """Return inputs with new values, clipped to `RANGES`; ignore non-finite values."""
+        """Return the inputs with new values, clipped to `RANGES`; invalid values are ignored."""
         changes = {}
         for name in values.keys() & RANGES.keys():
             value, (low, high) = values[name], RANGES[name]
@@ -122,7 +122,7 @@ class Inputs:
 
     @property
     def station(self) -> tuple[int, ...]:
-        """Inputs whose change requires another station."""
+        """Inputs whose change requires a new station."""
         line = (self.delay, self.jitter, self.loss) if NETWORKS[self.network] == "custom" else ()
         choices = (self.network, self.method, self.grip, self.object, self.detection, self.sensor)
         return (*choices, *line)
@@ -133,14 +133,17 @@ class Inputs:
         return self.station[:2] + self.station[6:]
 
     def pose(self, start: Array) -> Array | None:
-        """Return the intended pose X_BE (7,); None if released. `start`: (3,) position [m]."""
+        """Return the intended pose X_BE (7,); None if released.
+
+        `start` (3,): position of the stylus at zero displacement, in B [m].
+        """
         if not self.held:
             return None
         turn = exponential(tuple(ANGLE * r for r in (self.rx, self.ry, self.rz)))
         return np.concatenate([turn, start + LENGTH * np.array([self.x, self.y, self.z])])
 
     def holding(self, pose: Array, start: Array) -> Inputs:
-        """Return inputs that hold the stylus at the pose `pose` (7,) X_BE."""
+        """Return the inputs that hold the stylus at the pose X_BE (7,); `start`: see `pose`."""
         turn = logarithm(tuple(pose[:4]))
         places = zip(("x", "y", "z"), (pose[4:] - start) / LENGTH, strict=True)
         turns = zip(("rx", "ry", "rz"), (r / ANGLE for r in turn), strict=True)
@@ -148,7 +151,7 @@ class Inputs:
 
     @property
     def scales(self) -> dict[str, float]:
-        """Arguments of `ForceScaling.SetScales`."""
+        """Force scales as arguments of `ForceScaling.SetScales`."""
         return {
             "sigma_gripper": _SHARE_UNIT * self.sigma,
             "sigma_object": _SHARE_UNIT * self.sigma_object,
@@ -183,13 +186,13 @@ _VERSION = {"drake_teleop": __version__}
 
 
 def header(made_by: Mapping[str, str] = _VERSION) -> str:
-    """Return the file's first lines, with versions and digests by name."""
+    """Return the first lines of inputs.csv: versions and digests (`made_by`), column names."""
     comment = ", ".join(f"{name} {version}" for name, version in made_by.items())
     return f"# {comment}\n{','.join(_COLUMNS)}\n"
 
 
 def row(ms: int, inputs: Inputs) -> str:
-    """Return the line of the inputs at a time [ms]."""
+    """Return the line of inputs.csv for inputs that apply from a time [ms]."""
     values = {name: getattr(inputs, name) for name in RANGES}
     values |= {name: names[values[name]] for name, names in NAMES.items()}
     return ",".join(map(str, (ms, *values.values()))) + "\n"
@@ -199,7 +202,8 @@ def read_inputs(path: Path, made_by: Mapping[str, str] = _VERSION) -> list[tuple
     """Return the recorded changes with their times [ms]; the last one is the end.
 
     Raises:
-        DrakeTeleopError: for an invalid line; or if the drive cannot be repeated exactly.
+        DrakeTeleopError: for an invalid line, or if other versions or files prevent an exact
+            repetition.
     """
     complete = read_text(path).rpartition("\n")[0]
     lines = [line.split(",") for line in complete.split("\n")]

@@ -52,21 +52,20 @@ MAX_SLOWDOWN = 20.0
 
 
 class Live:
-    """Event handler of a live session: messages of pages and ticks of a clock.
+    """Event handler of a live session: messages of pages and ticks of a clock; times `now` in s.
 
     Attributes:
         refused: number of invalid messages.
         stopped: failure that stops the simulation, or "".
         requested_scene: scene requested by a page, or ""; the simulation waits for `change_scene`.
         scene: present scene.
-        pace: timing of the slices.
-        recorded: folders of completed drives.
+        pace: timing of the simulation slices.
+        recorded: folders of completed records.
 
     Args:
-        record: folder, or if it is not empty the next free one; None for no record.
-        show: function that returns the scene's part of a frame.
-        now: time of the clock [s].
-        link: link to a haptic device; None for a page's hand.
+        record: folder of the record; if not empty, the next free one; None: no record.
+        show: function that returns the 3D scene's part of a frame.
+        link: link to a haptic device; None: the page moves the hand.
         begin: initial inputs.
     """
 
@@ -121,7 +120,7 @@ class Live:
     def change_scene(
         self, scenario: Scenario, load: IdentifiedLoad | None, show: Show, now: float
     ) -> None:
-        """Start a new drive with the requested scene."""
+        """Complete the record and start a new session with the requested scene."""
         self._scenario, self._load, self._scene_part = scenario, load, show
         self.scene, self.requested_scene = self.requested_scene, ""
         self._restart(now)
@@ -134,12 +133,12 @@ class Live:
         self._refusal = failure
 
     def reject_scene(self, why: str, now: float) -> None:
-        """Continue the present scene, and show the reason `why`."""
+        """Continue the present scene; the page shows the reason `why`."""
         self.requested_scene, self._refusal = "", why
         self.pace.start(now)
 
     def hello(self) -> dict[str, Any]:
-        """Return the constants of the scenario for a page."""
+        """Return the scenario's constants, which a new page receives first."""
         scaling = self._scenario.kinematic_scaling
         return {
             "scenario": self._scenario.description or "a station",
@@ -155,12 +154,12 @@ class Live:
         }
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first page drives."""
+        """Add a page; the first one drives (its inputs move the hand)."""
         if self._driver is None:
             self._set_driver(client, now)
 
     def leave(self, client: int, now: float) -> None:
-        """Remove a page; the driver's hand releases the stylus."""
+        """Remove a page; if it drives, the hand releases the stylus."""
         if client == self._driver:
             self._driver, self._alone_since = None, now
             self._requested, self._rates = self._requested.changed(_RELEASED), RateInputs()
@@ -208,16 +207,16 @@ class Live:
 
     @property
     def is_idle(self) -> bool:
-        """Whether simulated time is stopped."""
+        """Whether the simulation does not advance at present."""
         return self._paused or self._asleep or bool(self.stopped or self.requested_scene)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next simulation slice or frame [s]."""
+        """Return the time until the next simulation slice or page frame [s]."""
         frame = self._frame_due - now
         return max(0.0, frame if self.is_idle else min(frame, self.pace.wait(now)))
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate at most four due slices; return a due frame, else None."""
+        """Simulate at most four due slices of time; return a frame for the pages if one is due."""
         for _ in range(_SLICES_PER_TICK):
             now = clock()
             if self.is_idle or self.pace.wait(now) > 0:
@@ -247,7 +246,6 @@ class Live:
             self.pace.start(now)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Run an action; if it fails, stop the simulation with the error in `stopped`."""
         try:
             action()
         except _FAILURES as error:
@@ -284,7 +282,7 @@ class Live:
         return self._limiter.step(wanted, free=free)
 
     def frame(self) -> dict[str, Any]:
-        """Return the values that pages show now (a frame)."""
+        """Return a frame: the values that pages show now."""
         rows = self._session.new_rows()
         if len(rows["t"]):
             self._last_frame = self._cockpit.frame(rows, self._session.inputs) | self._scene_part(
@@ -352,7 +350,6 @@ class Live:
 
 
 def _free_folder(folder: Path) -> Path:
-    """Return the folder if absent or empty, else a new DIR-2, DIR-3, ..."""
     folder = folder if folder.name.strip(".") else folder.resolve()  # "." has no name to number
     if not folder.is_dir() or not any(folder.iterdir()):
         return folder
@@ -361,9 +358,9 @@ def _free_folder(folder: Path) -> Path:
 
 
 def parse(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a page's message; None if there are none.
+    """Return the valid requests in a page's message, or None.
 
-    "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
+    Kinds: "set", "rates" (numbers by input), "pause", "slow", "scene", "reset" and "drive".
     """
     if not isinstance(text, str) or len(text) > MAX_MESSAGE_BYTES:
         return None

@@ -1,8 +1,4 @@
-"""Rate inputs of keys and sticks, and motion limits, in simulated time.
-
-Without limits, a hand in slow motion could saturate the wrist sensor, and forces would be rendered
-in free motion.
-"""
+"""Rate inputs of keys and sticks, and motion limits, in simulated time."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ _TRANSLATION_LIMITS, _ROTATION_LIMITS = (0.8, 20.0), (8.0, 250.0)
 
 
 class RateInputs:
-    """Integrator of input rates per simulated second."""
+    """Integrator of input rates (keys, sticks) per simulated second."""
 
     def __init__(self) -> None:
         self._rates: Mapping[str, float] = {}
@@ -29,7 +25,10 @@ class RateInputs:
         self._end_time = 0.0
 
     def begin(self, rates: Mapping[str, float], inputs: Inputs, now: float) -> Inputs:
-        """Return the inputs at new rates by name; rates end 1 s after their last repetition."""
+        """Set new rates by input name [input units/s]; return the inputs at this time.
+
+        Rates end 1 s of clock time after their last repetition.
+        """
         if not self._rates:
             self._at = {name: float(getattr(inputs, name)) for name in _LEAD_TIMES}
         self._rates = {name: rate for name, rate in rates.items() if rate and name in _LEAD_TIMES}
@@ -37,7 +36,7 @@ class RateInputs:
         return inputs.changed(self._at)
 
     def step(self, inputs: Inputs, slice_s: float, now: float) -> Inputs:
-        """Return the inputs of the next simulation slice."""
+        """Return the inputs of the next simulation slice of `slice_s`."""
         if not self._rates:
             return inputs
         if now > self._end_time:
@@ -51,7 +50,7 @@ class RateInputs:
 
 
 class MotionLimiter:
-    """Limiter of the target's speed, and for a device of its acceleration.
+    """Limiter of the target's speed, and for a device also of its acceleration.
 
     Args:
         slice_s: period [s].
@@ -70,7 +69,7 @@ class MotionLimiter:
             self._axes |= {name: _Axis(units * speed, change, RANGES[name]) for name in names}
 
     def step(self, inputs: Inputs, *, free: bool) -> Inputs:
-        """Return the limited inputs; with `free` the target may jump."""
+        """Return the limited inputs of the next period; `free` permits jumps of the target."""
         followed = {
             name: axis.step(getattr(inputs, name), free) for name, axis in self._axes.items()
         }

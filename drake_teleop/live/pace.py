@@ -1,4 +1,4 @@
-"""Timing of slices: simulated time follows a clock, or visibly falls behind."""
+"""Timing of simulation slices: simulated time follows a clock, or visibly falls behind."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _STATISTICS_SLICES = 400  # slices
 
 
 class Pace:
-    """Schedule of the simulation slices.
+    """Schedule of the simulation slices of `slice_s` simulated seconds; times `now` in s.
 
     Attributes:
-        slow: clock time per simulated time.
+        slow: clock time per simulated time; 1: real time.
         given_up: lost time that is not caught up [s].
     """
 
@@ -37,7 +37,7 @@ class Pace:
         return self._due - now
 
     def begin(self, now: float) -> None:
-        """Record the start of the due slice."""
+        """Record the start of the due slice at time `now`."""
         late = now - self._due
         if late > _MAX_LATENESS_S:
             self.given_up += late
@@ -62,7 +62,7 @@ class Pace:
 
 @contextmanager
 def without_garbage_collection() -> Iterator[None]:
-    """Disable the garbage collector, which takes the time of ten slices."""
+    """Disable Python's garbage collector, whose pauses would delay slices, in this context."""
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -1,6 +1,6 @@
 """3D scene of a live session for its page: the objects once, then their poses.
 
-Meshcat is closed before the server listens: malformed input from any page would end the process.
+Meshcat is closed before the server listens, because malformed input could end the process.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class PageScene:
             self._fail(error)
 
     def show(self, rows: Rows) -> dict[str, Any]:
-        """Return the scene's part of a frame, at the last row.
+        """Return the 3D scene's part of a frame, at the last row.
 
         "moves": {"poses": {path: 4x4 matrix by columns}, "sizes": {path: [x, y, z]}}.
         """
@@ -76,8 +76,6 @@ class PageScene:
 
 
 class _Moves:
-    """Recorder of poses with the interface of Meshcat."""
-
     def __init__(self) -> None:
         self._poses: dict[str, NDArray[np.float64]] = {}
         self._sizes: dict[str, list[float]] = {}

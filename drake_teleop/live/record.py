@@ -1,4 +1,4 @@
-"""Folder of a recorded drive: scenario, load, inputs and log."""
+"""Folder of a recorded live session: scenario, load, inputs and log."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEVICE = "device.txt"
 
 
 def made_by(scenario: Scenario) -> dict[str, str]:
-    """Return versions and a digest of the scenario's files, by name."""
+    """Return the versions, and a digest of the files that the scenario names."""
     digest, left = hashlib.sha256(), [dataclasses.asdict(scenario)]
     while left:
         value = left.pop()
@@ -42,10 +42,10 @@ def made_by(scenario: Scenario) -> dict[str, str]:
 
 
 class Record:
-    """Folder of a recorded drive without its log.
+    """Writer of scenario, load and inputs of a live session into a folder.
 
     Raises:
-        CannotWrite: if the folder contains a drive, or the disk is full.
+        CannotWrite: if the folder contains a record, or the disk is full.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class Record:
             raise
 
     def write(self, ms: int, inputs: Inputs) -> None:
-        """Write changed inputs at once, so that they survive a kill."""
+        """Write the inputs at a time [ms] at once, if they have changed."""
         line = row(ms, inputs)
         if line != self._last:
             self._append(line)
@@ -86,7 +86,7 @@ class Record:
             self._file.flush()
 
     def close(self, ms: int, inputs: Inputs) -> None:
-        """Write the end; remove the record if no time was simulated."""
+        """Write the end at a time [ms]; remove the record if no time was simulated."""
         if not ms:
             return self._remove()
         self.write(ms, inputs)
@@ -103,7 +103,7 @@ class Record:
 
 
 class LogBeside(LogOnDisk):
-    """Log written by a thread; only `finish` and the next part wait for the disk."""
+    """Log written by a thread; only `finish` and the next write wait for the disk."""
 
     def __init__(
         self,
@@ -130,5 +130,4 @@ class LogBeside(LogOnDisk):
 
 
 def _import_polars() -> None:
-    """Import polars on the thread, because that takes 0.1 s."""
     import polars  # noqa: F401

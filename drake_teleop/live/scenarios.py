@@ -44,7 +44,10 @@ SCENES = ("own", *_SHIPPED)
 
 
 def live_scenario(scenario: Scenario) -> Scenario:
-    """Return the scenario with intent, task and settling removed and error-controlled steps."""
+    """Return the scenario for a live session, with error-controlled steps.
+
+    Intended motion, task and settling time are removed; faults do not end it.
+    """
     return replace(
         scenario,
         operator__intent=[],
@@ -57,14 +60,14 @@ def live_scenario(scenario: Scenario) -> Scenario:
 
 
 def with_device(scenario: Scenario) -> Scenario:
-    """Return the scenario with a task-space device in place of a serial arm."""
+    """Return the scenario with a task-space device if its master is a serial arm."""
     if scenario.master.model not in (PHANTOM, LEADER):
         return scenario
     return replace(scenario, master=Master(model="haply_inverse3"))
 
 
 def scene(name: str, own: Scenario) -> Scenario:
-    """Return the scenario of a scene in `SCENES`."""
+    """Return the scenario of a scene in `SCENES`; `own` is the user's scenario."""
     if name == "own":
         return own
     scenario = LoadScenario(_SHIPPED[name])
@@ -76,7 +79,10 @@ def scene(name: str, own: Scenario) -> Scenario:
 
 
 def chosen_scenario(scenario: Scenario, load: IdentifiedLoad | None, inputs: Inputs) -> Scenario:
-    """Return the scenario with all choices; contact detection needs a noise floor."""
+    """Return the scenario with all choices of the driver.
+
+    Contact detection is on only with a noise floor and the scenario's own sensor.
+    """
     changes: dict[str, object] = {
         "passivity__method": METHODS[inputs.method],
         "operator__grip": list(GRIPS)[inputs.grip],
@@ -119,14 +125,13 @@ def _has_noise_floor(load: IdentifiedLoad | None, inputs: Inputs) -> bool:
 
 
 def _object_phi(scenario: Scenario) -> Array:
-    """Return the load parameters (10,) of the object, about So in S."""
     payload = NominalSlave(scenario.slave).arm.phi_load
     empty = replace(scenario, slave__payload=Payload(mass=0.0))
     return payload - NominalSlave(empty.slave).arm.phi_load
 
 
 def adapted_estimate(before: Scenario, load: IdentifiedLoad | None, now: Scenario) -> Array | None:
-    """Return the load estimate (16,) adapted to load and sensor offsets of the scenario `now`."""
+    """Return the load estimate (16,) of `before`, adapted to load and sensor offsets of `now`."""
     if load is None:
         return None
     estimate = load.estimate.copy()
@@ -142,7 +147,7 @@ def _sensor_offset(scenario: Scenario) -> Array:
 
 
 def fill_time(scenario: Scenario) -> float:
-    """Return the time until a new channel's packets arrive, also the most delayed [s]."""
+    """Return the time until all packets of a new channel arrive, also the most delayed ones [s]."""
     if scenario.is_direct:
         return 0.0
     return sum(longest_delay(line) for line in scenario.channel.lines()) + RESUME_TIME

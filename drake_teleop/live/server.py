@@ -1,6 +1,7 @@
 """Server of `drake-teleop drive`: one page on this machine and its websocket.
 
-One port of 127.0.0.1 serves clients with the token of the address; the websocket only this page.
+One port of 127.0.0.1 serves only clients with the token in the page's address; the websocket
+accepts only this page.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ class LiveDrive:
 
     Attributes:
         url: address of the page, with its token.
-        recorded: folders of completed drives.
+        recorded: folders of completed records.
         ended: after the end, the failure that stopped the simulation, or "".
         ms: after the end, simulated time [ms].
     """
@@ -129,7 +130,7 @@ class LiveDrive:
         self._check()
 
     def until_signal(self) -> str:
-        """Wait for Ctrl-C or SIGTERM and return its name.
+        """Wait for Ctrl-C or SIGTERM and return its name; "stop" after `stop`.
 
         Raises:
             DrakeTeleopError: if the record is incomplete.
@@ -240,7 +241,6 @@ class LiveDrive:
                 await self._sleep()
 
     async def _sleep(self) -> None:
-        """Wait until the next slice or frame, then handle messages."""
         rest = self._live.wait(time.perf_counter()) - 1e-3
         if rest > 0:
             await asyncio.sleep(rest)
@@ -290,7 +290,6 @@ class LiveDrive:
         return resources.files("drake_teleop.live").joinpath("page.html").read_text("utf-8")
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Serve a file or open the websocket, only for clients with the token."""
         host = f"{_HOST}:{self._port}"
         path, _, query = request.path.partition("?")
         token = parse_qs(query).get("token", [""])[0].encode(errors="replace")
@@ -344,7 +343,6 @@ class LiveDrive:
 
 
 def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | None:
-    """Return the identified load with its noise floor, None if it is estimated online."""
     if scenario.load_estimator.enabled:
         return None
     detection = scenario.contact_detection or ContactDetectionConfig()
@@ -352,7 +350,7 @@ def _load_of(scenario: Scenario, progress: bool | Stage) -> IdentifiedLoad | Non
 
 
 def warm_up(scenario: Scenario, load: IdentifiedLoad | None, device: bool) -> None:
-    """Compile the functions of the first slices, which takes a minute once."""
+    """Compile the functions of the first simulation slices, which takes a minute once."""
     session, cockpit = Session(scenario, load, device=device), Cockpit(scenario)
     for z in (-1, -2):  # numba compiles one and several rows separately
         cockpit.frame(session.new_rows(), session.inputs)
@@ -384,15 +382,15 @@ def drive(
     browser: bool = False,
     device: str | None = None,
 ) -> LiveDrive:
-    """Drive a station in the browser: move its hand by mouse, keys, gamepad or touch.
+    """Start a live session: the user moves the station's hand in the browser.
 
-    `wait()` returns at the end of the session, `stop()` ends it. A notebook shows the page as the
-    value of this call; elsewhere open its `url`.
+    `wait()` of the result returns at the end of the session, `stop()` ends it. A notebook displays
+    the page; elsewhere open its `url`.
 
     Args:
         scenario: scenario, shipped name, or YAML file; its operator specifies only the grip.
-        record: folder for `run --inputs`; None for no record.
-        port: TCP port of the page on 127.0.0.1; 0 for any free port.
+        record: folder for `run --inputs`; None: no record.
+        port: TCP port of the page on 127.0.0.1; 0: any free port.
         browser: whether to open the page.
         device: haptic device: udp://127.0.0.1:PORT of a client, or haply://localhost:10001.
 
@@ -427,7 +425,7 @@ def drive_command(
 
 
 def start_condition(device: str | None) -> str:
-    """Return the event for which the simulation waits, in words."""
+    """Return as text the event for which the simulation waits."""
     return "the simulation waits until this page is open" + _OR_DEVICE[device is not None]
 
 

@@ -1,6 +1,6 @@
 """Station that is simulated in slices of time and takes its inputs between them.
 
-The motion depends on the inputs alone: `Drive.repeat` gives the same log for any slices.
+The motion depends on the inputs alone, not on the slices.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ _NO_EVENT = EventStatus.DidNothing()
 
 
 def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
-    """Bound the steps of error control by `shortest` [s]; keep this step 4 ms after a rejection.
+    """Limit the integrator's steps of error control to at least `shortest` [s].
 
-    A bouncing tool makes error control reject two of five steps, which takes time.
+    After a rejected step the step size is `shortest` for 4 ms.
     """
     integrator = simulator.get_mutable_integrator()
     longest = integrator.get_maximum_step_size()
@@ -81,7 +81,7 @@ def take_short_steps_in_contact(simulator: Simulator, shortest: float) -> None:
 
 
 def with_all_signals(log: SimulationResult) -> SimulationResult:
-    """Return a log that has the signals of channel and contact detection."""
+    """Return the log, with missing signals of channel and contact detection added."""
     n = len(log.t)
     missing = {"pose_received": log["pose_command"], "ports": np.zeros((n, 8))}
     missing |= dict.fromkeys(("contact", "contact_at_hand"), np.zeros((n, 1)))
@@ -93,14 +93,6 @@ def with_all_signals(log: SimulationResult) -> SimulationResult:
 
 
 class _Station:
-    """Running station.
-
-    Args:
-        estimate: load estimate (16,).
-        load: identified load with the noise floor.
-        number: number of the station in the session; it is added to the seed.
-    """
-
     def __init__(
         self,
         scenario: Scenario,
@@ -173,7 +165,7 @@ class _Station:
 
 
 class Session:
-    """Running station with a hand that follows inputs.
+    """Simulated station whose hand follows inputs.
 
     Attributes:
         scenario: initial scenario.
@@ -184,7 +176,7 @@ class Session:
         load: identified load; None if it is estimated online.
         log: folder of the log; None keeps rows in memory until `new_rows` returns them.
         record: folder of scenario, load and inputs; None for none.
-        device: whether the positions are those of a haptic device.
+        device: whether the inputs are the positions of a haptic device.
     """
 
     def __init__(
@@ -212,7 +204,7 @@ class Session:
         self._station.simulator.Initialize()
 
     def apply(self, inputs: Inputs) -> None:
-        """Set and record the inputs from now on.
+        """Set and record the inputs from now on; a changed choice replaces the station.
 
         Raises:
             DrakeTeleopError: if no such station is possible; then nothing has changed.
@@ -273,7 +265,7 @@ class Session:
         advance(self._station.simulator, 1e-3 * ms)
 
     def new_rows(self) -> dict[str, NDArray[np.float64]]:
-        """Return the rows since the last call: (n, k) by signal, and "t" (n,) [s].
+        """Return the log's rows since the last call: signal -> (n, k), and "t" (n,) [s].
 
         Call it at least once a second: `advance` discards older rows.
         """
@@ -289,7 +281,7 @@ class Session:
         return rows
 
     def contact_force(self) -> float:
-        """Return the last contact force at the hand [N]; 0 if unknown."""
+        """Return the last contact force at the hand's scale [N]; 0 if unknown."""
         part, sink = self._station.columns.get("contact_wrench_S"), self._station.sink
         if part is None or not sink.num_samples():
             return 0.0
@@ -297,7 +289,7 @@ class Session:
         return self.inputs.scales["force_scale"] * math.sqrt(float(force @ force))
 
     def inputs_at_stylus(self) -> Inputs:
-        """Return inputs of a hand that takes the stylus at its present pose."""
+        """Return the inputs of a hand that takes the stylus at its present pose."""
         return self.inputs.holding(self._station.value("pose_master"), self._start)
 
     def force(self) -> NDArray[np.float64]:
@@ -305,14 +297,14 @@ class Session:
         return self._station.value("force_to_master")
 
     def removed_force(self) -> float:
-        """Return the force that the limit after a channel change removes [N]."""
+        """Return the force [N] that is not rendered because of the limit after a channel change."""
         if self._station_count == 1:
             return 0.0
         cross_fade, context = self._station.block("cross_fade")
         return float(cross_fade.removed_force(context))
 
     def flush(self) -> None:
-        """Write all rows and inputs until now."""
+        """Write all rows and inputs until now to the disk."""
         if self._record is not None:
             self._record.write(self.ms, self.inputs)
         if self._on_disk is not None:
@@ -330,7 +322,7 @@ class Session:
         return SimulationResult(t, values, parts[0].specs)
 
     def close(self) -> None:
-        """End the record; remove the record if no time was simulated."""
+        """Complete the record; remove it if no time was simulated."""
         record, self._record = self._record, None
         try:
             if record is not None:
@@ -342,7 +334,7 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Recorded drive.
+    """Recorded live session.
 
     Attributes:
         changes: changed inputs with their times [ms]; the last is the end.
@@ -358,7 +350,7 @@ class Drive:
     def repeat(
         self, progress: Progress, log: Path | None = None, slice_ms: int = SLICE_MS
     ) -> SimulationResult:
-        """Simulate the drive again and return its log, equal bit by bit.
+        """Simulate the session again and return its log, equal bit by bit.
 
         Args:
             log: folder of the log; None for memory.
@@ -376,7 +368,7 @@ class Drive:
 
 
 def read_drive(folder: str | Path) -> Drive:
-    """Return the recorded drive in a folder.
+    """Return the recorded live session in a folder.
 
     Raises:
         DrakeTeleopError: for an invalid file.

@@ -33,10 +33,10 @@ _BLOCKS_WITH_PARAMETERS = ("live_hand", "force_scaling", "channel")
 def copy_state(
     before: Diagram, then: Context, station: Diagram, context: Context, excluded: set[str]
 ) -> None:
-    """Copy states and changeable parameters of the station `before` to `station`.
+    """Copy time, states and changeable parameters of the station `before` to `station`.
 
     Args:
-        then, context: contexts of the two stations.
+        then, context: contexts of `before` and of `station`.
         excluded: names of blocks that are not copied.
     """
     context.SetTime(then.get_time())
@@ -84,14 +84,12 @@ def _copy(source: Context, target: Context, with_parameters: bool) -> None:
 
 @njit(cache=True)
 def _weight(change, time):
-    """Return the weight of the new wrench in a cross-fade, 0 to 1."""
     u = min(max((time - change[0]) / change[1], 0.0), 1.0)
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
 @njit(cache=True)
 def _cross_fade_into(wrench, before, share, most, out):
-    """Write the cross-faded wrench (6,), with a force of at most `most` [N]."""
     for i in range(6):
         out[i] = share * wrench[i] + (1.0 - share) * before[i] if share < 1.0 else wrench[i]
     force = _force(out)
@@ -139,7 +137,7 @@ class CrossFade(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def Begin(self, context: Context, start: float, length: float, rendered: Array) -> None:
-        """Cross-fade from the wrench `rendered` (6,) within `length` [s] from `start` [s]."""
+        """Cross-fade from the wrench `rendered` (6,) within `length` [s] from time `start` [s]."""
         change = np.concatenate([[start, length], rendered])
         context.get_mutable_numeric_parameter(self._change).SetFromVector(change)
         context.get_mutable_discrete_state(self._state)[0] = 0.0
@@ -149,7 +147,7 @@ class CrossFade(LeafSystem):
         context.get_mutable_discrete_state(self._state)[1] = most
 
     def removed_force(self, context: Context) -> float:
-        """Return the force that the limit removes [N]."""
+        """Return by how much the limit reduces the force [N]."""
         share, most = context.get_discrete_state(self._state).value()
         return max(_force(self._wrench.Eval(context)) - most, 0.0) if share == 1.0 else 0.0
 

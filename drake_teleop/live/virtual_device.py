@@ -14,7 +14,7 @@ _STEPS_PER_MS = 10  # per ms
 
 
 class VirtualDevice:
-    """Simulated light device of given mass [kg] and damping [N s/m] in a moving hand.
+    """Simulated device of given mass [kg] and damping [N s/m] in a moving hand.
 
     Attributes:
         position: device position [m].
@@ -40,7 +40,7 @@ class VirtualDevice:
         self.energy, self._t = 0.0, 0.0
 
     def move(self, force: Sequence[float], seconds: float) -> None:
-        """Simulate `seconds` under a constant force on the hand [N]."""
+        """Simulate `seconds` under a constant force (3,) on the hand [N]."""
         steps = max(math.ceil(seconds * 1e3 * _STEPS_PER_MS - 1e-9), 1)
         h = seconds / steps
         for _ in range(steps):
@@ -57,7 +57,10 @@ class VirtualDevice:
 def tapping(
     depth: float, *, hertz: float = 0.5, lift: float = 0.01, hold: float = 0.6
 ) -> Callable[[float], tuple[Sequence[float], Sequence[float]]]:
-    """Return a hand motion from `lift` to -`depth` [m] and back; `hold`: share of time below."""
+    """Return a hand motion along z from `lift` to -`depth` [m] and back, `hertz` times a second.
+
+    `hold`: share of the period at the lower end.
+    """
 
     def hand(t: float) -> tuple[Sequence[float], Sequence[float]]:
         phase, way = (t * hertz) % 1.0, 0.5 * (1.0 - hold)

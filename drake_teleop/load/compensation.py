@@ -1,10 +1,10 @@
-"""Elimination and scaling of the non-contact wrench in S about So, Eqs. (12)-(14) and (T7).
+"""Removal or scaling of the load's weight and inertia in a measured wrench, Eqs. (12)-(14), (T7).
 
     F_c = F - F_o - V phi                                          (13)
     F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
 
-F is the measured wrench, F_o the offsets. sigma scales weight and inertia of the load, 0
-eliminates them; gamma scales the contact wrench F_c.
+F is the measured wrench, F_o the sensor offsets, V phi the wrench of weight and inertia. Wrenches
+act on the load, about the sensor origin So, in S.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def scaled_wrench_into(
     gamma,
     out,
 ):
-    """Write the scaled wrench F' of Eq. (T7) into out (6,), with one evaluation of V phi.
+    """Write F' (6,) of `scaled_wrench` into out, for one sample.
 
-    For sigma = gamma the result does not depend on errors of the load's parameters.
+    For sigma = gamma the result does not depend on errors of the load parameters.
     """
     a, b = sigma_gripper - gamma, sigma_object - gamma
     phi = (
@@ -82,12 +82,13 @@ def contact_wrench(
     alpha: ArrayLike,
     phi: ArrayLike,
 ) -> Array:
-    """Return the contact wrench F_c (..., 6) of Eq. (13) [N, N m].
+    """Return the contact wrench F_c = F - F_o - V phi (..., 6) of Eq. (13) [N, N m].
 
     Args:
-        wrench: (..., 6) measured wrench, sign of Eq. (1).
-        offsets: (6,) or (..., 6) offsets of the sensor.
-        s, omega, alpha: (..., 3) motion, as for `regressor`.
+        wrench: (..., 6) measured wrench F on the load, Eq. (1).
+        offsets: (6,) or (..., 6) sensor offsets F_o.
+        s, omega, alpha: (..., 3) specific force a - g, angular velocity and acceleration of S, in S
+            [SI].
         phi: (10,) load about So in S.
     """
     return scaled_wrench(
@@ -117,15 +118,17 @@ def scaled_wrench(
     sigma_object: float,
     gamma: float,
 ) -> Array:
-    """Return the scaled wrench F' (..., 6) of Eq. (T7) [N, N m].
+    """Return F' = gamma F_c + V (sigma_gripper phi_gripper + sigma_object phi_object) (..., 6).
+
+    F_c is the contact wrench, V phi that of weight and inertia, Eq. (T7) [N, N m].
 
     Args:
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
-        phi_gripper, phi_object: (10,) parts of the load; zeros for a missing part.
-        sigma_gripper, sigma_object, gamma: scales >= 0 of gripper, object and contact wrench.
+        phi_gripper, phi_object: (10,) loads about So in S; zeros for a missing part.
+        sigma_gripper, sigma_object, gamma: scales >= 0.
 
     Raises:
-        DrakeTeleopError: for a negative factor.
+        DrakeTeleopError: for a negative scale.
     """
     scales = [
         _scale("sigma_gripper", sigma_gripper),
@@ -142,7 +145,9 @@ def scaled_wrench(
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:
-    """Return the scales sigma_gripper, sigma_object, gamma = 0, eta, 1, equivalent to Eq. (14).
+    """Return sigma_gripper, sigma_object, gamma = 0, eta, 1 for `scaled_wrench`, Eq. (14).
+
+    They remove the gripper and keep the share eta of the object.
 
     Raises:
         DrakeTeleopError: if eta is outside [0, 1].

@@ -1,7 +1,6 @@
-"""Identified load: values, covariance, verdicts, identification.json, and gripped objects.
+"""Identified load of a sensor, and the load of a gripped object as a difference.
 
-Parameters in directions without excitation are undetermined: variance inf. A parameter is
-identified if its standard deviation is at most 5 % of `natural_scale`, and "weakly" up to 50 %.
+Parameters without excitation are undetermined: variance inf.
 """
 
 from __future__ import annotations
@@ -40,25 +39,20 @@ _OPTIONAL_FIELDS = {"weight_removed", "degrees_of_freedom", "prior_dominated", "
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification:
-    """Identified load, as stored in identification.json.
+    """Load and sensor offsets with their uncertainty, as in identification.json.
 
     Attributes:
-        phi: (10,) load about So in S [kg, kg m, kg m^2].
-        offsets: (6,) offsets of the sensor [N, N m].
-        covariance: (16, 16) of [offsets; phi], Eq. (7) [SI]. An undetermined parameter has
-            variance inf (null in the file) and covariances 0.
+        phi: (10,) load about the sensor origin So in S [kg, kg m, kg m^2].
+        offsets: (6,) sensor offsets [N, N m].
+        covariance: (16, 16) of [offsets; phi] [SI]; undetermined: variance inf (null in the file).
         identifiable: (16,) True for identified parameters.
-        condition_number: of [E V] of Eq. (8), rows weighted by the noise and columns scaled to
-            unit norm, over the determined directions.
-        delay_s: delay of the motion relative to the wrench [s].
+        condition_number: of the scaled matrix [E V] of Eq. (8), over determined directions.
+        delay_s: delay of the motion behind the wrench [s].
         residual_rms: (6,) RMS residual of the wrench channels [N, N m].
         method: name of the estimator.
-        samples: number of samples.
-        weight_removed: whether the robot had removed the load's weight from the wrench.
+        weight_removed: True if the robot had removed the load's weight from the wrench.
         degrees_of_freedom: (16,) of the variances; inf (null) for specified noise.
-        prior_dominated: (16,) booleans, see `uncertainty.prior_dominated`.
-
-    The last three are optional in the file.
+        prior_dominated: (16,) True if the value is mostly that of the prior.
     """
 
     phi: Array
@@ -80,7 +74,7 @@ class Identification:
 
     @property
     def mass(self) -> float:
-        """Mass [kg]; negative for a wrench of opposite sign."""
+        """Mass [kg]; negative if the wrench has the opposite sign."""
         return float(self.phi[0])
 
     @property
@@ -90,12 +84,12 @@ class Identification:
 
     @property
     def inertia_com(self) -> Array:
-        """Inertia (3, 3) about the centre of mass, axes of S [kg m^2]."""
+        """Inertia (3, 3) about the centre of mass, in the axes of S [kg m^2]."""
         return mass_com_inertia(self.phi)[2]
 
     @property
     def physically_consistent(self) -> bool:
-        """Whether a body with these parameters exists, Eq. (T1)."""
+        """Whether a rigid body can have these parameters, Eq. (T1)."""
         return is_physically_consistent(self.phi)
 
     @property
@@ -105,9 +99,10 @@ class Identification:
 
     @property
     def verdicts(self) -> tuple[str, ...]:
-        """Verdicts (16,) on [offsets; phi], each one of `VERDICTS`.
+        """Verdicts (16,) on [offsets; phi]: "identified", "weakly", "not" or "prior".
 
-        "prior" marks a value that is mostly the prior's, "weakly" 5 % to 50 % of `natural_scale`.
+        "identified": standard deviation up to 5 % of `natural_scale`; "weakly": up to 50 %;
+        "prior": the value is mostly that of the prior.
         """
         share = self.standard_deviations / natural_scale(self.phi)
         rest = np.where(self.prior_dominated, "prior", np.where(share <= _WEAK, "weakly", "not"))
@@ -137,7 +132,7 @@ class Identification:
         """Write identification.json.
 
         Raises:
-            DrakeTeleopError: if a figure is not finite or the file cannot be written.
+            DrakeTeleopError: if a number is not finite or the file cannot be written.
         """
         for name, shape in (("condition_number", ()), ("delay_s", ()), ("residual_rms", (6,))):
             checked(f"{path}:{name}", getattr(self, name), *shape)
@@ -169,7 +164,7 @@ class Identification:
         """Read identification.json.
 
         Raises:
-            DrakeTeleopError: with file and field, if content is missing, unknown, malformed or
+            DrakeTeleopError: naming file and field, if a field is missing, unknown or malformed, or
                 contradicts phi.
         """
         expect((str, Path), path, "load")
@@ -249,7 +244,10 @@ def _numbers(values: Sequence[float] | Array, deviations: Array | None = None) -
 
 
 def com_deviations(phi: Array, covariance: Array) -> Array:
-    """Return (3,) standard deviations of the centre of mass [m], to first order."""
+    """Return standard deviations (3,) of the centre of mass [m] for a load phi (10,).
+
+    `covariance` (16, 16) is that of [offsets; phi].
+    """
     mass, com, _ = mass_com_inertia(phi)
     change = np.column_stack([-com, np.eye(3)]) / mass
     part = covariance[6:10, 6:10]
@@ -259,15 +257,15 @@ def com_deviations(phi: Array, covariance: Array) -> Array:
 
 
 def worth_stating(standard_deviations: Array, phi: Array) -> NDArray[np.bool_]:
-    """Return (16,) booleans: standard deviation at most 5 % of `natural_scale`."""
+    """Return (16,) True where a standard deviation is at most 5 % of `natural_scale`."""
     return standard_deviations <= WORTH_STATING * natural_scale(phi)
 
 
 def natural_scale(phi: Array) -> Array:
-    """Return the natural scale (16,) of [offsets; phi] for mass m and size L = max(|c|, 3 cm).
+    """Return the typical size (16,) of each of [offsets; phi], to judge its standard deviation.
 
-    m g and m g L for offsets, m, m L, and m L^2 / 3 for the inertia, as of a rod from So to 2 c
-    about its centre. The mass must not be zero.
+    For mass m and size L = max(|c|, 3 cm) they are m g, m g L, m, m L and m L^2 / 3. The mass must
+    not be zero.
     """
     m = abs(phi[0])
     L = max(float(np.linalg.norm(phi[1:4])) / m, _MIN_SIZE_M)
@@ -289,7 +287,6 @@ def _read_json(path: str | Path) -> dict[str, Any]:
 
 
 def _only_numbers(value: Any) -> bool:
-    """Return whether JSON data contains numbers only, not "1" or true."""
     if isinstance(value, list):
         return all(map(_only_numbers, value))
     return isinstance(value, (int, float)) and not isinstance(value, bool)
@@ -336,13 +333,13 @@ _IS_PHI = np.arange(16) >= 6
 
 
 def identified_object(total: Identification, gripper: Identification) -> Identification:
-    """Return the object's identification: gripper with object minus gripper alone.
+    """Return the object's load: that of gripper with object (`total`) minus that of `gripper`.
 
-    Covariances of phi add. All fields that do not concern phi are those of `total`.
+    Covariances of phi add. Other fields are those of `total`.
 
     Raises:
-        DrakeTeleopError: if the object's mass is zero, or negative by more than `SIGNIFICANT`
-            standard deviations.
+        DrakeTeleopError: if the object's mass is zero, or negative by more than 3 standard
+            deviations.
     """
     phi: Array = total.phi - gripper.phi
     covariance = total.covariance.copy()
@@ -380,10 +377,10 @@ def _degrees_of_freedom(total: Identification, gripper: Identification) -> Array
 
 
 def consistency_margin(load: Identification) -> tuple[float, float]:
-    """Return the smallest eigenvalue of the pseudo-inertia and its standard deviation, Eq. (T9).
+    """Return the smallest eigenvalue of the normalised pseudo-inertia, and its deviation, Eq. (T9).
 
-    In units of mass and radius of gyration about So; positive for a consistent load. The standard
-    deviation is inf if phi is not fully determined.
+    It is positive for a load that a rigid body can have. The deviation is inf for undetermined
+    loads.
     """
     J = pseudo_inertia(load.phi)
     mass, spread = abs(J[3, 3]), abs(float(np.trace(J[:3, :3])))

@@ -1,7 +1,7 @@
 """Inertial parameters phi of a rigid load: conversions, frames and physical consistency.
 
-phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], about the frame's
-origin, with centre of mass c. Parameters of parts add. Pseudo-inertia: Wensing, Kim, Slotine 2018.
+phi = [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz], Eq. (6) [kg, kg m, kg m^2], with mass m, centre of
+mass c, and inertia about the frame's origin. Pseudo-inertia: Wensing, Kim, Slotine, RA-L 2018.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _point_inertia(about: Array, mass: float) -> Array:
 
 
 def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: ArrayLike) -> Array:
-    """Return the load phi (10,) about So in S.
+    """Return the load phi (10,) about the sensor origin So, in S.
 
     Args:
         mass: [kg].
@@ -45,7 +45,7 @@ def phi_from_mass_com_inertia(mass: float, p_SoBcm_S: ArrayLike, I_BBcm_S: Array
 def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
     """Return mass [kg], centre of mass p_SoBcm_S (3,) [m] and inertia I_BBcm_S (3, 3) [kg m^2].
 
-    The mass may be negative.
+    The inertia is about the centre of mass. The mass may be negative.
 
     Raises:
         DrakeTeleopError: if the mass is zero.
@@ -59,13 +59,16 @@ def mass_com_inertia(phi: ArrayLike) -> tuple[float, Array, Array]:
 
 
 def inertia_about_origin(phi: ArrayLike) -> Array:
-    """Return the inertia tensor (3, 3) of Eq. (3) about So in S [kg m^2]."""
+    """Return the inertia tensor (3, 3) of phi about So in S [kg m^2], Eq. (3)."""
     xx, xy, xz, yy, yz, zz = checked("phi", phi, 10)[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pseudo_inertia(phi: ArrayLike) -> Array:
-    """Return the pseudo-inertia J (4, 4) of Eq. (T1) [kg m^2, kg m, kg]."""
+    """Return the pseudo-inertia J = [Sigma, m c; m c^T, m] (4, 4) of phi, Eq. (T1).
+
+    Sigma (3, 3) is the second moment of mass about So, tr(I) / 2 E - I [kg m^2].
+    """
     phi = checked("phi", phi, 10)
     I = inertia_about_origin(phi)  # noqa: E741
     J = np.empty((4, 4))
@@ -76,7 +79,7 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
 
 
 def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
-    """Return the load phi (10,), the inverse of `pseudo_inertia`.
+    """Return the load phi (10,) with this pseudo-inertia J (4, 4).
 
     Raises:
         DrakeTeleopError: if J is not symmetric.
@@ -90,13 +93,13 @@ def phi_from_pseudo_inertia(J: ArrayLike) -> Array:
 
 
 def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
-    """Return whether a body with these parameters exists, Eq. (T1).
+    """Return whether a rigid body can have the parameters phi (10,), Eq. (T1).
 
     Points, rods, plates and phi = 0 are consistent.
 
     Args:
-        phi: (10,) load.
-        tolerance: accepted negative eigenvalue of J, in units of m and sqrt(tr(Sigma) / m).
+        tolerance: accepted negative eigenvalue of the pseudo-inertia, normalised by mass and radius
+            of gyration.
     """
     J = pseudo_inertia(phi)
     if not J.any():
@@ -112,7 +115,7 @@ def is_physically_consistent(phi: ArrayLike, tolerance: float = 0.0) -> bool:
 
 
 def transform_phi(phi_B: ArrayLike, R_AB: ArrayLike, p_AoBo_A: ArrayLike) -> Array:
-    """Return the parameters (10,) of a load about Ao in A, from those about Bo in B, Eq. (T2).
+    """Return the load (10,) about Ao in frame A, given that about Bo in frame B, Eq. (T2).
 
     Args:
         phi_B: (10,) load about Bo in B.

@@ -1,9 +1,7 @@
-"""Load and sensor offsets of a record by batch least squares, Eqs. (7)-(8), (T3) and (T16).
+"""Load and sensor offsets by batch least squares, Eqs. (7)-(8), (T3) and (T16).
 
-Scaled Gram eigenvalues below 1e-12 of the largest count as zero: the solution has minimum norm
-in these directions, and affected parameters are undetermined. The covariance uses long-run
-variances from sums over blocks; for poses at rest, one variance for forces and one for torques.
-Derivation: docs/theory.md, "Details of the estimators".
+In directions without excitation the solution has minimum norm, and affected parameters are
+undetermined. Theory: docs/theory.md, "Details of the estimators".
 """
 
 from __future__ import annotations
@@ -37,12 +35,13 @@ _WRENCH, _MODEL = 1, np.array([0, *range(2, 12)])
 
 
 class NormalEquations:
-    """Sums of a record, in the order of time, that determine the load.
+    """Least squares sums of a record, from which load and sensor offsets are solved.
+
+    Samples are added in the order of time, because their noise may be correlated.
 
     Args:
-        noise: (6,) standard deviations of the wrench channels [N, N m], for the weights; None
-            gives every row the same weight.
-        resolution: (2,) quantisation step of forces and torques [N, N m] for poses at rest.
+        noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
+        resolution: (2,) quantisation step of forces and torques [N, N m], only for poses at rest.
     """
 
     def __init__(
@@ -62,12 +61,12 @@ class NormalEquations:
         return int(self._moments[0, 0, 0])
 
     def add(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Add samples as for `identify`, (N, 6) and (N, 3), or one sample, (6,) and (3,)."""
+        """Add N samples with arguments as for `identify`, or a single one, (6,) and (3,)."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         _accumulate(*rows, self._moments, self._blocks, self._state)
 
     def solve(self, delay_s: float = 0.0) -> Identification:
-        """Return the least squares solution, in which the given `delay_s` [s] is stored.
+        """Return the least squares solution; `delay_s` [s] is only stored in it.
 
         Raises:
             DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
@@ -102,15 +101,14 @@ class NormalEquations:
         )
 
     def covariance(self) -> Array:
-        """Return the covariance C (16, 16) of the minimum-norm solution, without infinite entries.
+        """Return the finite covariance C (16, 16) of the minimum-norm solution [offsets; phi].
 
-        c^T C c is the variance of a determined combination c.
+        c^T C c is the variance of a determined combination c (16,) of parameters.
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._covariance(inverse @ self.normal_equations()[1], inverse)[0]
 
     def _covariance(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
-        """Return the finite covariance (16, 16) and the variances' degrees of freedom (16,)."""
         variances, degrees, _ = self._long_run_variances(theta, inverse)
         # Contribution of each channel to the covariance, and Satterthwaite's degrees of freedom.
         parts = self._channel_grams() * (self._weights**2 * variances)[:, None, None]
@@ -128,7 +126,10 @@ class NormalEquations:
         return _pseudo_inverse(self.normal_equations()[0], self.unexcited)
 
     def normal_equations(self, weights: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Return Gram matrix (16, 16) and right-hand side (16,) for channel weights (6,)."""
+        """Return Gram matrix (16, 16) and right-hand side (16,) of [offsets; phi].
+
+        `weights` (6,) of the channels are by default those of the noise.
+        """
         weights = self._weights if weights is None else checked("weights", weights, 6)
         gram, right = np.tensordot(weights, self._channel_grams(), 1), np.zeros(16)
         for c, weight in enumerate(weights):
@@ -149,11 +150,11 @@ class NormalEquations:
 
     @property
     def weights(self) -> Array:
-        """Weights (6,) of the squared wrench channels."""
+        """Weights (6,) of the squared residuals of the wrench channels."""
         return self._weights.copy()
 
     def residual_squares(self, theta: ArrayLike) -> Array:
-        """Return the sums (6,) of each channel's squared residuals."""
+        """Return the sums (6,) of squared residuals of the channels for theta = [offsets; phi]."""
         theta = checked("theta", theta, 16)
         squares = np.empty(6)
         for c in range(6):
@@ -162,17 +163,17 @@ class NormalEquations:
         return squares
 
     def long_run_variances(self, theta: ArrayLike) -> tuple[Array, Array]:
-        """Return long-run variances (6,) of the residuals, and their degrees of freedom (6,).
+        """Return residual variances (6,) with correlation in time, and degrees of freedom (6,).
 
-        The variances are corrected for the power that least squares removes.
+        `theta` is [offsets; phi] (16,).
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(checked("theta", theta, 16), inverse)[:2]
 
     def slow_noise(self) -> NDArray[np.bool_]:
-        """Return (6,) booleans: True where the noise is slower than the record resolves.
+        """Return (6,) True for wrench channels whose noise is slower than the record resolves.
 
-        The standard deviations are then too small.
+        Standard deviations are then too small.
         """
         inverse, _, _ = self._pseudo_inverse()
         return self._long_run_variances(inverse @ self.normal_equations()[1], inverse)[2]
@@ -229,7 +230,6 @@ class NormalEquations:
         return variances, degrees, slow & (n * of_samples > _ROUNDING_RESIDUAL**2 * wrench)
 
     def _pose_variances(self, power: Array, absorbed: Array, theta: Array) -> tuple[Array, Array]:
-        """Return the variances (6,) of poses at rest, and their degrees of freedom (6,)."""
         assert self._resolution is not None
         squares, absorbed_sums = (x.reshape(2, 3).sum(axis=1) for x in (power, absorbed))
         min_variance = np.array(self._resolution) ** 2 / 12.0
@@ -259,12 +259,6 @@ class NormalEquations:
     def _unbiased(
         self, power: Array, count: float, between: Array, grams: Array, inverse: Array
     ) -> tuple[Array, Array]:
-        """Return long-run variances v_c (6,) and degrees of freedom (6,).
-
-        Args:
-            power: (6,) residual power between `count` blocks, q_c in docs/theory.md.
-            between, grams: (6, 16, 16) H_c and G_c; inverse: (16, 16) G^+.
-        """
         w = self._weights
         absorbed = self._absorbed(between, inverse)
         spread = inverse @ grams @ inverse
@@ -287,16 +281,17 @@ def identify(
     noise: ArrayLike | None = None,
     delay_s: float = 0.0,
 ) -> Identification:
-    """Return load and offsets of a free motion by batch least squares, Eqs. (7)-(8).
+    """Return load and sensor offsets from free motion, by batch least squares, Eqs. (7)-(8).
 
     Args:
-        wrench: (N, 6) measured [f; tau], sign of Eq. (1) [N, N m].
-        s, omega, alpha: (N, 3) motion, as for `regressor`, or (3,) zeros for static poses.
-        noise: (6,) standard deviations of the wrench channels; None: unweighted.
-        delay_s: delay that was removed from the motion, stored in the result [s].
+        wrench: (N, 6) measured force and torque on the load, Eq. (1) [N, N m].
+        s, omega, alpha: (N, 3) specific force a - g, angular velocity and acceleration of S, in S
+            [SI]; (3,) zeros for omega, alpha at rest.
+        noise: (6,) standard deviations of the wrench channels [N, N m]; None: equal weights.
+        delay_s: delay [s] that was removed from the motion, only stored in the result.
 
     Raises:
-        DrakeTeleopError: as `NormalEquations.solve`.
+        DrakeTeleopError: for fewer than 3 samples or an estimated mass of exactly zero.
     """
     equations = NormalEquations(noise)
     equations.add(wrench, s, omega, alpha)
@@ -309,13 +304,9 @@ def _columns(channel: int) -> NDArray[np.int_]:
 
 @njit(cache=True)
 def _accumulate(wrench, s, omega, alpha, moments, blocks, state):
-    """Add sums of x x^T, x = [1, wrench, row of V], per channel and per block of samples.
+    """Add samples to the sums of x x^T, x = [1, wrench, row of V], per channel and per block.
 
-    Args:
-        moments: (6, 12, 12) sums of each channel, updated.
-        blocks: (n, 6, 12) first rows of each block's sums, updated; a full table is halved by
-            joining pairs.
-        state: (2,) index of the open block, samples of a full block; updated.
+    A full table of blocks is halved by joining pairs.
     """
     V, x, part = np.empty((6, 10)), np.empty(12), np.zeros((6, 12, 12))
     x[0] = 1.0
@@ -361,7 +352,6 @@ def _add_block(part, moments, block):
 def _pseudo_inverse(
     gram: Array, unexcited: NDArray[np.bool_]
 ) -> tuple[Array, NDArray[np.bool_], float]:
-    """Return a Gram matrix's pseudo-inverse, undetermined parameters (16,), condition number."""
     scale = np.where(unexcited, 0.0, 1.0 / np.sqrt(np.where(unexcited, 1.0, np.diag(gram))))
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]

@@ -1,9 +1,8 @@
-"""Non-contact wrench of a load: matrix V of Eq. (5) and Newton-Euler Eqs. (1)-(2).
+"""Wrench of a load by its motion: regressor V of Eq. (5), and Newton-Euler Eqs. (1)-(2).
 
-All vectors are in the sensor frame S about its origin So. The sensor exerts the wrench on the load;
-at rest f = -m g. Functions named `..._into` are compiled and do not check their input.
-
-A sample is one row of numbers for sensor, estimators and logs (logs use the first 15, SI at So):
+Vectors are in the sensor frame S about its origin So; the wrench acts on the load (at rest f = -m
+g). Functions `..._into` are compiled and do not check their input. A sample is one row of numbers
+(logs: the first 15):
 
     [measured wrench (6) | specific force (3) | angular velocity (3) | angular acceleration (3) |
      saturated or lost | joint positions (n) | time (output of the wrist sensor only)]
@@ -35,7 +34,7 @@ TIME = -1  #: [s], only in the output of the wrist sensor
 
 @njit(cache=True)
 def regressor_into(s, omega, alpha, V):
-    """Write the regressor V of Eq. (5) into V (6, 10); rows [f; tau], columns as phi."""
+    """Write the regressor V (6, 10) of `regressor` for one sample."""
     sx, sy, sz = s[0], s[1], s[2]
     wx, wy, wz = omega[0], omega[1], omega[2]
     ax, ay, az = alpha[0], alpha[1], alpha[2]
@@ -58,7 +57,7 @@ def regressor_into(s, omega, alpha, V):
 
 @njit(cache=True)
 def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Write the load's wrench V phi, Eqs. (1)-(2), into out (6,) without V. phi may be a tuple."""
+    """Write the wrench V phi (6,) of `non_contact_wrench` into out. phi may be a tuple."""
     s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
     m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
     force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
@@ -81,12 +80,12 @@ def _non_contact_wrenches(s, omega, alpha, phi, out):
 
 
 def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
-    """Return the regressor V (..., 6, 10) of Eq. (5), with [f; tau] = V phi.
+    """Return the regressor V (..., 6, 10), with the load's wrench [f; tau] = V phi, Eq. (5).
 
     Args:
-        s: (..., 3) specific force a - g of So in S [m/s^2].
-        omega: (..., 3) angular velocity of S in S [rad/s].
-        alpha: (..., 3) angular acceleration of S in S [rad/s^2].
+        s: (..., 3) specific force a - g of the sensor origin So, in S [m/s^2].
+        omega: (..., 3) angular velocity of S, in S [rad/s].
+        alpha: (..., 3) angular acceleration of S, in S [rad/s^2].
     """
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     V = np.empty((motion[0].shape[0], 6, 10))
@@ -95,9 +94,9 @@ def regressor(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> Array:
 
 
 def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: ArrayLike) -> Array:
-    """Return the load's wrench V phi (..., 6) of Eqs. (1)-(2) and (12) [N, N m].
+    """Return the wrench V phi (..., 6) of a load's weight and inertia [N, N m], Eqs. (1)-(2), (12).
 
-    Arguments are as for `regressor`, and phi (10,), the load about So in S.
+    It acts on the load, about So, in S. Arguments as for `regressor`; phi (10,) about So in S.
     """
     phi = checked("phi", phi, 10)
     leading, motion = checked_rows(s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
@@ -107,7 +106,7 @@ def non_contact_wrench(s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, phi: Ar
 
 
 def sample_parts(num_joints: int) -> dict[str, int]:
-    """Return a dictionary from signal name to size, for a wrist sensor's sample."""
+    """Return the signals of a wrist sensor's sample and their sizes, in order."""
     return {
         "measured_wrench_S": 6,
         "specific_force_S": 3,
@@ -119,5 +118,5 @@ def sample_parts(num_joints: int) -> dict[str, int]:
 
 
 def sample_size(num_joints: int) -> int:
-    """Return the length of a wrist sensor's sample without time."""
+    """Return the length of a wrist sensor's sample without its time."""
     return BEFORE_JOINTS + num_joints

@@ -1,4 +1,4 @@
-"""Required accuracy of a load, such as "mass 0.5 %, com 0.5 mm, inertia 5 %", and its check."""
+"""Required accuracy of a load, such as "mass 0.5 %, com 0.5 mm, inertia 5 %"."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MIN_VALUE, _MAX_VALUE = 1e-9, 10.0
 
 
 class Tolerance(NamedTuple):
-    """Largest permitted standard deviations of a load; None where no accuracy is required.
+    """Largest permitted standard deviations of a load; None for no requirement.
 
     Attributes:
         mass: relative to the mass.
@@ -42,16 +42,16 @@ class Tolerance(NamedTuple):
 
     @property
     def required(self) -> tuple[str, ...]:
-        """Names of the quantities (`QUANTITIES`) whose accuracy is required."""
+        """Names of the quantities with a requirement, out of "mass", "com", "inertia"."""
         return tuple(name for name in QUANTITIES if getattr(self, name) is not None)
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """Names (k,) of the required numbers, in the order of `errors_of`."""
+        """Names (k,) of the single required numbers, such as "com x"."""
         return tuple(entry for name in self.required for entry in ENTRIES[name])
 
     def __str__(self) -> str:
-        """Return the text that `read_tolerance` reads."""
+        """Return the tolerance as text for `read_tolerance`."""
         return ", ".join(
             f"com {1e3 * value:g} mm" if name == "com" else f"{name} {100.0 * value:g} %"
             for name, value in zip(QUANTITIES, self, strict=True)
@@ -60,10 +60,10 @@ class Tolerance(NamedTuple):
 
 
 def read_tolerance(text: str) -> Tolerance:
-    """Return the tolerance that a text such as "mass 0.5 %, com 0.5 mm" specifies.
+    """Return the tolerance of a text such as "mass 0.5 %, com 0.5 mm".
 
     Raises:
-        DrakeTeleopError: for another form or a value outside 1e-9 to 10.
+        DrakeTeleopError: for another form, or a value outside 1e-9 to 10.
     """
     found: dict[str, float] = {}
     for part in text.split(","):
@@ -109,9 +109,10 @@ def errors_of(tolerance: Tolerance, phi: Array) -> Array:
 
 
 def deviations_of(errors: Array, covariance: Array) -> Array:
-    """Return (k,) standard deviations, divided by the tolerances; inf if undetermined.
+    """Return standard deviations (k,) of the required numbers, over the tolerances.
 
-    `errors` is the result of `errors_of`.
+    They are inf if undetermined. `errors` is from `errors_of`, `covariance` (16, 16) of [offsets;
+    phi].
     """
     unknown = np.isinf(np.diag(covariance))
     finite = np.where(unknown | unknown[:, np.newaxis], 0.0, covariance)
@@ -121,14 +122,14 @@ def deviations_of(errors: Array, covariance: Array) -> Array:
 
 
 def values_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the values (k,) of the required numbers, in the units of `UNITS`."""
+    """Return the values (k,) of the required numbers of load phi (10,) [kg, mm, kg m^2]."""
     m, c, inertia = mass_com_inertia(phi)
     values = {"mass": [m], "com": 1e3 * c, "inertia": inertia[np.triu_indices(3)]}
     return np.concatenate([values[name] for name in tolerance.required])
 
 
 def sizes_of(tolerance: Tolerance, phi: Array) -> Array:
-    """Return the tolerances (k,) in the units of `UNITS`, for the load phi."""
+    """Return the tolerances (k,) of the required numbers for load phi (10,) [kg, mm, kg m^2]."""
     m, _, inertia = mass_com_inertia(phi)
     scales = {"mass": abs(m), "com": 1e3, "inertia": max(float(np.trace(inertia)) / 3.0, 0.0)}
     sizes = [scales[name] * getattr(tolerance, name) for name in tolerance.required]

@@ -1,4 +1,4 @@
-"""Excitation trajectories as Fourier series, Eqs. (9)-(10)."""
+"""Joint trajectories as Fourier series that excite the load, Eqs. (9)-(10)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _MAX_NUMBER = 1e6  # of any number in a file [rad, Hz]
 
 @dataclass(frozen=True)
 class FourierTrajectory:
-    """Periodic joint trajectory, Eqs. (9)-(10).
+    """Periodic trajectory of n joints with N harmonics, Eqs. (9)-(10).
 
     Attributes:
         q0: (n,) constant part [rad].
         rho, delta: (n, N) sine and cosine coefficients [rad].
-        frequency: base frequency f [Hz].
+        frequency: base frequency [Hz].
     """
 
     q0: Array
@@ -37,7 +37,7 @@ class FourierTrajectory:
     def at_rest(
         cls, q0: ArrayLike, sine: ArrayLike, cosine: ArrayLike, frequency: float
     ) -> FourierTrajectory:
-        """Return a trajectory that is at rest at both ends of the period, Eq. (T17).
+        """Return a trajectory without velocity and acceleration at both ends, Eq. (T17).
 
         Args:
             q0: (n,) constant part [rad]; the trajectory starts at q0 + sum(delta).
@@ -50,11 +50,11 @@ class FourierTrajectory:
 
     @property
     def period(self) -> float:
-        """Length of one period [s]."""
+        """Period [s]."""
         return 1.0 / self.frequency
 
     def evaluate(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return position, velocity and acceleration (..., n) at times t (...) [s, rad]."""
+        """Return joint position, velocity and acceleration (..., n) at times t (...) [rad, s]."""
         rate = 2 * np.pi * self.frequency * np.arange(1, self.rho.shape[1] + 1)
         phase = np.multiply.outer(np.asarray(t, float), rate)
         sine, cosine = np.sin(phase), np.cos(phase)
@@ -65,11 +65,11 @@ class FourierTrajectory:
         return q, qd, qdd
 
     def scaled(self, factor: float) -> FourierTrajectory:
-        """Return the trajectory with `factor` times the amplitude about q0."""
+        """Return the trajectory with `factor` times the amplitudes; q0 is unchanged."""
         return FourierTrajectory(self.q0, factor * self.rho, factor * self.delta, self.frequency)
 
     def save(self, path: str | Path, joint_names: tuple[str, ...]) -> None:
-        """Write the coefficients as YAML."""
+        """Write the coefficients as YAML, by joint name."""
         from drake_teleop.common.texts import yaml_text
 
         joints = {
@@ -81,10 +81,10 @@ class FourierTrajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> FourierTrajectory:
-        """Read a YAML file that `save` wrote.
+        """Read the YAML file of `save`.
 
         Raises:
-            DrakeTeleopError: with file and field, if the content is not a trajectory.
+            DrakeTeleopError: naming the file, if the content is not a trajectory.
         """
         from drake_teleop.common.texts import read_yaml
 

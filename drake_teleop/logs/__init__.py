@@ -1,1 +1,1 @@
-"""Recorded logs: identification and elimination of the load, contact detection; no Drake needed."""
+"""Recorded logs: identification and removal of the load, contact detection; no Drake needed."""

@@ -1,4 +1,4 @@
-"""Log without its delay, with the motion that best explains the wrench of an identified load."""
+"""Log whose delay is removed, with the motion that best explains the wrench of a known load."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class AlignedLog:
     """Log with motion and wrench at the same instants.
 
     Attributes:
-        log: with removed weight, its specific force is the acceleration.
-        delay_s: removed delay of the recorded motion behind the wrench [s].
-        source: of the delay: "estimated", "given", "load" or "static".
-        differentiated: the log with differentiated motion, if required.
-        edge: (N,) True for samples with measurements on one side only.
+        log: with acceleration instead of specific force if the robot had removed the weight.
+        delay_s: removed delay of the motion behind the wrench [s].
+        source: of the delay: "estimated", "given", "load" (identification file) or "static".
+        differentiated: log with motion by numerical differentiation, if required.
+        edge: (N,) True for samples near ends and gaps, whose motion is less accurate.
     """
 
     log: Log
@@ -47,13 +47,14 @@ def aligned_log(
     differentiate: bool,
     weight_removed: bool = False,
 ) -> AlignedLog:
-    """Return the log with the motion of splines, or of an IMU if the load fits better with it.
+    """Read a log and remove the delay between motion and wrench.
+
+    The motion is from splines of the poses, or from an IMU if the load then fits better.
 
     Args:
         path, cutoff_hz, delay: as in `eliminate_log`.
         phi: (10,) identified load.
         usual_s: delay for a record that does not determine it [s].
-        differentiate: True if `AlignedLog.differentiated` is required.
         weight_removed: True if the wrench does not contain the weight of the load.
 
     Raises:
@@ -91,7 +92,7 @@ def aligned_log(
 
 
 def without_orientation(where: str) -> DrakeTeleopError:
-    """Return the error for a wrench with removed weight whose log has no orientation."""
+    """Return the error for a log with removed weight and without orientation."""
     return DrakeTeleopError(
         "the robot has removed the weight of the load from the wrench, and without an orientation"
         " gravity cannot be subtracted from the measured acceleration",

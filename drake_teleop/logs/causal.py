@@ -1,8 +1,4 @@
-"""Contact wrench from past samples alone, as in a control loop.
-
-The low-pass is a Butterworth filter of second order, Eq. (T11) in docs/theory.md. Wrench and
-motion are aligned before it, so that its lag does not disturb the elimination.
-"""
+"""Contact wrench from past samples only, as in a control loop."""
 
 from __future__ import annotations
 
@@ -19,14 +15,13 @@ MODES = ("delayed", "predicted")
 
 @dataclass(frozen=True)
 class CausalWrench:
-    """Wrenches of N samples, each computed from past samples alone.
+    """Contact and scaled wrenches of N samples, each computed from past samples only.
 
-    Args:
-        mode: one of `MODES`.
+    Attributes:
+        mode: "delayed" or "predicted" (extrapolated over the lag).
         lag_s: delay of a slow contact without prediction [s].
-        contact: (N, 6) contact wrench F_c, Eq. (13).
-        scaled: (N, 6) scaled wrench gamma F_c + sigma V phi.
-        offsets: (6,) offsets of the load file or of the start of the record.
+        contact, scaled: (N, 6) contact wrench F_c, and gamma F_c + sigma V phi [N, N m].
+        offsets: (6,) sensor offsets that were subtracted [N, N m].
     """
 
     mode: str
@@ -37,16 +32,15 @@ class CausalWrench:
 
 
 def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float = 0.0) -> Array:
-    """Filter samples along the first axis, from the steady state of the first sample.
+    """Filter samples x (N, ...) by a second-order Butterworth low-pass, Eq. (T11).
 
     Args:
-        x: (N, ...) samples.
         dt: sample time [s].
         cutoff_hz: frequency of half the amplitude; no filter for None or above the Nyquist rate.
-        ahead_s: time by which the output's slope extrapolates the output [s].
+        ahead_s: time over which the output is extrapolated by its slope [s].
 
     Raises:
-        DrakeTeleopError: for a prediction without a filter.
+        DrakeTeleopError: for an extrapolation without a filter.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         if ahead_s != 0.0:
@@ -66,7 +60,7 @@ def causal_low_pass(x: Array, dt: float, cutoff_hz: float | None, ahead_s: float
 def low_pass_coefficients(
     dt: float, cutoff_hz: float, ahead_s: float = 0.0
 ) -> tuple[Array, Array, Array]:
-    """Return b (3,), a (3,) of `causal_low_pass`, and its steady state (2,) for a constant 1."""
+    """Return b (3,), a (3,) of `causal_low_pass`, and its state (2,) for a constant input 1."""
     # Imported here, because the import takes longer than the rest of the command.
     from scipy.signal import bilinear, lfilter_zi
 
@@ -76,7 +70,7 @@ def low_pass_coefficients(
 
 
 def filter_lag(dt: float, cutoff_hz: float | None) -> float:
-    """Return the delay of `causal_low_pass` at low frequencies [s]."""
+    """Return the delay of `causal_low_pass` for slow signals [s]."""
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return 0.0
     return math.sqrt(2.0) / _prewarped(cutoff_hz, dt)
@@ -85,12 +79,12 @@ def filter_lag(dt: float, cutoff_hz: float | None) -> float:
 def causal_wrenches(
     contact: Array, scaled: Array, dt: float, *, cutoff_hz: float | None, delay_s: float, mode: str
 ) -> CausalWrench:
-    """Return the output that a control loop has at each instant.
+    """Return the filtered wrenches that a control loop has at each instant.
 
     Args:
         contact, scaled: (N, 6) unfiltered wrenches, with the motion of the same instants.
         dt: sample time [s].
-        cutoff_hz: cut-off of the low-pass.
+        cutoff_hz: cut-off of the low-pass; None: no filter.
         delay_s: delay of the motion behind the wrench [s], rounded up to a full sample.
         mode: "delayed" keeps the lag, "predicted" extrapolates over it.
 

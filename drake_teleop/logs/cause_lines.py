@@ -1,6 +1,6 @@
 """Lines of a log description that correct the causes of a misfit.
 
-Each line contains the value after the correction of all causes.
+A line contains the value after the correction of all causes.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ _OTHER_REMEDIES = {
 
 
 def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cause, ...]:
-    """Return the causes with the correcting lines added to their messages.
+    """Return the causes; their messages now end in the description lines that correct them.
 
-    `by_pose`: the acceleration is from poses, not from an IMU.
+    `by_pose` is True if the acceleration is from poses, not from an IMU.
     """
     _, texts, corrected = _correct_fields(causes, log, by_pose)
     return tuple(
@@ -52,7 +52,7 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
 
 def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> str | None:
-    """Return the fields to set, as a message, if a mass is too large for a wrist sensor."""
+    """Return a message with the units to correct if a mass [kg] is above 1000 kg, or None."""
     if abs(mass) < _MAX_MASS_KG or log.described is None or log.described.wrench is None:
         return None
     fields = _correct_fields(causes, log, by_pose=True)[0]

@@ -1,9 +1,8 @@
-"""Contact detection shared by the commands `detect` and `eliminate`.
+"""Contact detection in a log, for the commands `detect` and `eliminate`.
 
-A statistic of the contact wrench, relative to its noise floor, is compared with a threshold. This
-is 1.25 times the statistic's maximum in free motion, and at least the value that normal noise
-reaches once in a million samples. Without a log of free motion, free motion is searched in the
-record itself (docs/theory.md, "On a record").
+Contact begins where a statistic of the contact wrench clearly exceeds its maximum in free motion.
+Without a log of free motion, calm parts of the record itself are used (docs/theory.md, "On a
+record").
 """
 
 from __future__ import annotations
@@ -42,7 +41,13 @@ _CONTACT_SHARE_OF_SHIFT = 0.2
 
 
 class Samples(NamedTuple):
-    """Input of the detector: contact wrench F_c (N, 6); motion s, omega, alpha, a (N, 3)."""
+    """Input of the contact detector, low-passed.
+
+    Attributes:
+        contact: (N, 6) contact wrench F_c [N, N m].
+        s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S [SI].
+        acceleration: (N, 3) acceleration without gravity [m/s^2].
+    """
 
     contact: Array
     s: Array
@@ -59,15 +64,14 @@ class Samples(NamedTuple):
 class Detection:
     """Contact in a log of N samples.
 
-    Args:
+    Attributes:
         floor: noise floor of the free motion.
-        statistic: one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
-        threshold: threshold of this statistic.
+        statistic, threshold: name of the used statistic, and its threshold.
         statistics: (N, 3) all statistics; 0 at the unjudged ends.
         touched: (N,) True for contact, with hysteresis.
         free_s: duration of the free motion [s].
         force_threshold: 1.25 times the largest |F_c| of the free motion [N].
-        notes: reasons for doubt.
+        notes: doubts about the result.
     """
 
     floor: NoiseFloor
@@ -106,19 +110,17 @@ def detect_contact(
     free: tuple[Samples, float] | None = None,
     statistic: str = "level",
 ) -> Detection | None:
-    """Find contact in a log; return None for fewer than `MIN_SAMPLES` judged samples.
-
-    Without `free`, short contacts slightly above the threshold are removed.
+    """Find contact in a log; return None for fewer than 100 judged samples.
 
     Args:
-        rows: samples of the whole log, low-passed.
+        rows: samples of the whole log.
         dt: sample time [s].
         cutoff_hz: cut-off of the low-pass; one of its periods at both ends is not judged.
         covariance: (16, 16) of [offsets; phi], from `finite_covariance`.
         usual: (6,) RMS residual of the identification [N, N m].
         edge: (N,) True for further samples that are not judged.
         free: samples of a log of free motion, and its sample time [s].
-        statistic: one of `STATISTICS`.
+        statistic: "level", "cusum" or "glr".
 
     Raises:
         DrakeTeleopError: for an unknown statistic, or too little free motion.
@@ -170,7 +172,6 @@ def _judged_samples(
 def _floor_from_record(
     rows: Samples, dt: float, hold: int, fade: float, covariance: Array, statistic: str
 ) -> tuple[NoiseFloor, float, Samples]:
-    """Return noise floor, threshold and free motion of a record that contains contacts."""
     from scipy.ndimage import maximum_filter1d
 
     n = len(rows.contact)
@@ -208,7 +209,7 @@ def _quieter_half(level: Array, block: int) -> NDArray[np.bool_]:
 
 
 def _extrapolated(values: Array, block: int, samples: int) -> float:
-    """Return the maximum of `values` in free motion, extrapolated to `samples`, Eq. (T13)."""
+    """Return the expected maximum of `values` in free motion over `samples` samples, Eq. (T13)."""
     block = min(block, len(values) // 4)
     count = len(values) // block
     largest = values[: count * block].reshape(count, block).max(axis=1)
@@ -257,9 +258,9 @@ def _detection_notes(
 
 
 def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
-    """Return a note if most of a record seems to be contact.
+    """Return a note if most of a record seems to be contact, else ().
 
-    `shift` (6,) is the difference of its offsets from those of the free motion.
+    `shift` (6,) is the difference of its offsets from those of the free motion [N, N m].
     """
     force = float(np.linalg.norm(shift[:3]))
     if force <= found.force_threshold or found.touched.mean() < _CONTACT_SHARE_OF_SHIFT:
@@ -271,8 +272,9 @@ def offset_shift_note(shift: Array, found: Detection) -> tuple[str, ...]:
 
 
 def robust_offsets(residual: Array) -> tuple[Array, float]:
-    """Return the offsets (6,) on which most samples of a residual (N, 6) agree, and the share of
-    these samples, Eq. (T12).
+    """Return sensor offsets (6,) and the share of samples that agree on them, Eq. (T12).
+
+    `residual` (N, 6) is the wrench without that of the load [N, N m].
     """
     ordered = np.sort(residual, axis=0)
     half = len(ordered) // 2
@@ -292,9 +294,7 @@ def robust_offsets(residual: Array) -> tuple[Array, float]:
 
 
 def noise_floor(contact: Array) -> Array:
-    """Return the noise (6,) of a contact wrench (N, 6) that is calm for half of the record, Eq.
-    (T12).
-    """
+    """Return the noise (6,) of a contact wrench (N, 6), calm for half of the record, Eq. (T12)."""
     ordered = np.sort(contact, axis=0)
     half = len(ordered) // 2
     floor = (ordered[half:] - ordered[: len(ordered) - half]).min(axis=0) / 1.349
@@ -313,7 +313,7 @@ def _quiet(contact: Array, floor: Array) -> NDArray[np.bool_]:
 
 
 def contacts_of(t: Array, contact: Array, touched: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """Return times, peaks, direction and point of each contact, from contact wrenches (N, 6)."""
+    """Return times [s], peaks [N, N m], direction and point (in S) of each contact."""
     rows = []
     for start, stop in _spans(touched):
         wrench = contact[start:stop]

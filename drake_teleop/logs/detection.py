@@ -1,7 +1,4 @@
-"""Contact detection in a log, above the noise floor of free motion.
-
-docs/detection.md explains the names in the summary of `drake-teleop detect`.
-"""
+"""Command `drake-teleop detect`: contacts in a log (names of figures: docs/detection.md)."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DetectedLog(Detection):
-    """Contacts of a log; `eliminated` is the log without its non-contact wrench."""
+    """Contacts of a log, and the log after removal of the load's wrench (`eliminated`)."""
 
     eliminated: EliminatedLog = field(kw_only=True)
 
@@ -37,16 +34,16 @@ def detect_log(
     cutoff_hz: float = 30.0,
     delay: str | float = "auto",
 ) -> DetectedLog:
-    """Find contact in a log after the zero-phase low-pass of `eliminate_log`.
+    """Find contact in a log, after a zero-phase low-pass.
 
     Args:
         path: canonical table or log description.
         load: identification.json or its content; None: load identified from the log itself.
         free: log of equally fast free motion with the same load; None: calm parts of the log
             itself.
-        statistic: one of `STATISTICS`.
+        statistic: "level", "cusum" or "glr".
         cutoff_hz: cut-off of the low-pass.
-        delay: as in `eliminate_log`.
+        delay: delay of the motion behind the wrench [s], or "auto".
 
     Raises:
         DrakeTeleopError: for an unusable log or load file, static poses or an unknown statistic.
@@ -72,7 +69,7 @@ def detect_log(
 
 
 def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
-    """Return the share of samples whose force exceeds a limit, by kind of wrench."""
+    """Return the share of samples with |F| > `threshold` [N], for raw and corrected wrenches."""
     wrenches = {
         "raw": found.measured - found.measured[0],
         "gravity_only": found.gravity_only,
@@ -87,7 +84,7 @@ def share_above_force(found: EliminatedLog, threshold: float) -> dict[str, Any]:
 
 
 def draw_detection(found: DetectedLog) -> Any:
-    """Draw |F| before and after elimination, and the statistic with its threshold."""
+    """Draw |F| before and after removal of the load, and the statistic with its threshold."""
     from drake_teleop.common.style import BLACK, BLUE, ORANGE, Picture, plot_style, shade_contact
 
     eliminated = found.eliminated

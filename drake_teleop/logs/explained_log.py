@@ -1,4 +1,4 @@
-"""Search for causes in a log, and the load within the model that explains it."""
+"""Search for causes of a misfit in a log, and the load that results with these causes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _BANDWIDTH_HZ = 25.0  # Hz, bandwidth of block means
 
 
 def explain_log(log: Log, delay_s: float, found: PoseEstimate | None = None) -> Explanation | None:
-    """Explain the wrench of a log; return None if the log is too short.
+    """Search for causes why a rigid load does not explain the wrench; None for a short log.
 
-    `found` is the motion by splines, if there is one.
+    `delay_s` is the delay of the motion behind the wrench [s], `found` the motion by splines.
     """
 
     def with_delay(more: float) -> Instants:
@@ -69,7 +69,6 @@ def _spline_instants(log: Log, found: PoseEstimate, late: float) -> Instants:
 
 
 def _acceleration_noise(splines: PoseSplines) -> float:
-    """Return the noise of the acceleration that noisy positions cause [m/s^2]."""
     f = np.linspace(0.0, _BANDWIDTH_HZ, 500)
     share = passed(f, splines.spacing)
     if splines.imu_rows is not None:
@@ -79,11 +78,7 @@ def _acceleration_noise(splines: PoseSplines) -> float:
 
 
 def explained_load(load: Identification, why: Explanation) -> Identification:
-    """Return the load of the model that explains the wrench, or `load` with wider intervals.
-
-    Noise of an IMU's angular acceleration reduces the inertia; the standard deviations are
-    increased by this share.
-    """
+    """Return the load of the model with causes; without any, `load` with wider intervals."""
     load = _explained_load(load, why)
     if why.state.data.gravity_W is not None:
         return load
@@ -128,8 +123,9 @@ def _explained_load(load: Identification, why: Explanation) -> Identification:
 
 
 def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
-    """Return the causes; `finding` replaces pose frame and sensor rotation if the model has no
-    other part.
+    """Return the causes, with `finding` instead of "pose frame" and "sensor rotation".
+
+    Only if these are the only extensions of the model.
     """
     if why.state.model.parts and set(why.state.model.parts) <= {"frame", "rotation"}:
         kept = [x for x in why.causes if x.name not in ("pose frame", "sensor rotation")]
@@ -138,7 +134,7 @@ def named_frame(why: Explanation, finding: Finding) -> tuple[Cause, ...]:
 
 
 def removed_note(why: Explanation) -> str:
-    """Return a note about the weight that `wrench.weight: removed` refers to, or ""."""
+    """Return a note about the weight that the robot removes (`wrench.weight: removed`), or ""."""
     if "weight" not in why.given or why.removed_weight is None:
         return ""
     mass, moment = float(why.removed_weight[0]), why.removed_weight[1:]

@@ -1,7 +1,4 @@
-"""Figures in the summaries of `drake-teleop identify` and `drake-teleop eliminate`.
-
-docs/log-summaries.md explains their names.
-"""
+"""Figures in the summaries of the commands `identify` and `eliminate` (docs/log-summaries.md)."""
 
 from __future__ import annotations
 
@@ -29,7 +26,7 @@ from drake_teleop.logs.processing import EliminatedLog, IdentifiedLog
 def common_figures(
     path: Path, found: IdentifiedLog | EliminatedLog, cutoff_hz: float | None, delay_s: float
 ) -> dict[str, Any]:
-    """Return the fields with which both summaries begin."""
+    """Return the fields with which the summaries of `identify` and `eliminate` begin."""
     log = found.log
     findings = [{"name": finding.name, "message": finding.message} for finding in found.findings]
     return {
@@ -46,7 +43,7 @@ def common_figures(
 
 
 def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
-    """Return the figures of the load in one part of a record."""
+    """Return the numbers of the load in one part of a record for a summary [SI]."""
     mass, com, _ = mass_com_inertia(stretch.phi)
     deviations = np.sqrt(np.diag(stretch.covariance))[6:]
     return {
@@ -62,7 +59,7 @@ def load_of_stretch(stretch: Stretch) -> dict[str, Any]:
 
 
 def load_figures(load: Identification) -> dict[str, Any]:
-    """Return the figures of a load: values and uncertainties."""
+    """Return the numbers of a load for a summary: values and uncertainties [SI]."""
     deviations = load.standard_deviations
     ends = intervals(load)
     return {
@@ -82,7 +79,7 @@ def load_figures(load: Identification) -> dict[str, Any]:
 
 
 def object_figures(alone: Identification) -> dict[str, Any]:
-    """Return the figures of an object without its gripper."""
+    """Return the numbers of an object without its gripper for a summary [SI]."""
     margin, deviation = consistency_margin(alone)
     figures = load_figures(alone)
     for name in ("identifiable", "not_identifiable"):
@@ -91,7 +88,7 @@ def object_figures(alone: Identification) -> dict[str, Any]:
 
 
 def object_notes(alone: Identification) -> list[str]:
-    """Return warnings for an object whose mass or parameters are doubtful."""
+    """Return warnings for an object with a doubtful mass or impossible parameters."""
     deviation = float(alone.standard_deviations[6])
     if alone.mass < SIGNIFICANT * deviation:
         return [
@@ -114,7 +111,7 @@ def _named(result: Identification, identifiable: bool) -> list[str]:
 
 
 def rms_figures(found: EliminatedLog) -> dict[str, Any]:
-    """Return RMS and peak values of the wrenches, without the edges."""
+    """Return RMS and peak values of the wrenches, without samples near ends and gaps."""
 
     def rms(x: Array) -> Array:
         return np.sqrt(np.mean(x**2, axis=0))
@@ -132,7 +129,7 @@ def rms_figures(found: EliminatedLog) -> dict[str, Any]:
 
 
 def contact_figures(found: EliminatedLog, causal_tare_s: float | None) -> dict[str, Any]:
-    """Return the figures of noise floor, contacts and causal wrenches."""
+    """Return noise floor, contacts and causal wrenches for a summary."""
     figures: dict[str, Any] = {
         "noise_floor": found.noise_floor,
         "edge_s": 0.0 if found.log.static else float(found.edge.sum()) * found.log.dt,

@@ -1,7 +1,4 @@
-"""Command `drake-teleop inspect`: quality of a log, suspected errors, or a draft description.
-
-docs/log-summaries.md explains the names in its summary.
-"""
+"""Command `drake-teleop inspect`: quality of a log, suspected errors, or a draft description."""
 
 from __future__ import annotations
 
@@ -271,10 +268,7 @@ def _stream(
 def _repeated(
     at: str, values: Array, same: NDArray[np.bool_], rate: float | None, time: Any
 ) -> list[Finding]:
-    """Return a finding, with the rate of new rows, if the recorder repeated rows.
-
-    A coarse sensor at rest also repeats rows, but then few channels change in the next row.
-    """
+    """Return a finding if the recorder repeated rows, unlike a coarse sensor at rest."""
     held = int(same.sum())
     news_after = np.flatnonzero(same[:-1] & ~same[1:]) + 1
     changing = values[:, (values[1:] != values[:-1]).any(axis=0)]
@@ -362,7 +356,6 @@ def _longest(flags: NDArray[np.bool_]) -> int:
 
 
 def _saturated(x: Array, same: NDArray[np.bool_]) -> int:
-    """Count samples at the ends of a channel's range, if only these values repeat."""
     held = np.zeros(len(x), bool)
     held[1:] = (x[1:] == x[:-1]) & ~same[1:]
     ends = (x == np.nanmax(x)) | (x == np.nanmin(x))

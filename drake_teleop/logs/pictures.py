@@ -51,7 +51,7 @@ _MEASURED = "#A3AAB5"
 
 
 def draw_fit(found: IdentifiedLog) -> Figure:
-    """Draw measured wrench, V phi and residual without offsets; shade rejected samples."""
+    """Draw measured wrench, load's wrench and residual without offsets; shade rejected samples."""
     with plot_style():
         figure = Picture(figsize=(10, 7))
         _fit_into(figure, found)
@@ -59,7 +59,7 @@ def draw_fit(found: IdentifiedLog) -> Figure:
 
 
 def draw_knowledge(found: IdentifiedLog) -> Figure:
-    """Draw the residual's spectrum and the intervals and identifiability of parameters."""
+    """Draw the spectrum of the residual, and intervals and verdicts of the parameters."""
     with plot_style():
         figure = Picture(figsize=(10, 7.4))
         _knowledge_into(figure, found)
@@ -67,7 +67,7 @@ def draw_knowledge(found: IdentifiedLog) -> Figure:
 
 
 def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
-    """Write two PNG files of equal width as one, the first above the second."""
+    """Write two PNG files of equal width as one PNG `page`."""
     from matplotlib.image import imread, imsave
 
     with whole_file(page) as unfinished:
@@ -75,14 +75,10 @@ def stack_pictures(upper: Path, lower: Path, page: Path) -> None:
 
 
 def spectrum(x: Array, dt: float) -> tuple[Array, Array]:
-    """Return the one-sided amplitude spectral density by Welch's method.
+    """Return frequencies (m,) [Hz] without 0, and one-sided amplitude spectral densities (m, k).
 
-    Args:
-        x: (N, k) samples.
-        dt: sample time [s].
-
-    Returns:
-        frequencies (m,) without zero [Hz], densities (m, k) [unit of x / sqrt(Hz)].
+    Welch's method; x (N, k) are samples with sample time `dt` [s], densities in unit of x /
+    sqrt(Hz).
     """
     length = min(len(x), max(16, len(x) // 8), _MAX_WINDOW)
     window = np.hanning(length + 1)[:-1, None]
@@ -184,7 +180,7 @@ def _draw_parameters(figure: Any, result: Identification) -> None:
 
 
 def draw_elimination(found: EliminatedLog) -> Figure:
-    """Draw |F| and the six channels of each wrench; shade contacts."""
+    """Draw force magnitude and the six channels of each wrench; shade contacts."""
     curves = [("measured, offsets removed", found.measured, _MEASURED)]
     if found.gravity_only is not None:
         curves.append(("static weight removed", found.gravity_only, ORANGE))

@@ -1,4 +1,4 @@
-"""Fit of the load to a log with poses: `pose_motion` for `identify_log`."""
+"""Fit of a load to a log with poses."""
 
 from __future__ import annotations
 
@@ -33,14 +33,12 @@ _CHUNK, _NEIGHBOURS = 2**14, 2**8  # kept samples per chunk, and neighbours for 
 
 @dataclass(frozen=True)
 class PosedFit:
-    """Result of `fit_posed`.
+    """Load identified from a log with poses.
 
     Attributes:
-        log: used samples with the motion of the splines, low-passed.
-        fit: identified load.
-        delay_s: removed delay [s].
+        log: used samples with the motion of splines, low-passed.
+        delay_s: removed delay of the motion behind the wrench [s].
         source: of the delay: "given", "estimated", or "undetermined" (0 was used).
-        motion: estimate from the poses.
     """
 
     log: Log
@@ -53,13 +51,13 @@ class PosedFit:
 def fit_posed(
     log: Log, method: str, cutoff_hz: float | None, delay: str | float
 ) -> tuple[PosedFit | None, tuple[Finding, ...]]:
-    """Return the load from wrench and poses, and a finding if the pose frame is not S.
+    """Return the load identified from wrench and poses, and findings about the pose frame.
 
-    The load is None for other methods or logs, or if an IMU contradicts the poses.
+    The load is None for a method without splines, a log without usable poses, or an IMU that
+    contradicts the poses.
 
     Args:
-        log: the log as read.
-        method: one of `METHODS`.
+        method: "robust" or "consistent" use splines.
         cutoff_hz: cut-off of the low-pass on samples and residual.
         delay: delay of the motion behind the wrench [s], or "auto".
     """
@@ -88,7 +86,6 @@ def fit_posed(
 
 
 def _is_sensor_rotated(found: PoseEstimate) -> bool:
-    """Return whether the sensor is rotated against both the poses and the IMU."""
     return found.frame.turned and not found.frame.shifted
 
 
@@ -136,7 +133,6 @@ def _fit(
 
 
 def _consistent(found: PoseEstimate) -> Array:
-    """Return [offsets; phi] (16,) of the nearest consistent load; a negative mass remains."""
     theta, covariance = found.theta, found.covariance
     if theta[6] < 0.0 or np.isinf(np.diag(covariance)).any():
         return theta

@@ -1,4 +1,4 @@
-"""Identification and elimination on logs, from files to arrays (long: two commands)."""
+"""Identification of the load, and its removal, for log files (long: two commands)."""
 
 from __future__ import annotations
 
@@ -58,15 +58,14 @@ _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
 class IdentifiedLog:
     """Log with its identified load.
 
-    Args:
-        log: used samples: without delay and gaps, low-passed.
-        identification: identified load.
-        predicted: (N, 6) wrench offsets + V phi at the same instants.
-        delay_source: source of the delay, as in the summary.
+    Attributes:
+        log: used samples, low-passed, without delay and gaps.
+        predicted: (N, 6) wrench offsets + V phi of the load [N, N m].
+        delay_source: origin of the delay, such as "estimated".
         rejected: (N,) True for samples that robust fits reject.
         base: combinations of offsets and load that the samples determine.
-        findings: suspected errors of the description.
-        causes: effects other than a rigid load with constant offsets, included in the model.
+        findings: suspected errors of the log description.
+        causes: effects beside a rigid load with constant offsets that the fit includes.
         loads: load of each part of the record, if it changes.
         delay_deviation_s: standard deviation of an estimated delay [s]; nan if unknown.
     """
@@ -88,24 +87,25 @@ class IdentifiedLog:
 
 @dataclass(frozen=True)
 class EliminatedLog:
-    """Log without its non-contact wrench. Arrays are low-passed and in S, sign of Eq. (1).
+    """Log with the load's wrench (weight and inertia) removed.
 
-    Args:
+    Wrenches are (N, 6), low-passed, in S [N, N m].
+
+    Attributes:
         log: without delay and gaps; not low-passed.
-        phi: (10,) load, gripper and object, see `usable_phi`.
-        point_mass: names of the inertias replaced by those of a point mass.
-        offsets: (6,) of this record.
-        tare_fraction: share of the samples that determined `offsets`; 1 if not tared.
-        delay_s: removed delay of the motion behind the wrench [s].
-        delay_source: source of the delay, as in the summary.
-        measured: (N, 6) wrench without offsets.
-        non_contact: (N, 6) load's wrench V phi.
-        contact: (N, 6) contact wrench F_c, Eq. (13).
-        scaled: (N, 6) scaled wrench gamma F_c + sigma V phi.
-        gravity_only: (N, 6) wrench without offsets and weight; None without orientation.
-        noise_floor: (6,) noise of `contact`, independent of the motion.
+        phi: (10,) removed load, gripper and object.
+        point_mass: names of inertias that are those of a point mass.
+        offsets: (6,) sensor offsets of this record [N, N m].
+        tare_fraction: share of the samples that determined `offsets`; 1 if from the load file.
+        delay_s, delay_source: removed delay of the motion behind the wrench [s], and its origin.
+        measured: wrench without offsets.
+        non_contact: load's wrench V phi.
+        contact: contact wrench F_c, Eq. (13).
+        scaled: scaled wrench gamma F_c + sigma V phi.
+        gravity_only: wrench without offsets and weight; None without orientation.
+        noise_floor: (6,) noise of `contact` [N, N m].
         causal: wrenches as in a control loop, if requested.
-        edge: (N,) True for unjudged samples at ends and gaps, excluded from all figures.
+        edge: (N,) True for samples near ends and gaps, excluded from all figures.
         detection: contacts; None for static poses and very short records.
         findings: suspected errors of the description, after a poor fit.
     """
@@ -143,21 +143,20 @@ def identify_log(
     delay: str | float = "auto",
     checks: Conventions | None = None,
 ) -> IdentifiedLog:
-    """Identify the load and the sensor's offsets from a log.
+    """Identify the load and the sensor offsets from a log.
 
-    With positions, motion is from splines (`drake_teleop.logs.pose_motion`). Otherwise wrench and
-    motion pass one zero-phase low-pass, and motion counts as exact. Static poses are unfiltered.
+    With positions, the motion is from splines. Otherwise wrench and motion pass one zero-phase
+    low-pass, and the motion counts as exact. Static poses are unfiltered.
 
     Args:
         path: canonical table or log description.
-        method: one of `drake_teleop.load.batch.methods.METHODS`.
+        method: "ordinary", "whitened", "total", "robust" or "consistent".
         cutoff_hz: cut-off of the low-pass; None for no filter.
         delay: delay of the motion behind the wrench [s], or "auto".
-        checks: checks of this log, if already known.
+        checks: result of `check_file` for this log, if known.
 
     Raises:
-        DrakeTeleopError: for an unusable log, an unknown method or a worthless result
-            (`question_fit`).
+        DrakeTeleopError: for an unusable log, an unknown method or a worthless result.
     """
     check_method(method)
     with one_blas_thread():
@@ -254,13 +253,11 @@ def _can_be_explained(log: Log, by_splines: bool) -> bool:
 
 
 def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
-    """Check a log and its description, with the causes that identification finds.
-
-    Causes replace findings that may be effects of these causes.
+    """Check a log and its description, including causes that identification finds.
 
     Args:
         path: canonical table or log description.
-        checks: checks of the description without causes, if already known.
+        checks: result of `check_file` for this log, if known.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -309,14 +306,14 @@ def eliminate_log(
     free: str | Path | None = None,
     statistic: str = "level",
 ) -> EliminatedLog:
-    """Remove (or scale) the non-contact wrench of a known load in a log.
+    """Remove (or scale) the wrench of weight and inertia of a known load in a log.
 
     Args:
         path, delay: as in `identify_log`.
         load: identification.json, or its content.
         gripper: identification of the gripper alone, in the same frame S; `load` is then gripper
             with object.
-        sigma: kept share of the non-contact wrench; with `gripper`, of the gripper's.
+        sigma: kept share of the load's wrench; with `gripper`, of the gripper's.
         sigma_object: kept share of the object's wrench, with `gripper` only; None: sigma.
         gamma: scale of the contact wrench.
         eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
@@ -329,7 +326,7 @@ def eliminate_log(
         causal_tare_s: contact-free start that determines the offsets of `causal` [s]; None: those
             of `load`.
         free: log of free motion with the same load; None: calm parts of the record itself.
-        statistic: contact statistic, one of `drake_teleop.load.contact.noise_floor.STATISTICS`.
+        statistic: contact statistic, "level", "cusum" or "glr".
 
     Raises:
         DrakeTeleopError: for an unusable log or load file, contradictory scales, causal or free
@@ -512,9 +509,9 @@ def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:
 
 
 def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
-    """Return the load phi (10,) with point-mass inertias where unidentified, and their names.
+    """Return the load phi (10,), and names of unidentified inertias.
 
-    m (c'c E - c c') is the smallest inertia about So for this mass m and centre of mass c.
+    They are replaced by those of a point mass.
     """
     phi = identification.phi.copy()
     replaced = np.flatnonzero(~identification.identifiable[10:])
@@ -526,7 +523,6 @@ def usable_phi(identification: Identification) -> tuple[Array, tuple[str, ...]]:
 def _suspected_errors(
     path: Path, wrench: Array, contact: Array, load: Identification
 ) -> tuple[Finding, ...]:
-    """Return errors of the description if 30 % of the median force remain after elimination."""
     sizes = [float(np.median(np.linalg.norm(x[:, :3], axis=1))) for x in (wrench, contact)]
     if sizes[1] < 0.3 * sizes[0]:
         return ()

@@ -29,7 +29,7 @@ _PILLS = {"identified": "agrees", "not": "differs"}
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """Printed row of one parameter, with numbers in `unit`."""
+    """Row of one parameter in the report, as text, with numbers in `unit`."""
 
     symbol: str
     index: str
@@ -70,11 +70,10 @@ def write_report(
     summary: Mapping[str, Any],
     alone: Identification | None = None,
 ) -> None:
-    """Write a self-contained page with embedded pictures.
+    """Write the HTML report of an identification, with embedded pictures.
 
     Args:
         path: HTML file; fit.png and knowledge.png are beside it.
-        found: identified log.
         summary: summary of `identify_command`.
         alone: identification of the object alone, if the gripper is known.
     """

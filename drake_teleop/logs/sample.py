@@ -1,7 +1,6 @@
-"""Simulated log of `drake-teleop sample-log`: a gripper on an arm with the lengths of a UR5e.
+"""Command `drake-teleop sample-log`: simulated log of a gripper on an arm like a UR5e.
 
-The gripper moves freely (free.yaml) and is touched (touched.yaml). Wrench and pose have different
-rates, clocks and units, noise, offsets and a delay. truth.json contains the true values.
+free.yaml is free motion, touched.yaml has contacts, truth.json the true values.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ _HARMONICS = 6
 
 @dataclass(frozen=True)
 class Touch:
-    """Half-sine push at the fingertips.
+    """Push at the fingertips, a half sine over time.
 
     Args:
         start_s, stop_s: times on the sensor's clock.
@@ -67,7 +66,7 @@ class Touch:
     push_W: tuple[float, float, float]
 
     def force(self, t: Array) -> Array:
-        """Return the force (N, 3) in the world [N] at times t (N,)."""
+        """Return the force (N, 3) on the gripper, in the world [N], at times t (N,) [s]."""
         share = np.clip((t - self.start_s) / (self.stop_s - self.start_s), 0, 1)
         return np.outer(np.sin(np.pi * share), self.push_W)
 
@@ -188,9 +187,7 @@ def _motion(number: int) -> _Motion:
 
 
 def sensor_motion(q: Array, qd: Array, qdd: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the motion of the last link's frame S, from joint angles.
-
-    It is s, omega, alpha (N, 3) in S, orientation R_WS (N, 3, 3) and position p_WS (N, 3).
+    """Return s, omega, alpha (N, 3) in S, R_WS (N, 3, 3) and p_WS (N, 3) of the last link S.
 
     Args:
         q, qd, qdd: (N, 6) joint angles and their derivatives [rad, s].

@@ -1,4 +1,4 @@
-"""Motion of S at the sample times of a wrench, from splines of the poses."""
+"""Motion of the sensor frame S at the sample times of a wrench, from splines of the poses."""
 
 from __future__ import annotations
 
@@ -28,11 +28,9 @@ _Motion = TypeVar("_Motion", bound=PoseMotion)
 
 
 def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
-    """Return motion and load of a log with poses, and the source of the delay.
+    """Return motion and load of a log with poses, and the source of its delay.
 
-    Args:
-        log: the log as read.
-        delay: delay of the motion behind the wrench [s], or "auto".
+    `delay` is that of the motion behind the wrench [s], or "auto".
 
     Raises:
         DrakeTeleopError: for too few usable samples, or an invalid delay.
@@ -43,12 +41,12 @@ def motion_and_load(log: Log, delay: str | float) -> tuple[PoseEstimate, str]:
 def motion_of_known_load(
     log: Log, delay: str | float, load: Array, usual_s: float
 ) -> tuple[PoseMotion, str] | None:
-    """Return the motion with which an identified load fits best, and the source of the delay.
+    """Return the motion with which an identified load fits best, and the source of its delay.
 
     None without positions, for a short record, and if an IMU disagrees with the poses.
 
     Args:
-        log, delay: as in `motion_and_load`.
+        delay: of the motion behind the wrench [s], or "auto".
         load: (6, 16) from `drake_teleop.logs.pose_motion.rigid.load_coefficients`.
         usual_s: delay for a record that does not determine it [s].
     """
@@ -95,9 +93,9 @@ def _estimate(log: Log, delay: float | None) -> PoseEstimate:
 
 
 def use_spline_motion(log: Log, found: PoseMotion) -> tuple[Log, NDArray[np.bool_]]:
-    """Return the log with spline motion and without delay, and (N,) True for edge samples.
+    """Return the log with spline motion and without delay, and flags (N,).
 
-    Within two knots of an end or a gap of the poses the acceleration is noisy.
+    Flags are True near ends and gaps of the poses, where the acceleration is noisy.
     """
     assert log.posed is not None
     moved, splines = undelayed(log, found.delay_s), found.splines

@@ -9,7 +9,11 @@ from drake_teleop.common.errors import DrakeTeleopError
 
 
 class Address:
-    """Parsed address; raise DrakeTeleopError if host, port or a parameter name is invalid."""
+    """Parsed address with the parameters `allowed`; defaults: `port` and `host`.
+
+    Raises:
+        DrakeTeleopError: if host, port or a parameter name is invalid.
+    """
 
     def __init__(
         self, text: str, port: int | None, allowed: tuple[str, ...], *, host: str = ""
@@ -34,11 +38,15 @@ class Address:
                 )
 
     def parameter(self, name: str) -> str | None:
-        """Return a query parameter, None if it is absent."""
+        """Return a query parameter; None if it is absent."""
         return self._parameters.get(name)
 
     def numbers(self, name: str, count: int) -> list[float] | None:
-        """Return `count` positive numbers, None if absent; raise DrakeTeleopError otherwise."""
+        """Return a parameter of `count` positive numbers; None if it is absent.
+
+        Raises:
+            DrakeTeleopError: for any other value.
+        """
         text = self._parameters.get(name)
         if text is None:
             return None
@@ -53,7 +61,7 @@ class Address:
         return values
 
     def choice(self, name: str, among: tuple[str, ...]) -> str:
-        """Return one of the words `among`, by default the first; else raise DrakeTeleopError."""
+        """Return a parameter among words, default the first; else raise DrakeTeleopError."""
         text = self._parameters.get(name, among[0])
         if text not in among:
             raise DrakeTeleopError(
@@ -62,7 +70,10 @@ class Address:
         return text
 
     def sign(self) -> float:
-        """Return the factor to the wrench of sensor on load, Eq. (1): 1, or -1 (default)."""
+        """Return the factor that converts the source's wrench to that of sensor on load, Eq. (1).
+
+        It is the parameter `sign`: 1, or -1 (default).
+        """
         text = self._parameters.get("sign", "-1")
         if text not in ("-1", "1", "+1", " 1"):  # parse_qsl decodes + as a space
             raise DrakeTeleopError(f"sign={text!r} is neither 1 nor -1", where=self.text)

@@ -1,7 +1,4 @@
-"""Readings that combine the wrench of one stream with the motion of another.
-
-The motion contains derivatives of poses (docs/robot.md, "Methods").
-"""
+"""Readings that combine the wrench of one stream with the motion of another (docs/robot.md)."""
 
 from __future__ import annotations
 
@@ -44,11 +41,14 @@ _PERIOD_SAMPLES = 20  # for the median period of the motion
 
 
 class Parts:
-    """One or two sources of parts as one source; raise DrakeTeleopError if none has motion.
+    """One source of wrenches and motions, made of one or two sources of parts (single samples).
 
     Attributes:
         motion_stream: stream of the motion: poses if available, else an IMU.
-        two_clocks: wrench and motion have different clocks.
+        two_clocks: whether wrench and motion have different clocks.
+
+    Raises:
+        DrakeTeleopError: if no source delivers motion.
     """
 
     live = True
@@ -66,7 +66,7 @@ class Parts:
             )
 
     def read(self, timeout_s: float) -> list[tuple[Part, float]] | None:
-        """Return received parts with their times of arrival [s]."""
+        """Return the received parts with their times of arrival [s]; None at the end."""
         found: list[tuple[Part, float]] = []
         if self._motion is not None:
             motions, now = self._motion.read(0.0) or (), time.monotonic()
@@ -155,7 +155,10 @@ class MotionWindow:
             self.reset()
 
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
-        """Return times and motions (9,) that a sample received at time `now` completes."""
+        """Return the motions that a part, received at time `now` [s], completes.
+
+        Each is a time [s] with specific force, angular velocity and acceleration (9,) in S.
+        """
         row = self._row(part)
         if row is None:
             return []
@@ -181,7 +184,6 @@ class MotionWindow:
         return found
 
     def _row(self, part: Part) -> Array | None:
-        """Return rotation R_WS and position p_WS (12,), or IMU values (6,); None if invalid."""
         values = part.values
         if part.flags or not (abs(part.t) < _MAX_TIME_S and (np.abs(values) < _MAX_VALUE).all()):
             return None
@@ -194,7 +196,6 @@ class MotionWindow:
         return np.concatenate([(R_WF @ self._R_FS).ravel(), values[4:] + R_WF @ self._p_FS])
 
     def _motion(self) -> Array:
-        """Return the motion s, omega, alpha (9,) in the middle of the window."""
         rows = np.array(self._rows)
         smooth, first, second = self._weights @ rows
         if rows.shape[1] == 6:
@@ -210,7 +211,7 @@ def _axis(A: Array) -> Array:
 
 
 def pose_from_rpy(numbers: Sequence[float]) -> Array:
-    """Return the pose (7,) of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
+    """Return the pose (7,), [w x y z, position], of x, y, z [m], roll, pitch, yaw [deg] (URDF)."""
     return np.concatenate([quaternions(rotation_rpy(numbers[3:])[None])[0], numbers[:3]])
 
 
@@ -226,7 +227,7 @@ class _ClockOffset:
 
 
 class Assembly:
-    """Source of readings with the motion of another stream.
+    """Source of readings: wrenches with the motion of another stream at the same time.
 
     Args:
         delay_s: delay of the motion's time stamps behind the wrench's [s].
@@ -267,7 +268,7 @@ class Assembly:
 
     @property
     def delay_s(self) -> float:
-        """Present delay of the motion [s]."""
+        """Present delay of the motion behind the wrench [s]."""
         return self._delay if self._tracker is None else self._tracker.delay_s
 
     def read(self, timeout_s: float) -> list[Reading] | None:
@@ -278,7 +279,7 @@ class Assembly:
         return [reading for part, now in arrived for reading in self.take(part, now)]
 
     def take(self, part: Part, now: float) -> list[Reading]:
-        """Return the readings that a part received at time `now` completes."""
+        """Return the readings that a part, received at time `now` [s], completes."""
         if part.stream == WRENCH:
             self._clocks[0].update(part.t, now)
             self._pending.append(part)
@@ -307,7 +308,6 @@ class Assembly:
                 motions.popleft()
 
     def _complete(self, part: Part) -> Reading | None:
-        """Return a wrench's reading, stale without motion; None while motion is pending."""
         values, flags, motions = np.zeros(VALUES), part.flags, self._motions
         values[:6] = part.values
         if not math.isfinite(part.t):

@@ -52,7 +52,7 @@ _INDEPENDENT_PER_S_HZ = 2.2
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Intermediate result of a calibration.
+    """Intermediate result of a calibration, for the k parameters with a tolerance.
 
     Attributes:
         t: length of the record [s].
@@ -82,7 +82,10 @@ def evaluate_record(
     cutoff_hz: float | None,
     delay: str | float,
 ) -> Evaluation:
-    """Identify the record at `path`; return the result. `previous`: previous result."""
+    """Identify the record at `path` and return the result; `previous` is the previous one.
+
+    `cutoff_hz` and `delay`: see `identify_log`.
+    """
     count, found, why = len(tolerance.entries), None, ""
     try:
         found = identify_log(path, cutoff_hz=cutoff_hz, delay=delay)
@@ -116,9 +119,9 @@ def evaluate_record(
 
 
 def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Array, Array]:
-    """Return interval half-widths divided by the tolerances, and degrees of freedom, (k,) each.
+    """Return interval half-widths over the tolerances, and degrees of freedom, (k,) each.
 
-    The half-widths have the levels 95 % and `CONFIDENCE`.
+    The levels are 95 % (first) and `CONFIDENCE` (second).
     """
     load = found.identification
     errors = errors_of(tolerance, load.phi)
@@ -130,7 +133,7 @@ def half_widths(found: IdentifiedLog, tolerance: Tolerance) -> tuple[Array, Arra
 
 
 def record_problems(found: IdentifiedLog) -> tuple[str, ...]:
-    """Return the problems of a record that invalidate all intervals."""
+    """Return the problems of a record that invalidate all intervals, as text."""
     doubts = [finding.message for finding in found.findings if finding.name != "contact"]
     if found.log.static:
         doubts.append("all poses are at rest")
@@ -146,7 +149,7 @@ def best_motion(
     errors: Array,
     noise: Array,
 ) -> str:
-    """Return the most informative motion, in words.
+    """Return as text the next motion that reduces the uncertainty most.
 
     Args:
         motion: s, omega, alpha of the record, (N, 3) each.
@@ -170,7 +173,6 @@ def best_motion(
 
 
 def _candidate_motions(up: Array, noise: Array, rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield motions in words, with their information (16, 16); all start at specific force `up`."""
     s0 = _GRAVITY * up / max(float(np.linalg.norm(up)), 1e-9)
     t = np.arange(_MOTION_SAMPLES) * (_MOTION_S / _MOTION_SAMPLES)
     for words, size, hertz in _MOTIONS:
@@ -218,7 +220,7 @@ def calibrate(
         show: callback for each result.
 
     Returns:
-        All results.
+        All intermediate results.
 
     Raises:
         DrakeTeleopError: if there are too few samples, or the record cannot be written.

@@ -1,8 +1,4 @@
-"""Detection of a changed sensor zero or load in a stream, by the test of `identify`.
-
-For a live stream the test runs in another process of low priority, because threads would share the
-interpreter lock with the loop.
-"""
+"""Detection of a changed sensor zero or load in a stream, by the test of `identify`."""
 
 from __future__ import annotations
 
@@ -42,7 +38,7 @@ Report = tuple[float, str]
 
 
 class Changes:
-    """Monitor that reports each change of zero or load once, by the callback `report`."""
+    """Monitor that reports each change of sensor zero or load once, by `report`."""
 
     def __init__(self, dt: float, *, live: bool, report: Callable[[str], None]) -> None:
         self._dt, self._live, self._report = dt, live, report
@@ -116,7 +112,7 @@ def _find_changes_in_process(rows: Array, dt: float) -> list[Report]:
 
 
 def find_changes(rows: Array, dt: float) -> list[Report]:
-    """Return the changes of zero and load in rows (N, 16) of time [s] and values."""
+    """Return the changes of sensor zero and load in rows (N, 16): time [s] and reading (15)."""
     t = np.arange(rows[0, 0], rows[-1, 0] + 0.5 * dt, dt)
     at = np.clip(np.searchsorted(rows[:, 0], t - 0.5 * dt), 0, len(rows) - 1)
     if len(t) * dt < _MIN_RECORD_S:
@@ -132,7 +128,6 @@ def find_changes(rows: Array, dt: float) -> list[Report]:
 
 
 def _decisive(state: State, time: float) -> bool:
-    """Return whether the sensor moved after `time` and the other kind of change fits much worse."""
     steps, data = state.model.steps, state.data
     after = data.y[data.used & (data.t > time)][:, S]
     if len(after) == 0 or np.linalg.norm(after.std(axis=0)) < _MIN_FORCE_STD:

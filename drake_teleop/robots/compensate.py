@@ -35,7 +35,7 @@ class Control:
         self.port = self._socket.getsockname()[1]
 
     def answer(self, tare: Callable[[], str]) -> None:
-        """Answer a waiting request: call `tare` and send the result."""
+        """Answer a waiting request, if any: call `tare` and send its result."""
         try:
             request, sender = self._socket.recvfrom(64)
             valid = request.strip() == b"tare"
@@ -63,7 +63,7 @@ def run(
     """Compensate readings until the source ends, or Ctrl-C.
 
     Args:
-        tare: tare once, after `TARE_S` of good readings.
+        tare: tare once, after `TARE_S` of valid readings.
         report: callback for a tare, and the first fault of each kind.
 
     Returns:
@@ -125,7 +125,7 @@ def compensate_command(
 
     Args:
         sigma, gamma, cutoff_hz, predicted: see `Compensator`.
-        largest: range of the sensor [N], [N m].
+        largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, see `Detector`.
         control: UDP port of `Control`.
         stream: options of `open_source`.

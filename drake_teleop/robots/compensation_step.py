@@ -53,7 +53,7 @@ def low_pass_into(x, low_pass, memory):
 
 @njit(cache=True)
 def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
-    """Write the contact wrench and scaled wrench of a good reading to out (12,).
+    """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
     Args:
         values: (15,) reading.

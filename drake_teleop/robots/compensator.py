@@ -1,11 +1,8 @@
 """Contact wrench of each reading; a flagged zero wrench for each invalid reading.
 
-Good readings pass the kernels of `eliminate --causal`, with bit-equal results. After `STALE_S`
-without a good reading the low-pass restarts in its steady state.
-
-The source's time t is related to our clock by the minimum of (now - t), which rises by
-`CLOCK_DRIFT`. The excess of (now - t) over this minimum is the age of a reading. If it lasts for
-`JUMP_S`, the source's clock was set.
+Results are bit-equal to `eliminate --causal`. After `STALE_S` without a valid reading the low-pass
+restarts in its steady state. A reading's age is the excess of (our clock - source's clock) over its
+minimum, which rises by `CLOCK_DRIFT`.
 """
 
 from __future__ import annotations
@@ -61,8 +58,6 @@ _MAX_NOISE_RATIO, _MIN_NOISE_LIMIT = 4.0, np.repeat([0.1, 0.005], 3)
 
 
 class _RateCheck:
-    """Comparison of the measured rate of the readings with the configured one."""
-
     def __init__(self, dt: float) -> None:
         self._dt, self._readings = dt, max(_RATE_READINGS, round(_RATE_S / dt))
         self._start_t, self._start_number = 0.0, 0
@@ -72,7 +67,6 @@ class _RateCheck:
         self._count, self._flag = 0, 0
 
     def flag(self, reading: Reading) -> int:
-        """Return 0 or `WRONG_RATE`, the result of the last complete interval."""
         if self._count == 0:
             self._start_t, self._start_number = reading.t, reading.number
         self._count += 1
@@ -96,7 +90,7 @@ class Compensator:
     Attributes:
         offsets: (6,) sensor offsets [N, N m].
         lag_s: delay of a slow contact without prediction [s].
-        good_count: number of successive good readings.
+        good_count: number of successive valid readings.
     """
 
     def __init__(
@@ -173,7 +167,7 @@ class Compensator:
         return max(0.0, self._now + STALE_S - now)
 
     def tare(self) -> str:
-        """Add the mean contact wrench to the offsets, or refuse; return the result in words."""
+        """Add the mean contact wrench to the offsets, or refuse; return the result as text."""
         if self.good_count < len(self._tare_rows):
             return f"refused: fewer than {TARE_S:g} s of good readings so far"
         spread = self._tare_rows.std(axis=0)
@@ -198,7 +192,6 @@ class Compensator:
         return "done: offsets moved by " + " ".join(f"{x:+.3g}" for x in step)
 
     def _reading_flags(self, reading: Reading, now: float) -> int:
-        """Return the flags of a reading and update the clock comparison."""
         flags = reading.flags
         if flags & _DAMAGED:
             return _DAMAGED
@@ -235,7 +228,6 @@ class Compensator:
         return flags | self._rate.flag(reading)
 
     def _restart_clock(self, reading: Reading, ahead: float, flags: int) -> int:
-        """Accept the clock of this reading and restart the filters."""
         self._min_offset, self._number, self._t = ahead, reading.number, reading.t
         self._rate.reset()
         self.good_count = 0
@@ -250,7 +242,6 @@ class Compensator:
         self._delay_line.clear()
 
     def _eliminate(self, values: Array) -> Array:
-        """Return low-passed contact wrench and scaled wrench (12,)."""
         out = np.empty(12)
         at = self.good_count % len(self._tare_rows)
         phi, zero, scales = self._phi, self._zero_phi, self._scales

@@ -146,7 +146,6 @@ def open_sink(address: str) -> Sink:
 
 
 def _kind(address: str) -> str:
-    """Return the scheme of an address; "" for a file."""
     if address.startswith(_REPLAY):
         return "replay"
     return address.partition("://")[0] if "://" in address or address == "-" else ""

@@ -41,7 +41,7 @@ Motion = tuple[float, Array]
 
 
 class DelayTracker:
-    """Estimator of the motion's delay `delay_s` [s]."""
+    """Estimator of the motion's delay behind the wrench, `delay_s` [s]."""
 
     def __init__(
         self, load: Identification, dt: float, cutoff_hz: float | None, delay_s: float
@@ -85,7 +85,6 @@ class DelayTracker:
             self._slew_delay(min(elapsed, FADE_TIME_S))
 
     def _is_explained(self, residual: Array, slope: Array) -> bool:
-        """Return whether the residual is explained without contact."""
         starting = self._samples < _MIN_SAMPLES
         limit = _SIGMAS * self._noise + self._delay_error * np.abs(slope)
         limit += MODEL_ERROR * np.abs(self._wrenches[0]) + starting * MAX_OFFSET_DRIFT

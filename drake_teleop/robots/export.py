@@ -79,8 +79,8 @@ def export(
         sign: -1 if the sensor reports the wrench of load on sensor (usual), else 1.
 
     Raises:
-        DrakeTeleopError: for an unknown format, a `sensor_pose` with a format in the sensor's
-            frame, or an inconsistent load with a format that requires a body.
+        DrakeTeleopError: for an unknown format, an inconsistent load, or, if the format is in the
+            sensor's frame, a `sensor_pose` or a wrench without the load's weight.
     """
     if to not in FORMATS:
         raise DrakeTeleopError(
@@ -118,7 +118,6 @@ def export(
 
 
 def _rotation_about(axis: int, angle: float) -> Array:
-    """Return the rotation matrix about the axis 0, 1 or 2."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     R = np.eye(3)
     R[i, i] = R[j, j] = np.cos(angle)

@@ -1,7 +1,7 @@
 """Readings and wrenches as lines of JSON.
 
-Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output:
-number, t, contact and scaled (6 each), and names of flags.
+Input: t [s], wrench (6), s, omega, alpha (3 each); optionally number and saturated. Output: number,
+t, contact and scaled (6 each), and names of flags.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _BLOCK_BYTES = 65536
 
 
 def read_line(line: bytes, number: int) -> Reading:
-    """Return the reading in a line, `DAMAGED` if invalid; `number` is the default number."""
+    """Return the reading in a line, `DAMAGED` if it is invalid; `number` is the default number."""
     if len(line) > _MAX_LINE_BYTES:
         return DAMAGED
     try:
@@ -53,7 +53,7 @@ def flag_names(flags: int) -> list[str]:
 
 
 class LineSource(Source[Reading]):
-    """Source of readings from a growing file, such as standard input."""
+    """Source of readings, as lines of JSON, from a growing file such as standard input."""
 
     live = True
 
@@ -80,7 +80,7 @@ class LineSource(Source[Reading]):
 
 
 class LineSink(Sink):
-    """Sink of unbuffered lines in a text file, such as standard output."""
+    """Sink of unbuffered lines of JSON in a text file such as standard output."""
 
     def __init__(self, file: TextIO) -> None:
         self._file = file

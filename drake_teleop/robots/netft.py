@@ -1,7 +1,6 @@
 """Source for ATI Net F/T and compatible OnRobot sensors: RDT (raw data transfer) over UDP.
 
-A request of 8 bytes starts the stream of records of 36 bytes, both big-endian. It is repeated after
-a silence, so that the stream resumes after a restart of the NetBox.
+A request of 8 bytes starts the stream of records of 36 bytes, both big-endian.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ class Record(NamedTuple):
 
 
 def unpack_record(packet: bytes) -> Record | None:
-    """Return the record in a packet, None if it is invalid."""
+    """Return the record in a packet; None if it is invalid."""
     if len(packet) != RECORD.size:
         return None
     rdt, ft, status, *counts = RECORD.unpack(packet)
@@ -100,7 +99,7 @@ class NetFtSource:
         return found
 
     def part(self, packet: bytes, now: float) -> Part:
-        """Return the wrench in a packet received at time `now`, flagged if it is invalid."""
+        """Return the wrench in a packet received at time `now` [s], flagged if it is invalid."""
         record = unpack_record(packet)
         if record is None:
             return DAMAGED_WRENCH
@@ -153,7 +152,7 @@ def _read_page(address: Address) -> list[float]:
 
 
 def parse_page(content: bytes) -> list[float]:
-    """Return counts per N and N m, and rate [Hz], from netftapi2.xml.
+    """Return counts per N and per N m, and the rate [Hz], from netftapi2.xml.
 
     Raises:
         SyntaxError, KeyError, ValueError: if they are missing or invalid.
@@ -175,8 +174,7 @@ _JUMP_S = 1.0  # a larger step of the number is a restart
 class SampleClock:
     """Clock that derives times from sample numbers.
 
-    The period is first the configured one, after a second the measured one, so that a wrong
-    configured rate causes no growing delay.
+    Its period is first the configured `dt` [s], after a second the measured one.
     """
 
     def __init__(self, dt: float) -> None:

@@ -1,7 +1,6 @@
 """Recorders that collect the samples of a stream and write them as a log.
 
-Readings make a canonical log; parts a table for each stream and a description, log.yaml. When a
-clock is set, a new segment of the record starts; the longest segment is written.
+If a clock is set, a new record starts; the longest one is written.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _T = TypeVar("_T")
 
 
 class Records(ABC, Generic[_T]):
-    """Recorder of samples.
+    """Recorder of samples; `largest`: stream -> largest valid magnitudes (6,), or None.
 
     Attributes:
         file, files: name of the log, and of all written files.
@@ -112,7 +111,10 @@ class Recorder(Records[Reading]):
 
 
 class PartRecorder(Records[tuple[Part, float]]):
-    """Recorder of parts; `largest` as in `Recorder`, `X_FS` as in `Assembly`."""
+    """Recorder of parts: wrenches, and poses or IMU samples.
+
+    `largest` (6,) is the range of the sensor [N, N m]; `X_FS` (7,) its pose in the posed frame.
+    """
 
     file = "log.yaml"
     files: tuple[str, ...] = (file, *(f"{stream}.parquet" for stream in _COLUMNS))
@@ -173,8 +175,6 @@ _FIELDS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 class _Samples:
-    """Samples of one stream; `min_offset` is the minimum of (our clock - its clock) [s]."""
-
     def __init__(self) -> None:
         self.t: list[float] = []
         self._values: list[Array] = []
@@ -184,7 +184,6 @@ class _Samples:
         return bool(self.t) and abs(t - self.t[-1]) > JUMP_S
 
     def add(self, t: float, values: Array, now: float) -> bool:
-        """Add the sample and return True, unless it is out of order."""
         if self.t and t <= self.t[-1]:
             return False
         self.t.append(t)
@@ -193,7 +192,6 @@ class _Samples:
         return True
 
     def table(self, width: int, left_out: int) -> tuple[Array, Array]:
-        """Return times (N,) and values (N, width)."""
         if len(self.t) < 2:
             raise DrakeTeleopError(
                 f"{len(self.t)} good readings received, {left_out} rejected",

@@ -1,7 +1,7 @@
 """Source and sink for ROS 2 with rmw_zenoh, by the library eclipse-zenoh, without ROS.
 
 A topic has the key `DOMAIN/TOPIC/TYPE/HASH`. Messages are CDR, with number, send time and sender
-attached. A liveliness token lists a node in the ROS graph.
+attached.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _NODE = "drake_teleop"
 
 
 def require_libraries(where: str) -> None:
-    """Raise DrakeTeleopError if a library is missing."""
+    """Raise DrakeTeleopError, for the address `where`, if a library is missing."""
     require_library("zenoh", "eclipse-zenoh", "ros", where)
     require_library("rosbags", "rosbags", "ros", where)
 
@@ -53,7 +53,7 @@ def message_types() -> Any:
 
 
 def open_session(address: Address) -> Any:
-    """Return a session with the router at `address`, which may start later."""
+    """Return a session with the zenoh router at `address`, which may start later."""
     import zenoh
 
     config = zenoh.Config()
@@ -76,7 +76,7 @@ def topic_key(domain: int, topic: str, kind: str, hashed: str = "*") -> str:
 
 
 def domain_of(address: Address) -> int:
-    """Return the ROS domain of an address, by default 0; raise DrakeTeleopError if invalid."""
+    """Return the ROS domain in an address, by default 0; raise DrakeTeleopError if invalid."""
     text = address.parameter("domain") or "0"
     if not (text.isdecimal() and text.isascii() and int(text) <= 232):
         raise DrakeTeleopError(f"domain={text!r} is not 0 to 232", where=address.text)
@@ -108,12 +108,12 @@ def liveliness_tokens(
 
 
 def attachment(number: int, ns: int, sender: bytes) -> bytes:
-    """Return the attachment of a message, as in rmw_zenoh since 0.2.4."""
+    """Return the attachment of a message, as in rmw_zenoh since 0.2.4; `ns`: send time."""
     return _ATTACHMENT.pack(number, ns, len(sender), sender)
 
 
 def message_number(attached: bytes) -> int | None:
-    """Return the message number in an attachment, None if absent."""
+    """Return the message number in an attachment; None if it is absent."""
     if len(attached) == _ATTACHMENT.size:
         return int(_NUMBER.unpack_from(attached)[0])
     if attached.startswith(_OLD_PREFIX) and len(attached) >= len(_OLD_PREFIX) + 8:
@@ -127,7 +127,7 @@ def _dds(kind: str) -> str:
 
 
 class Messages:
-    """Converter of ROS 2 messages to parts.
+    """Converter of ROS 2 messages to parts (samples of single streams).
 
     Args:
         sign: see `Address.sign`.
@@ -171,7 +171,6 @@ class Messages:
         ]
 
     def _values(self, name: str, data: Any) -> Array | None:
-        """Return the values; None for joints of another device, such as a gripper."""
         if name == WRENCH:
             wrench = data.wrench
             return self._sign * np.array([*_xyz(wrench.force), *_xyz(wrench.torque)])
@@ -185,7 +184,6 @@ class Messages:
         return np.array([*_xyz(data.linear_acceleration), *_xyz(data.angular_velocity)])
 
     def _transform_pose(self, data: Any) -> list[tuple[Any, Array]]:
-        """Return stamp and pose of the child frame, if this message updates it."""
         newest = {each.child_frame_id: each for each in data.transforms}
         for child, each in newest.items():
             X = each.transform
@@ -312,7 +310,7 @@ class Ros2Sink:
         self._publisher.put(message, attachment=attachment(self._number, ns, self._sender))
 
     def message(self, wrench: Array, ns: int) -> bytes:
-        """Return a WrenchStamped in CDR; `ns`: its time."""
+        """Return a WrenchStamped in CDR; `wrench` (6,) [N, N m], `ns`: its time stamp [ns]."""
         kinds = self._types.types
         vector, stamp = kinds["geometry_msgs/msg/Vector3"], kinds["builtin_interfaces/msg/Time"]
         header = kinds["std_msgs/msg/Header"](stamp(ns // 10**9, ns % 10**9), self._frame)

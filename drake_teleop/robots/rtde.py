@@ -25,7 +25,7 @@ _BLOCK_BYTES = 65536
 
 
 class RtdeSource:
-    """Source of parts at rtde://HOST[?sign=-1], synchronous, 500 or 125 per second.
+    """Source of wrench, TCP pose and tool acceleration at rtde://HOST[?sign=-1], 500 or 125 Hz.
 
     Raises:
         DrakeTeleopError: if the address is invalid, ur_rtde is missing, or no robot answers.
@@ -57,7 +57,6 @@ class RtdeSource:
         return [part for sample in samples for part in parts_of(sample, self.dt, self._sign)]
 
     def _samples(self, timeout_s: float) -> list[tuple[float, ...]]:
-        """Return the received samples; restart an ended child process."""
         if not select.select([self._pipe], [], [], max(0.0, timeout_s))[0]:
             return []
         block = os.read(self._pipe, _BLOCK_BYTES)
@@ -96,7 +95,10 @@ class RtdeSource:
 
 
 def parts_of(sample: tuple[float, ...], dt: float, sign: float) -> list[Part]:
-    """Return wrench, pose and acceleration of a sample."""
+    """Return wrench, pose and acceleration of a sample of `rtde_reader` as parts.
+
+    `dt`: period of the robot [s]; `sign`: see `Address.sign`.
+    """
     t, values = sample[0], np.array(sample[1:])
     number = round(t / dt) if abs(t) < 1e12 else -1
     values_of_stream = {

@@ -1,6 +1,6 @@
 """Child process of `rtde`: writes the samples of ur_rtde to a pipe.
 
-ur_rtde blocks its caller while it connects or ends, writes to stdout, and may abort the process.
+ur_rtde blocks its caller, writes to stdout, and may abort the process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _POLL_S, _MAX_SILENCE_S = 0.0002, 1.0
 
 
 def read(host: str, pipe: int) -> None:
-    """Write samples until the robot disconnects or sends no new ones."""
+    """Write samples to a pipe until the robot disconnects or sends no new ones."""
     import rtde_receive
 
     robot = rtde_receive.RTDEReceiveInterface(host, -1.0, list(VARIABLES))
@@ -34,7 +34,7 @@ def read(host: str, pipe: int) -> None:
 
 
 def main() -> None:
-    """Run `read` with the arguments host and file descriptor."""
+    """Run `read` with the command-line arguments host and file descriptor."""
     try:
         read(sys.argv[1], int(sys.argv[2]))
     finally:

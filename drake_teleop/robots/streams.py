@@ -40,7 +40,11 @@ NONZERO_FLAGS = Flag.WRONG_RATE | Flag.CLIPPED | Flag.IN_CONTACT | Flag.OTHER_LO
 
 
 class Reading(NamedTuple):
-    """Sample of wrench and motion: number, time [s] on the source's clock, values (15,), flags."""
+    """Sample of wrench and motion: number, time [s] on the source's clock, values (15,), flags.
+
+    Values: wrench of sensor on load (6) [N, N m], specific force, angular velocity and acceleration
+    (3 each), in the sensor frame S.
+    """
 
     number: int
     t: float
@@ -67,7 +71,7 @@ ACCELERATION = "acceleration"
 
 
 class Compensated(NamedTuple):
-    """Sample for a sink: contact wrench (6,) and scaled wrench (6,)."""
+    """Sample for a sink: contact wrench (6,) and scaled wrench (6,) [N, N m]."""
 
     number: int
     t: float
@@ -94,7 +98,7 @@ class Source(Protocol[_T]):
     live: bool
 
     def read(self, timeout_s: float) -> list[_T] | None:
-        """Return the samples after waiting for the first; [] if none, None at the end."""
+        """Return the samples after waiting for the first; [] after the timeout, None at the end."""
 
     def close(self) -> None:
         """Close the source."""
@@ -118,7 +122,7 @@ class Sink(Protocol):
     """Interface of a sink of compensated wrenches."""
 
     def write(self, out: Compensated) -> None:
-        """Write a wrench."""
+        """Write a compensated wrench."""
 
     def close(self) -> None:
         """Close the sink."""

@@ -48,7 +48,6 @@ class TableSink:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the rows; a call after an interrupt or an error writes them again."""
         import polars as pl
 
         rows, table = len(self._rows), pl.DataFrame(self._columns())

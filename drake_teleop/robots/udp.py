@@ -37,7 +37,7 @@ def pack_reading(reading: Reading) -> bytes:
 
 
 def unpack_reading(packet: bytes) -> Reading:
-    """Return the reading in a packet, `DAMAGED` if it is invalid."""
+    """Return the reading in a packet; `DAMAGED` if it is invalid."""
     if len(packet) != READING.size or packet[:4] != _READING_TAG:
         return DAMAGED
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -52,7 +52,7 @@ def pack_parts(wrench: Part, pose: Part) -> bytes:
 
 
 def unpack_parts(packet: bytes) -> list[Part]:
-    """Return wrench and pose in a packet, a damaged wrench if it is invalid."""
+    """Return wrench and pose in a packet; a damaged wrench if it is invalid."""
     if len(packet) != POSED.size or packet[:4] != _POSED_TAG:
         return [DAMAGED_WRENCH]
     _, flags, number, t = _HEAD.unpack_from(packet)
@@ -68,7 +68,7 @@ def pack_wrench(out: Compensated) -> bytes:
 
 
 def unpack_wrench(packet: bytes) -> Compensated:
-    """Return the compensated wrench in a packet; raise DrakeTeleopError if invalid."""
+    """Return the compensated wrench in a packet; raise DrakeTeleopError if it is invalid."""
     if len(packet) != WRENCH.size or packet[:4] != _WRENCH_TAG:
         raise DrakeTeleopError("is not a wrench packet", where="packet")
     _, flags, number, t, *values = WRENCH.unpack(packet)
@@ -92,7 +92,7 @@ def endpoint(address: str, port: int | None = None) -> tuple[str, int]:
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that receives UDP packets; raise DrakeTeleopError if it is in use."""
+    """Return a socket that receives UDP packets; raise DrakeTeleopError if the port is in use."""
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiver.bind((host, port))
@@ -158,7 +158,11 @@ class UdpSink:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def write(self, out: Compensated) -> None:
-        """Send a wrench; packets that cannot be sent now are dropped."""
+        """Send a wrench; drop it if it cannot be sent now.
+
+        Raises:
+            DrakeTeleopError: if the host is unknown.
+        """
         try:
             self._socket.sendto(pack_wrench(out), self._to)
         except OSError as error:

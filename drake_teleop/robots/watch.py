@@ -1,7 +1,7 @@
 """Detection of contact or of another load, sample by sample, for `compensate --watch`.
 
-A lasting push appears as another load only if it turns with the tool. With `--free LOG`, contact
-is detected as by `detect`, with a noise floor fitted to a log of free motion.
+With `--free LOG`, contact is detected as by `detect`, with a noise floor fitted to a log of free
+motion.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ _NOISE_BANDWIDTH = 3.0 * math.pi / (8.0 * math.sqrt(2.0))
 
 
 def raw_noise(load: Identification, dt: float, cutoff_hz: float | None) -> Array:
-    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual."""
+    """Return a reading's white noise (6,) [N, N m] that explains the low-passed residual.
+
+    `dt`: period of the readings [s]; `cutoff_hz`: low-pass of the residual of `load`.
+    """
     share = 1.0 if cutoff_hz is None else min(1.0, 2.0 * _NOISE_BANDWIDTH * cutoff_hz * dt)
     return np.maximum(load.residual_rms / math.sqrt(share), MIN_NOISE * math.sqrt(1e-3 / dt))
 
@@ -65,12 +68,12 @@ class Watch:
         self.restart(load.offsets)
 
     def restart(self, offsets: Array) -> None:
-        """Reset all but the identified load; `offsets` (6,): sensor offsets."""
+        """Reset all but the identified load; `offsets` (6,): sensor offsets [N, N m]."""
         self._out = np.concatenate([offsets, self._phi])
         self._memory = watched_memory(self._out, self._covariance)
 
     def flags(self, values: Array) -> int:
-        """Return the flags of a good reading (15,)."""
+        """Return the `Flag` bits of a valid reading (15,): contact, another load, or 0."""
         watched_update(self._out, self._memory, values, self._fallback, self._dt, *self._parameters)
         state = watched_state(self._memory)
         if state == OTHER_LOAD:
@@ -87,8 +90,6 @@ _RATE_TOLERANCE = 0.05
 
 class Detector:
     """Contact detector with the noise floor of a log after the causal low-pass.
-
-    Gravity is the specific force below `_GRAVITY_HZ`.
 
     Args:
         free: log of free motion of the load, at the rate of the stream.
@@ -143,7 +144,6 @@ class Detector:
         self._filters = np.full((2, 12), np.nan)
 
     def _low_passed(self, rows: Array) -> Array:
-        """Return low-passed contact wrench, motion and acceleration (N, 18)."""
         filters, contacts = np.full((2, 12), np.nan), np.full((2, 6), np.nan)
         out = np.empty((len(rows), 18))
         for row, to in zip(rows, out, strict=True):
@@ -153,7 +153,10 @@ class Detector:
         return out
 
     def flags(self, values: Array, contact: Array) -> int:
-        """Return the flags of a good reading (15,) with low-passed contact wrench (6,)."""
+        """Return `Flag.IN_CONTACT` or 0 for a valid reading (15,).
+
+        `contact` (6,): its low-passed contact wrench [N, N m].
+        """
         touched = _detect(
             self._memory, values, contact, self._fast, self._slow, self._filters, self._settings
         )
@@ -167,7 +170,6 @@ def _low_pass(dt: float, cutoff_hz: float) -> Array:
 
 @njit(cache=True)
 def _filter_motion_into(values, fast, slow, filters, out):
-    """Write low-passed motion (9,) and acceleration without gravity (3,)."""
     out[:9] = values[6:]
     low_pass_into(out[:9], fast, filters[:, :9])
     out[9:] = values[6:9]

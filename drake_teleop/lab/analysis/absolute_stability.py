@@ -1,8 +1,7 @@
-"""Stability with any passive hand and environment, or with those in bounded ranges.
+"""Stability with any passive hand and environment, or with those in given ranges.
 
-Hybrid matrices H (..., 2, 2) are on the imaginary axis; results are for each frequency omega
-[rad/s]. Stability also requires h11 and h22 without poles in the right half plane, which the
-station's servo ensures.
+H is the station's hybrid matrix (..., 2, 2) on the imaginary axis (see `two_port`); results are per
+frequency omega [rad/s]. h11 and h22 must have no pole in the right half plane.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _ROUNDING = 1e-12  # relative to the terms that cancel in a criterion
 def llewellyn(H: Complex) -> Real:
     """Return Llewellyn's criterion 2 Re h11 Re h22 - Re(h12 h21) - |h12 h21| (T54).
 
-    Negative: the station is not absolutely stable. Llewellyn, Proc. IRE 40 (1952).
+    Negative: not absolutely stable. Llewellyn, Proc. IRE 40 (1952).
     """
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
@@ -39,7 +38,7 @@ def llewellyn(H: Complex) -> Real:
 def llewellyn_parameter(H: Complex) -> Real:
     """Return Llewellyn's parameter (2 Re h11 Re h22 - Re h12 h21) / |h12 h21|.
 
-    It is at least 1 if the station is absolutely stable.
+    Absolute stability requires at least 1.
     """
     product = np.abs(H[..., 0, 1] * H[..., 1, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -47,7 +46,7 @@ def llewellyn_parameter(H: Complex) -> Real:
 
 
 def absolutely_stable(H: Complex) -> Flags:
-    """Return booleans: True where all passive hands and environments are stable."""
+    """Return booleans: True where the station is stable with every passive hand and environment."""
     h11, h12, h21, h22 = entries(H)
     size = np.abs(h12 * h21) + np.abs(h11 * h22)
     return (
@@ -58,9 +57,9 @@ def absolutely_stable(H: Complex) -> Flags:
 
 
 def required_damping(H: Complex) -> Real:
-    """Return the damping that device or hand lack for absolute stability [N s/m].
+    """Return the device damping [N s/m] that is missing for absolute stability, per frequency.
 
-    The largest value over all frequencies counts; infinite: no damping helps.
+    The maximum over the frequencies counts. inf: none suffices.
     """
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
@@ -72,10 +71,9 @@ def required_damping(H: Complex) -> Real:
 
 
 def raisbeck(H: Complex) -> Real:
-    """Return Raisbeck's criterion 4 Re h11 Re h22 - |h12 + conj(h21)|^2 (T55).
+    """Return Raisbeck's passivity criterion 4 Re h11 Re h22 - |h12 + conj(h21)|^2 (T55).
 
-    Negative: the station is not passive. Use `power_scaled` ports. Raisbeck, J. Appl. Phys. 25
-    (1954).
+    Negative: not passive. Scale H by `power_scaled`. Raisbeck, J. Appl. Phys. 25 (1954).
     """
     h11, h12, h21, h22 = entries(H)
     return 4 * h11.real * h22.real - np.abs(h12 + np.conj(h21)) ** 2
@@ -95,11 +93,8 @@ def passive(H: Complex) -> Flags:
 def positive_real(system: control.lti.LTI) -> bool:
     """Return whether a rational impedance or hybrid matrix is passive at all frequencies.
 
-    The least eigenvalue of G + G^H changes its sign only at eigenvalues of the pencil of G(s) +
-    G(-s)^T; one test between any two of them misses no frequency.
-
     Raises:
-        DrakeTeleopError: if the system is not continuous, square and proper (then pass the
+        DrakeTeleopError: unless the system is continuous, square and proper (if improper, pass the
             admittance).
     """
     import control
@@ -173,9 +168,9 @@ def _squared_abs(z: Complex) -> Real:
 
 
 class WorstLoads(NamedTuple):
-    """Reactances X (...,) of the lossless hand and environment closest to oscillation [N s/m].
+    """Lossless hand and environment closest to oscillation: reactances X (...) [N s/m].
 
-    X > 0 at a frequency w is a mass X / w, X < 0 a spring -X w.
+    At frequency w, X > 0 is a mass X / w, X < 0 a spring -X w.
     """
 
     hand: Real
@@ -184,7 +179,10 @@ class WorstLoads(NamedTuple):
 
 
 def worst_loads(H: Complex) -> WorstLoads:
-    """Return loads that prove a station not absolutely stable; Re h22 must not be 0."""
+    """Return the lossless loads closest to oscillation; Re h22 must not be 0.
+
+    A negative resistance proves that the station is not absolutely stable.
+    """
     h11, h12, h21, h22 = entries(H)
     product = h12 * h21
     size = np.abs(product)
@@ -199,9 +197,9 @@ def worst_loads(H: Complex) -> WorstLoads:
 
 @dataclass(frozen=True)
 class ImpedanceRange:
-    """Range of hands or environments m s + b + k / s; parameters are (smallest, largest).
+    """Range of hand or environment impedances m s + b + k / s; fields are (smallest, largest).
 
-    At one frequency the impedances fill a rectangle.
+    At one frequency it is a rectangle in the complex plane.
     """
 
     mass: tuple[float, float]  #: kg
@@ -217,7 +215,7 @@ class ImpedanceRange:
                 )
 
     def corners(self, omega: Real) -> Complex:
-        """Return the corners (..., 4) of the rectangle of impedances [N s/m], in order."""
+        """Return the corners (..., 4) of the rectangle of impedances [N s/m], counter-clockwise."""
         low = self.mass[0] * omega - self.stiffness[1] / omega
         high = self.mass[1] * omega - self.stiffness[0] / omega
         least, most = self.damping
@@ -226,7 +224,7 @@ class ImpedanceRange:
         )
 
     def contains(self, impedance: Complex, omega: Real) -> Flags:
-        """Return booleans: True where the range has this impedance [N s/m] at omega."""
+        """Return booleans: True where the range contains the impedance [N s/m] at omega [rad/s]."""
         corners = self.corners(omega)
         low, high = corners[..., 0], corners[..., 2]
         return (
@@ -238,7 +236,7 @@ class ImpedanceRange:
 
 
 def range_of_grips() -> ImpedanceRange:
-    """Return the range of hands from the lightest to the firmest grip."""
+    """Return the range of hand impedances from the light to the firm grip."""
     from drake_teleop.station.operator.operator import GRIPS
 
     mass, damping, stiffness = (
@@ -253,11 +251,10 @@ def range_of_grips() -> ImpedanceRange:
 def can_oscillate(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Flags:
-    """Return booleans: True where some hand and environment of the ranges can oscillate (T57).
+    """Return booleans (per omega): True if some hand and environment of the ranges oscillate (T57).
 
-    If no pair can at any frequency, either all pairs are stable or none is (zero exclusion): check
-    one pair. Behind an ideal servo this conclusion holds if the displayed tool mass is less
-    than that of hand and device. The frequencies must be dense.
+    If all are False on a dense grid, the pairs are all stable or all unstable: test one. Behind an
+    ideal servo, hand and device must be heavier than the displayed tool.
     """
     h11, h12, h21, h22 = (entry[..., None, None] for entry in entries(H))
     z, e = hand.corners(omega)[..., :, None], environment.corners(omega)[..., None, :]
@@ -273,10 +270,10 @@ def can_oscillate(
 
 
 def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: float = 0.0) -> Real:
-    """Return the softest wall with which some hand of the range oscillates at each frequency [N/m].
+    """Return the softest wall [N/m] with which some hand of the range oscillates, per omega.
 
-    A wall up to the least value over the frequencies keeps all hands stable that are stable without
-    it. `damping` is the wall's damping [N s/m].
+    Walls below the minimum over omega keep all hands stable that are stable without wall. `damping`
+    is the wall's [N s/m].
     """
     h11, h12, h21, h22 = (entry[..., None] for entry in entries(H))
     z = hand.corners(omega)
@@ -290,9 +287,9 @@ def stiffness_limit(H: Complex, omega: Real, hand: ImpedanceRange, damping: floa
 def _edge_crossings(
     h11: Complex, product: Complex, h22: Complex, z: Complex, dz: Complex, e: Complex, de: Complex
 ) -> tuple[Real, Real]:
-    """Return t and u at which hand z + t dz and wall e + u de oscillate, or nan."""
     # (Z_h + h11)(1 + h22 Z_e) - h12 h21 Z_e = a + b t + (c + d t) u; it is zero where
     # t = -(a + c u) / (b + d u) is real.
+    """Return t and u for which hand z + t dz and wall e + u de oscillate, or nan."""
     hand_side, environment_side = z + h11, 1 + h22 * e
     a, b = hand_side * environment_side - product * e, dz * environment_side
     c, d = (hand_side * h22 - product) * de, dz * h22 * de
@@ -308,9 +305,9 @@ def _edge_crossings(
 def bounded_singular_value(
     H: Complex, omega: Real, hand: ImpedanceRange, environment: ImpedanceRange
 ) -> Real:
-    """Return mu for hands and environments of the ranges; below 1 no pair can oscillate.
+    """Return mu for the hands and environments of the ranges.
 
-    The condition is only sufficient, because the best of five discs replaces each rectangle.
+    Below 1 no pair can oscillate; this is sufficient, not necessary.
     """
     z, r1 = (values[..., :, None] for values in _enclosing_discs(hand.corners(omega)))
     e, r2 = (values[..., None, :] for values in _enclosing_discs(environment.corners(omega)))

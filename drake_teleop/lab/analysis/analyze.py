@@ -75,13 +75,12 @@ def analyze_command(
     """Analyse a scenario; write summary.json, report.html and its pictures into `out`.
 
     Args:
-        scenario: name of a shipped scenario, or a YAML file.
+        scenario: shipped name or YAML file.
         direction: x, y or z of the world.
-        quiet: True hides progress bars and tables.
-        progress: False hides only the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The summary, see the module's docstring.
+        The content of summary.json; the module lists it.
     """
     setup = LoadScenario(scenario)
     make_folder(out)  # before the work, so that a bad path fails early
@@ -98,10 +97,9 @@ def analyze_command(
 def analyze(
     scenario: Scenario, direction: str = "z", progress: bool | Stage = True
 ) -> tuple[dict[str, Any], Curves]:
-    """Return the summary of a scenario along x, y or z of the world, and its curves.
+    """Analyse a scenario, without its passivity method, along the world's x, y or z axis.
 
-    A passivity method, which is not linear, is left out. `progress`: whether or where to show the
-    progress.
+    Return the summary and the curves. `progress`: whether or where to show the progress.
     """
     with show_progress(progress) as stage, one_blas_thread():
         return _analyze(scenario, direction, stage)
@@ -184,7 +182,7 @@ def _analyze(scenario: Scenario, direction: str, stage: Stage) -> tuple[dict[str
 
 
 def describe_wall(scenario: Scenario, is_known: bool) -> str:
-    """Return the source of the wall's stiffness as text."""
+    """Return the source of the analysed wall stiffness as text."""
     if scenario.leaf is not None:
         return "the leaf"
     surroundings = scenario.surroundings
@@ -196,7 +194,7 @@ def describe_wall(scenario: Scenario, is_known: bool) -> str:
 
 
 def sampling_of(scenario: Scenario) -> Sampling:
-    """Return the rates and the sensor's low-pass of a scenario."""
+    """Return the scenario's update rates and its sensor's low-pass."""
     rates, sensor = scenario.rates, scenario.wrist_sensor
     return Sampling(
         rates.hand_hz,
@@ -207,7 +205,11 @@ def sampling_of(scenario: Scenario) -> Sampling:
 
 
 def leaf_displacement(scenario: Scenario) -> list[float]:
-    """Return the displacement of the master [m], in B, that presses the tip 5 mm into the leaf."""
+    """Return the master's displacement [m], in B, that presses the tip 5 mm into the leaf spring.
+
+    Raises:
+        DrakeTeleopError: if the translation scale is 0.
+    """
     assert scenario.leaf is not None
     scaling = scenario.kinematic_scaling
     if scaling.translation_scale == 0:
@@ -223,16 +225,16 @@ def leaf_displacement(scenario: Scenario) -> list[float]:
 
 
 def close_all_loops(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the linear system of a scenario with all loops closed."""
+    """Return the linear model with the loops of hand and network closed."""
     return close_network(system, scenario).close("operator_wrench", "hand_wrench")
 
 
 def close_other_directions(
     system: Linearization, scenario: Scenario, along: TaskDirection
 ) -> Linearization:
-    """Return the linear system with all loops closed except the hand's along the direction.
+    """Return the linear model with all loops closed, except the hand's along the direction.
 
-    If the direction is no axis of B, the hand's whole loop remains open.
+    If it is no axis of B, the hand's loop remains open in all directions.
     """
     system = close_network(system, scenario)
     (aligned,) = np.nonzero(np.abs(along.hand) > 1 - 1e-9)

@@ -1,8 +1,7 @@
 """Loop of the sampled one-axis model, cut at the displayed force: stability for every delay (T60).
 
-If servo and sensor run at the hand's rate or a whole multiple of it, one loop through the channel
-remains: L(z) z^(-D) with D hand periods of round trip. From the crossings of |L| = 1 the argument
-principle counts the unstable multipliers for every D, without the eigenvalues of a long delay.
+The loop is L(z) z^(-D), with a round trip of D hand periods. The argument principle counts its
+unstable multipliers (eigenvalues over a period).
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _UNIT_TOLERANCE = 1e-9  # distance from 1 at which a multiplier counts as 1
 
 @dataclass(frozen=True)
 class CutLoop:
-    """Loop L(z) from displayed force to displayed force, without the channel's delay."""
+    """Loop L(z), from displayed force to displayed force, without the channel's delay."""
 
     open: Complex  #: (..., n) multipliers of the cut loop
     closed: Complex  #: (..., n) multipliers of the loop closed without delay
@@ -41,7 +40,7 @@ class CutLoop:
     def of(
         cls, opened: Complex, closed: Complex, period: ArrayLike, level: ArrayLike = 1.0
     ) -> CutLoop:
-        """Return the loop with these multipliers, and its crossings of |L| = level."""
+        """Return the loop with these multipliers, and its crossings of |L| = level; period [s]."""
         shape, n = opened.shape[:-1], opened.shape[-1]
         found = np.zeros((3, *shape, _MAX_CROSSINGS))
         _find_crossings(
@@ -58,8 +57,8 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
     """Return the model's loop cut at the displayed force; `axis.delay` has no effect.
 
     Raises:
-        DrakeTeleopError: if the servo is ideal, or servo or sensor do not run at a whole multiple
-            of the hand's rate.
+        DrakeTeleopError: for an ideal servo, or a rate of servo or sensor that is no whole multiple
+            of the hand's.
     """
     M = cut_map(axis, sampling)
     n = M.shape[-1] - 3
@@ -71,9 +70,9 @@ def cut_loop(axis: OneAxis, sampling: Sampling) -> CutLoop:
 
 
 def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -> Complex:
-    """Return the loop L(z) z^(-D) (N, ...) at z = e^(j w T); 1 is the stability limit.
+    """Return the loop response L(z) z^(-D) (N, ...) at z = e^(j w T); 1 is the stability limit.
 
-    `frequency`: (N,) w [rad/s]; `delay`: one way [s], (...).
+    D is the round trip in hand periods T. `frequency`: w (N,) [rad/s]; `delay`: one way [s], (...).
     """
     dimensions = max(loop.period.ndim, np.ndim(delay))
     w = np.atleast_1d(np.asarray(frequency, dtype=float)).reshape(-1, *[1] * dimensions)
@@ -84,7 +83,7 @@ def loop_response(loop: CutLoop, frequency: ArrayLike, delay: ArrayLike = 0.0) -
 
 
 def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
-    """Return the number (...) of multipliers of the closed loop outside the unit circle.
+    """Return the number (...) of closed-loop multipliers outside the unit circle.
 
     `delay` is one way [s], (...), not rounded to hand periods.
     """
@@ -97,9 +96,9 @@ def unstable_multipliers(loop: CutLoop, delay: ArrayLike) -> NDArray[np.int64]:
 
 
 def delay_margin(loop: CutLoop) -> Array:
-    """Return the total round trip (...) at which the loop first becomes unstable [s].
+    """Return the total round-trip delay (...) at which the loop first becomes unstable [s].
 
-    0: unstable without delay; infinite: no limit. Longer delays may be stable again.
+    0: unstable without delay; inf: no limit. Longer delays may be stable again.
     """
     inside = (loop.angles > 0) & (loop.angles < np.pi) & (loop.signs != 0)
     steps = np.mod(loop.phases, 2 * np.pi) / np.where(inside, loop.angles, 1.0)
@@ -108,9 +107,9 @@ def delay_margin(loop: CutLoop) -> Array:
 
 
 def dominant_multiplier(loop: CutLoop, delay: ArrayLike) -> Complex:
-    """Return the largest multiplier (...) of the closed loop, with imaginary part >= 0.
+    """Return the closed loop's multiplier (...) of largest magnitude, with imaginary part >= 0.
 
-    No matrix grows with the delay, one way [s], (...); exact at whole hand periods.
+    `delay` is one way [s], (...); the result is exact at whole hand periods.
     """
     shape = np.broadcast_shapes(loop.period.shape, np.shape(delay))
     n = loop.open.shape[-1]

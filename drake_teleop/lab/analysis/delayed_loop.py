@@ -1,11 +1,7 @@
 """Continuous loop with a delay: exact unstable poles, delay margin and windows of stable delays.
 
-The loop L(s) = N(s) / D(s) e^(-s RTT) is cut at the displayed force (T58). A pole can cross the
-imaginary axis only at roots of |N(jw)| = |D(jw)|, at delays 2 pi / w apart and always in the same
-direction (Walton and Marshall 1987; T59). With an ideal servo and a displayed inertia, |L| tends to
-a constant rho at high frequency; with rho >= 1 any delay causes infinitely many unstable poles.
-
-Parameters that are not positive, or N of higher order than D, raise DrakeTeleopError.
+The loop L(s) = N(s) / D(s) e^(-s RTT) is cut at the displayed force (Walton and Marshall 1987; T58,
+T59). Invalid signs, or N of higher order than D, raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DelayedLoop:
-    """Loop L(s) = N(s) / D(s) e^(-s delay), or a grid of such loops."""
+    """Loop L(s) = N(s) / D(s) e^(-s delay), or a grid (...) of such loops."""
 
     numerator: Array  #: coefficients (..., n + 1), highest power first
     denominator: Array  #: coefficients, at least of the numerator's order
@@ -75,7 +71,7 @@ class DelayedLoop:
         return control.frd(self(1j * omega), omega)
 
     def __call__(self, s: ArrayLike) -> Complex:
-        """Return the loop L (n, *grid) at s (n,) [rad/s]."""
+        """Return the loop L(s) (n, *grid) at s (n,) [rad/s]."""
         s = np.asarray(s, dtype=complex)
         return self._at(s.reshape(s.shape + (1,) * self.delay.ndim))
 
@@ -93,7 +89,7 @@ class DelayedLoop:
 
 
 def held_device(axis: OneAxis) -> tuple[Array, Array, Array]:
-    """Return mass, damping and stiffness of hand and device together."""
+    """Return mass [kg], damping [N s/m] and stiffness [N/m] of hand and device together."""
     mass = checked_positive(
         np.asarray(axis.hand_mass) + axis.device_mass, "mass of hand and device"
     )
@@ -107,11 +103,11 @@ def held_device(axis: OneAxis) -> tuple[Array, Array, Array]:
 
 
 def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
-    """Return the loop of a station at the displayed force, on its wall or in free motion.
+    """Return the station's loop, cut at the displayed force; `contact=False` removes the wall.
 
     L = k_f l_p G (gamma (b_e s + k_e) + M s^2) / (m s^2 + b s + k) e^(-2 s T), with
-    G = g / (s^2 + k_v s + g + (b_e s + k_e) / m_s), g = k_v k_p, or 1 for an ideal servo;
-    m, b, k of hand and device; displayed tool mass M. Arrays as fields of the axis form the grid.
+    G = g / (s^2 + k_v s + g + (b_e s + k_e) / m_s), g = k_v k_p, or G = 1 for an ideal servo;
+    m, b, k of hand and device together; M the displayed tool mass; other symbols as in `one_axis`.
     """
     if not contact:
         axis = replace(axis, wall_stiffness=0.0, wall_damping=0.0)
@@ -136,7 +132,7 @@ def station_loop(axis: OneAxis, *, contact: bool = True) -> DelayedLoop:
 
 
 def gain_crossings(loop: DelayedLoop) -> tuple[Array, Array]:
-    """Return where |L(jw)| = 1, and the direction in which poles cross there as the delay grows.
+    """Return where |L(jw)| = 1, and the direction in which growing delay moves poles there.
 
     Returns:
         frequency (..., n) [rad/s], NaN if unused; direction (..., n): 1 into the right half plane
@@ -164,15 +160,15 @@ def unstable_poles(loop: DelayedLoop) -> Array:
 
 
 def delay_margin(loop: DelayedLoop) -> Array:
-    """Return the delay (...) that may be added before the loop becomes unstable [s].
+    """Return the additional delay (...) [s] at which the loop becomes unstable.
 
-    inf: any delay; 0: the loop is already unstable.
+    inf: stable with any delay; 0: already unstable.
     """
     return margin_of_delay(loop, unstable_poles(loop) == 0)[0]
 
 
 def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]]:
-    """Return the windows of delay in [0, longest] in which a single loop is stable."""
+    """Return the windows (start, end) of delay [s] in [0, longest] with a stable single loop."""
     if loop.delay.ndim:
         raise DrakeTeleopError("windows of stable delays are those of a single loop")
     if loop.high_frequency_gain >= 1:
@@ -194,7 +190,7 @@ def stable_delays(loop: DelayedLoop, longest: float) -> list[tuple[float, float]
 
 
 def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Return the delay margin, and the frequency at which a pole reaches the imaginary axis."""
+    """Return the delay margin (...) [s] and the frequency [rad/s] of the crossing pole."""
     frequency, _ = gain_crossings(loop)
     past = np.mod(phase_lag_to_minus_one(loop, frequency), 2 * np.pi)
     margin, at = min_without_nan(past / frequency, frequency)
@@ -203,7 +199,7 @@ def margin_of_delay(loop: DelayedLoop, stable: NDArray[np.bool_]) -> tuple[Array
 
 
 def phase_lag_to_minus_one(loop: DelayedLoop, frequency: Array) -> Array:
-    """Return the phase lag [rad] that moves each loop to -1, at frequencies (..., n)."""
+    """Return the phase lag [rad] that rotates L to the angle of -1, at frequencies (..., n)."""
     along = DelayedLoop(
         loop.numerator[..., None, :], loop.denominator[..., None, :], loop.delay[..., None]
     )
@@ -223,7 +219,7 @@ def _unstable_without_delay(loop: DelayedLoop) -> Array:
 
 
 def min_without_nan(value: Array, at: Array, axis: int = -1) -> tuple[Array, Array]:
-    """Return the least value along the axis without NaN, or inf, and the entry of `at` there."""
+    """Return the minimum without NaN, or inf, and the entry of `at` there."""
     value = np.where(np.isnan(value), np.inf, value)
     if not value.shape[axis]:
         shape = np.delete(value.shape, axis)
@@ -240,7 +236,7 @@ def angle_of(value: Complex) -> Array:
 
 
 def checked_positive(value: ArrayLike, what: str) -> Array:
-    """Return the value as an array; raise if it is not positive."""
+    """Return the value as an array; raise DrakeTeleopError unless it is positive."""
     value = np.asarray(value, dtype=float)
     if not np.all(value > 0):
         raise DrakeTeleopError(f"the {what} is not positive")
@@ -253,7 +249,7 @@ def stack_coefficients(*coefficients: Any) -> Array:
 
 
 def multiply_polynomials(p: Array, q: Array) -> Array:
-    """Return the product of polynomials."""
+    """Return the product of polynomials (..., n), highest power first."""
     n = q.shape[-1]
     grid = np.broadcast_shapes(p.shape[:-1], q.shape[:-1])
     product = np.zeros((*grid, p.shape[-1] + n - 1))
@@ -263,13 +259,13 @@ def multiply_polynomials(p: Array, q: Array) -> Array:
 
 
 def squared_magnitude(p: Array) -> Array:
-    """Return the polynomial |p(jw)|^2 in x = w^2: p(s) p(-s) with s^2 = -x."""
+    """Return |p(jw)|^2 as a polynomial in x = w^2."""
     powers = np.arange(p.shape[-1] - 1, -1, -1)
     return multiply_polynomials(p, p * (-1.0) ** powers)[..., ::2] * (-1.0) ** powers
 
 
 def polynomial_value(p: Array, x: Any) -> Any:
-    """Return p(x) by Horner's method."""
+    """Return p(x); coefficients (..., n), highest power first."""
     value = p[..., 0] + 0 * x
     for i in range(1, p.shape[-1]):
         value = value * x + p[..., i]
@@ -277,7 +273,7 @@ def polynomial_value(p: Array, x: Any) -> Any:
 
 
 def polynomial_roots(p: Array) -> Complex:
-    """Return the roots (..., n) of a polynomial; a leading zero gives a very large root."""
+    """Return the roots (..., n) of polynomials; a leading zero gives a very large root."""
     order = p.shape[-1] - 1
     if order == 0:
         return np.zeros((*p.shape[:-1], 0), dtype=complex)

@@ -1,4 +1,4 @@
-"""Numbers in the summary of `drake-teleop analyze`, one function for each part."""
+"""Numbers in the summary of `drake-teleop analyze`, one function for each section."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _MULTI_SINE = MultiSine(lowest=0.6, period=1.5, settle=1.0)
 
 
 def with_grip(axis: OneAxis, grip: str) -> OneAxis:
-    """Return the axis with another grip of the hand."""
+    """Return the axis with the hand impedance of a grip: light, medium or firm."""
     hand = GRIPS[grip]
     return dataclasses.replace(
         axis, hand_mass=hand.mass, hand_damping=hand.damping, hand_stiffness=hand.stiffness
@@ -59,7 +59,10 @@ def with_grip(axis: OneAxis, grip: str) -> OneAxis:
 def diagram_figures(
     name: str, system: Linearization, axis: OneAxis, sampling: Sampling
 ) -> dict[str, Any]:
-    """Return stability and slowest motion; above `MAX_STATES` states only of the one-axis model."""
+    """Return stability and slowest motion of the linearised Diagram.
+
+    Above `MAX_STATES` states only those of the one-axis model.
+    """
     lines = sum(len(outputs) * periods for outputs, _, periods in system.loops)
     loop = cut_loop(axis, sampling)
     one_axis = _slowest_motion(complex(dominant_multiplier(loop, axis.delay)), float(loop.period))
@@ -85,7 +88,10 @@ def _slowest_motion(multiplier: complex, period: float) -> dict[str, Any]:
 
 
 def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the Diagram's deviations from two one-axis models, hand's mass included."""
+    """Return the largest relative deviation of the Diagram's H from two one-axis models.
+
+    `with_hand`: that H (n, 2, 2), hand's mass included, at `OMEGA`; compared up to 30 Hz.
+    """
     compared = OMEGA <= COMPARISON_BAND
     with_hand_mass = dataclasses.replace(axis, device_mass=axis.device_mass + axis.hand_mass)
 
@@ -100,7 +106,7 @@ def two_port_deviations(with_hand: Complex, axis: OneAxis, sampling: Sampling) -
 
 
 def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict[str, Any]]:
-    """Return the margins of the sampled loop for each grip and wall."""
+    """Return the sampled loop's margins for each grip and wall; `own_wall` in N/m."""
     rows = []
     omega = np.geomspace(1e-2, np.pi * sampling.hand_hz, 6000)
     for grip in GRIPS:
@@ -127,7 +133,7 @@ def margin_rows(axis: OneAxis, sampling: Sampling, own_wall: float) -> list[dict
 
 
 def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
-    """Return criteria of stability and passivity with arbitrary passive loads."""
+    """Return criteria of stability and passivity with any passive hand and environment."""
     parameter = absolute_stability.llewellyn_parameter(H)
     worst = int(np.argmin(parameter))
     scaled = power_scaled(H, power_ratio(axis)) if power_ratio(axis) > 0 else H
@@ -143,7 +149,7 @@ def absolute_figures(H: Complex, axis: OneAxis) -> dict[str, Any]:
 
 
 def bounded_figures(H: Complex, axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest stable wall for all hands between two grips, and for each grip."""
+    """Return the stiffest stable wall [N/m]: for all hands between light and firm, and per grip."""
     hands = absolute_stability.range_of_grips()
     limit = float(absolute_stability.stiffness_limit(H, OMEGA, hands).min())
     each = {grip: _stiffest_stable_wall(with_grip(axis, grip), sampling) for grip in GRIPS}
@@ -159,7 +165,10 @@ def _stiffest_stable_wall(axis: OneAxis, sampling: Sampling) -> float:
 
 
 def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -> dict[str, Any]:
-    """Return displayed and ideal impedance in free motion and at the wall, and tracking."""
+    """Return displayed and ideal impedance in free motion and at the wall, and tracking figures.
+
+    `wall` is stiffness [N/m] and damping [N s/m].
+    """
     fitted = OMEGA <= _FIT_BAND
     figures: dict[str, Any] = {}
     environments = {"free": np.zeros_like(S), "wall": wall[1] + wall[0] / S}
@@ -189,7 +198,7 @@ def transparency_figures(H: Complex, axis: OneAxis, wall: tuple[float, float]) -
 
 
 def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
-    """Return the stiffest virtual walls that the device itself could render."""
+    """Return the stiffest virtual walls that the device itself can render (Z-width)."""
     damping, period = np.linspace(0.0, 60.0, 31), 1 / sampling.hand_hz
     passive = sampled_wall.passive_stiffness(axis.device_damping, damping, period)
     stable = sampled_wall.stable_stiffness(
@@ -218,9 +227,9 @@ def z_width_figures(axis: OneAxis, sampling: Sampling) -> dict[str, Any]:
 def measured_figures(
     scenario: Scenario, along: TaskDirection, system: Linearization
 ) -> dict[str, Any]:
-    """Return the impedance displayed in free motion, measured in the nonlinear simulation.
+    """Measure the impedance displayed in free motion, by simulation without Coulomb friction.
 
-    The simulation has noise but no friction.
+    Errors are relative to the linear model `system`.
     """
     frictionless = scenario.master.without_coulomb_friction()
     free = scenario.without_environment()
@@ -248,7 +257,7 @@ def measured_figures(
 def parameter_maps(
     axis: OneAxis, wall: tuple[float, float], sampling: Sampling, stage: Stage
 ) -> dict[str, dict[str, StabilityMap]]:
-    """Return the stability maps: title -> grip -> map."""
+    """Return stability maps over pairs of parameters: title -> grip -> map."""
     touching = dataclasses.replace(axis, wall_stiffness=wall[0], wall_damping=wall[1])
     n, tool = _MAP_POINTS, axis.tool_mass
     delay, sigma = np.linspace(0.0, 0.2, n), np.linspace(0.0, 2.0, n)

@@ -1,9 +1,4 @@
-"""Frequency responses of the whole nonlinear station, measured with a multi-sine of the operator.
-
-The frequencies are odd multiples of a fundamental, so that even distortion is between the lines.
-Spectra are averaged over the periods before they are divided, so that noise cancels in a closed
-loop too (T64).
-"""
+"""Frequency responses of the nonlinear station, measured with a multi-sine motion (T64)."""
 
 from __future__ import annotations
 
@@ -34,7 +29,7 @@ _APPARENT_MASS_BAND = 2 * np.pi * 10.0  # rad/s, limit of the fit of the apparen
 
 @dataclass(frozen=True)
 class MultiSine:
-    """Multi-sine motion that the operator intends."""
+    """Intended motion of the operator: a sum of sines with random phases and a low peak."""
 
     lowest: float = 0.5  #: Hz
     highest: float = 31.0  #: Hz
@@ -46,13 +41,13 @@ class MultiSine:
     seed: int = 0  #: seed of the random phases
 
     def multiples(self) -> NDArray[np.int64]:
-        """Return the odd multiples (n,) of 1 / period in the motion."""
+        """Return the odd multiples (n,) of 1 / period that the motion contains."""
         spaced = np.geomspace(self.lowest * self.period, self.highest * self.period, self.lines)
         odd: NDArray[np.int64] = np.unique(2 * np.floor((spaced - 1) / 2 + 1e-9).astype(int) + 1)
         return odd[odd > 0]
 
     def segments(self, direction: Array, start: float) -> list[Sine]:
-        """Return the intended motion along `direction` (6,) in B, from `start` [s]."""
+        """Return one sine motion per frequency, along `direction` (6,) in B, from `start` [s]."""
         frequencies = self.multiples() / self.period
         amplitudes = self.velocity / (2 * np.pi * frequencies)
         duration = self.settle + self.period * self.periods + self.settle
@@ -84,8 +79,8 @@ class MultiSine:
 class StationResponse:
     """Spectra of the station's signals along a direction, measured or predicted.
 
-    The signals: `hand_force` on the stylus [N], `hand_velocity` [m/s], `felt_force` displayed by
-    the device [N], `tool_velocity` at the tip [m/s].
+    Signals: `hand_force`, of the hand on the stylus [N]; `hand_velocity` [m/s]; `felt_force`,
+    displayed by the device [N]; `tool_velocity`, of the tip [m/s].
     """
 
     omega: Array  #: (n,) [rad/s]
@@ -93,24 +88,24 @@ class StationResponse:
     force_scale: float
 
     def response(self, output: str, input_: str) -> Complex:
-        """Return the ratio (n,) of two spectra, output over input."""
+        """Return the frequency response (n,), output over input."""
         ratio: Complex = self.spectra[output].mean(axis=0) / self.spectra[input_].mean(axis=0)
         return ratio
 
     def coherence(self, output: str, input_: str) -> Array:
-        """Return the fraction (n,) of the output's power that is linear in the input."""
+        """Return the coherence (n,): fraction of the output's power that is linear in the input."""
         y, x = self.spectra[output], self.spectra[input_]
         cross = np.abs((y * x.conj()).sum(axis=0)) ** 2
         power = (np.abs(y) ** 2).sum(axis=0) * (np.abs(x) ** 2).sum(axis=0)
         return cross / power
 
     def apparent_mass(self) -> float:
-        """Return the tool mass displayed to the hand, in the slave's units [kg]; ideally sigma m_t.
+        """Return the displayed tool mass, at the slave's scale [kg]; ideal: sigma times tool mass.
 
-        The mass is extrapolated to frequency 0, for delays far below 0.1 s.
+        Valid for delays far below 0.1 s.
 
         Raises:
-            DrakeTeleopError: if fewer than three lines are below 10 Hz.
+            DrakeTeleopError: if fewer than three frequencies are below 10 Hz.
         """
         low = self.omega <= _APPARENT_MASS_BAND
         if np.count_nonzero(low) < 3:
@@ -143,10 +138,10 @@ def measure_frequency_response(
     load_estimate: Array | None = None,
     approach: Sequence[MinimumJerk] = (),
 ) -> StationResponse:
-    """Simulate the station with a multi-sine of the operator and return the spectra.
+    """Simulate the station with a multi-sine motion of the operator and return the spectra.
 
     Args:
-        scenario: scenario whose intent is replaced.
+        scenario: scenario whose intended motion is replaced.
         load_estimate: (16,) as for `MakeTeleopStation`.
         approach: motions to the operating point, before the multi-sine.
 
@@ -193,7 +188,10 @@ def predict_frequency_response(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> StationResponse:
-    """Return the spectra that the linearised Diagram predicts; see `linearize_station`."""
+    """Return the spectra at omega (n,) [rad/s] that the linearised Diagram predicts.
+
+    They are for a unit force; other arguments: see `linearize`.
+    """
     system = linearize_station(scenario, load_estimate=load_estimate, displacement=displacement)
     first = system.inputs.index("hand_wrench.x")
     pushed = system.frequency_response(omega)[:, :, first : first + 6] @ task.hand

@@ -1,7 +1,6 @@
-"""The station's Diagram, linearised at rest (long: a model and how it is computed).
+"""The station's Diagram, linearised at rest by simulation (long: a model and how it is computed).
 
-Each state is displaced up and down and the Diagram simulated for one period of the hand (T63). The
-loops are cut at
+The loops are cut at (T63)
 
     loop                       output              input
     hand on the stylus         operator_wrench     hand_wrench      F_E_B at E, in B
@@ -9,7 +8,7 @@ loops are cut at
     network, slave to master   wrench_B            wrench_received  F_E_B, in B
 
 The input `tool_wrench` acts on the tool, about So, in W. Inputs are held for a period. The model
-excludes noise, offset, quantisation and saturation of the sensor, and all Coulomb friction.
+excludes the sensor's noise, offset, quantisation and saturation, and all Coulomb friction.
 """
 
 from __future__ import annotations
@@ -66,9 +65,9 @@ _EIGENVALUES_PER_SHIFT = 40  # eigenvalues per shift
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Linear model x' = A x + B u, y = C x + D u over one period, and delayed loops.
+    """Linear model of one period, x[k+1] = A x + B u, y = C x + D u, and delayed feedback loops.
 
-    Parts of a port are "port.x", ..., "port.rz": poses as translation [m] and rotation vector
+    Components of a port are "port.x", ..., "port.rz": poses as translation [m] and rotation vector
     [rad], wrenches [N, N m], twists [m/s, rad/s].
     """
 
@@ -88,7 +87,7 @@ class Linearization:
     ) -> Linearization:
         """Return the model with outputs fed back to inputs, u += z^-periods y; the inputs remain.
 
-        `outputs` and `inputs` are a port's name, or names of its parts; other names raise an error.
+        Outputs and inputs: a port or a list of components; other names raise DrakeTeleopError.
         """
         rows, columns = self._indices(outputs, self.outputs), self._indices(inputs, self.inputs)
         if periods > 0:
@@ -97,7 +96,7 @@ class Linearization:
         return dataclasses.replace(self, A=A)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G(e^(j omega dt)) (n, outputs, inputs) at omega (n,) [rad/s]."""
+        """Return the response G(e^(j omega dt)) (n, outputs, inputs) at omega (n,) [rad/s]."""
         z = np.exp(1j * np.asarray(omega, dtype=float) * self.dt)
         identity = np.eye(len(self.A))
         # Solve for each frequency: a chain of delays has no basis of eigenvectors.
@@ -112,10 +111,10 @@ class Linearization:
 
     @property
     def multipliers(self) -> Complex:
-        """Eigenvalues over a period, largest first; stable if all magnitudes are below 1.
+        """Eigenvalues over one period, largest first; stable if all magnitudes are below 1.
 
-        Above 800 states, delay included: only those near the unit circle up to 100 Hz. Above 8000
-        states, DrakeTeleopError is raised.
+        Above 800 states (with delays) only those near the unit circle up to 100 Hz; above 8000,
+        DrakeTeleopError.
         """
         size = len(self.A) + sum(len(rows) * periods for rows, _, periods in self.loops)
         if size <= _MAX_DENSE_STATES:
@@ -155,7 +154,7 @@ class Linearization:
         return result
 
     def to_control(self) -> Any:
-        """Return a discrete `control.StateSpace`; "port.x" becomes "port[x]"."""
+        """Return a discrete `control.StateSpace`; the name "port.x" becomes "port[x]"."""
         import control
 
         system = self.expanded()
@@ -186,7 +185,6 @@ def _use_brackets(name: str) -> str:
 
 
 def _find_eigenvalues_near_circle(A: Any, highest: float) -> Complex:
-    """Return eigenvalues of a sparse A near the unit circle, by shift and invert."""
     from scipy.sparse.linalg import eigs
 
     start = np.random.default_rng(0).standard_normal(A.shape[0]).astype(complex)
@@ -222,10 +220,10 @@ def linearize(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Linearization:
-    """Return the Diagram of a scenario, linearised at rest with its loops cut.
+    """Return the scenario's Diagram, linearised at rest with its loops cut.
 
     Args:
-        scenario: its intent, network and passivity method have no effect.
+        scenario: its intended motion, network and passivity method have no effect.
         load_estimate: (16,) as for `MakeTeleopStation`.
         displacement: of the master from its start [m], in B; the slave follows.
 
@@ -261,7 +259,7 @@ def linearize_station(
 ) -> Linearization:
     """Return the linearised Diagram with all loops closed, over the scenario's constant delays.
 
-    See `linearize`; a passivity method raises an error, because it is not linear.
+    Arguments: see `linearize`. A passivity method is not linear and raises DrakeTeleopError.
     """
     check_scenario(scenario)
     if scenario.passivity.method != "none":
@@ -275,7 +273,7 @@ def linearize_station(
 
 
 def close_network(system: Linearization, scenario: Scenario) -> Linearization:
-    """Return the system with its loops closed over the network's constant delays."""
+    """Return the model with both network loops closed, each with its constant delay."""
     forward, backward = delays(scenario)
     system = system.close("pose_command", "pose_received", forward)
     return system.close("wrench_B", "wrench_received", backward)
@@ -284,7 +282,7 @@ def close_network(system: Linearization, scenario: Scenario) -> Linearization:
 def delays(scenario: Scenario) -> tuple[int, int]:
     """Return the delays of pose and wrench over the network, in hand periods.
 
-    The delays are 0 for an ideal network without a passivity method, otherwise at least 1.
+    Both are 0 for an ideal network without a passivity method, otherwise at least 1.
     """
     lines = scenario.channel.lines()
     if scenario.passivity.method == "none" and lines == (type(lines[0])(), type(lines[0])()):
@@ -296,10 +294,10 @@ def delays(scenario: Scenario) -> tuple[int, int]:
 
 
 def hybrid_along(system: Linearization, omega: Array, hand: Array, tool: Array) -> Complex:
-    """Return the hybrid matrix H (n, 2, 2) along one direction (see `TaskDirection`).
+    """Return the hybrid matrix H (n, 2, 2) along one direction, at omega (n,) [rad/s], not zero.
 
-    In `system` the hand loop is cut in that direction. The hand's mass is part of the device.
-    Forces are those of `sampled_two_port`. omega: (n,) [rad/s], not zero.
+    `hand` and `tool` (6,): see `TaskDirection`. In `system` the hand's loop is cut in this
+    direction. H includes the hand's mass; the spectrum of held forces is divided out.
     """
     G = system.frequency_response(omega)
     i, o = list(system.inputs), list(system.outputs)
@@ -329,8 +327,6 @@ def _states_affecting_outputs(A: Array, C: Array) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class _States:
-    """States of one block: `part` of a discrete `group` or of the continuous state."""
-
     system: str
     group: int | None
     part: slice | NDArray[np.intp]
@@ -455,7 +451,6 @@ class _Period:
         self._sensor.reset_queue(self._context("wrist_sensor"))
 
     def _apply(self, u: Array) -> None:
-        """Set the cut inputs to those of the operating point plus `u` (24,)."""
         self._fix("master_device", "hand_wrench_E", self._hand + u[:6])
         self._fix("inverse_kinematics", "pose_command", _displace(self._pose, u[6:12]))
         self._fix("force_display", "wrench_command", self._wrench + u[12:18])
@@ -495,7 +490,6 @@ class _Period:
         )
 
     def rest(self, displacement: Array) -> tuple[Array, Array, Array]:
-        """Return states, A and C at the operating point; set the cut inputs to balance it."""
         start = self._pose
         pose_B = self._start_B.copy()
         pose_B[4:] += displacement
@@ -527,7 +521,6 @@ class _Period:
         return self.get()
 
     def _find_equilibrium(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the slave's states at rest, A and C, by Newton's method."""
         slave = np.array([not name.startswith("master") for name in self.states])
         for _ in range(_MAX_NEWTON_STEPS):
             A, C = self.derivative(x)

@@ -1,8 +1,4 @@
-"""Stability maps: stability and distortion of the sampled loop over two parameters.
-
-`cut_loop` counts unstable multipliers; bisection refines the boundaries. The delay is not rounded
-to hand periods, so that boundaries are smooth.
-"""
+"""Stability maps: stability and distortion of the sampled loop over two parameters."""
 
 from __future__ import annotations
 
@@ -40,7 +36,7 @@ _DISTORTION_BAND = 2 * np.pi * np.array([0.5, 1.0, 2.0, 5.0])  # rad/s, delibera
 
 @dataclass(frozen=True)
 class StabilityMap:
-    """Stability and distortion over a grid of two parameters."""
+    """Stability, and distortion of the force at the hand, over a grid of two parameters."""
 
     x_name: str
     y_name: str
@@ -67,9 +63,9 @@ def stability_map(
     """Return stability and distortion over a grid of two parameters.
 
     Args:
-        x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's [Hz], the other
-            rates in proportion.
-        x, y: (nx,), (ny,) increasing values.
+        x_name, y_name: fields of `OneAxis`, "low_pass_hz", or "rate": the hand's rate [Hz], with
+            the other rates in proportion.
+        x, y: increasing values (nx,), (ny,).
 
     Raises:
         DrakeTeleopError: for another name, values that do not increase, or the reasons of
@@ -105,10 +101,9 @@ def stability_map(
 
 
 def distortion(axis: OneAxis, loop: CutLoop, frequency: ArrayLike = _DISTORTION_BAND) -> Array:
-    """Return the largest relative error (...) of the hand's total force over a band [rad/s].
+    """Return the largest relative error (...) of the operator's force over `frequency` [rad/s].
 
-    The total moves hand and device against the displayed force; the reference has the
-    `ideal_impedance`.
+    The force moves hand and device against the displayed force; reference: `ideal_impedance`.
     """
     shape = np.broadcast_shapes(
         loop.period.shape, *(np.shape(getattr(axis, entry.name)) for entry in fields(axis))

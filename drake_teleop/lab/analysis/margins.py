@@ -25,8 +25,7 @@ from drake_teleop.lab.analysis.delayed_loop import (
 class Margins:
     """Stability margins of a loop, or of each loop of a grid (...).
 
-    An unstable loop has gain 1, phase 0, delay 0. Without a limit the margin is inf, its frequency
-    NaN.
+    Unstable: gain 1, phase 0, delay 0. Without limit: inf, and frequency NaN.
     """
 
     unstable_poles: Array  #: number of them in the closed loop
@@ -39,11 +38,7 @@ class Margins:
 
 
 def margins(loop: DelayedLoop) -> Margins:
-    """Return the margins of a loop from its coefficients; the delay is exact.
-
-    The gain margin needs a grid of frequencies for each loop: for large grids of parameters use
-    `delay_margin` and `unstable_poles`.
-    """
+    """Return the margins of a loop from its coefficients; the delay is exact."""
     unstable = unstable_poles(loop)
     stable = unstable == 0
     frequency, _ = gain_crossings(loop)
@@ -73,9 +68,7 @@ def margins_of_response(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Margins:
-    """Return the margins of loops from their frequency responses, measured or sampled.
-
-    log |L| and the phase are interpolated linearly in log w.
+    """Return the margins of loops from their frequency responses, interpolated in log w.
 
     Args:
         omega: (n,) frequencies [rad/s], increasing, positive.
@@ -126,15 +119,13 @@ def encirclements(
     poles_at_origin: int = 0,
     sampled: bool = False,
 ) -> Array:
-    """Return the number (...) of unstable closed-loop poles, by the encirclements of -1.
-
-    A continuous response must extend to where |L| < 1 remains, a sampled one to half the sampling
-    rate.
+    """Return the number (...) of unstable closed-loop poles by Nyquist's encirclements of -1.
 
     Args:
-        response: (n, ...) loop L at increasing frequencies from near zero.
+        response: (n, ...) loop L at increasing frequencies, from near zero to where |L| remains
+            below 1 (continuous) or to half the sampling rate (`sampled`).
         open_loop_poles: number of unstable poles of L.
-        poles_at_origin: number at s = 0 or z = 1; the contour passes them on the unstable side.
+        poles_at_origin: number of poles of L at s = 0 or z = 1.
 
     Raises:
         DrakeTeleopError: if the frequencies are too coarse, or end too early.
@@ -183,14 +174,14 @@ def _gain_margin(loop: DelayedLoop) -> tuple[float, float]:
 
 
 def break_frequencies(loop: DelayedLoop) -> tuple[float, float]:
-    """Return the least and largest magnitude of the poles of N / D, except 0."""
+    """Return the smallest and largest magnitude of the poles of N / D, without 0 [rad/s]."""
     breaks = np.abs(polynomial_roots(loop.denominator))
     breaks = breaks[breaks > 0]
     return float(np.min(breaks, initial=1.0)), float(np.max(breaks, initial=1.0))
 
 
 def frequency_grid(loop: DelayedLoop, slow: float, top: float) -> Array:
-    """Return frequencies up to `top`, between which L and its delay rotate little."""
+    """Return frequencies [rad/s] up to `top`, dense enough for the phase of L."""
     step = np.pi / 8 / max(float(loop.delay), 1 / top)
     return np.union1d(np.geomspace(1e-3 * slow, top, 1000), np.arange(step, top, step))
 

@@ -1,14 +1,11 @@
 """Sampled one-axis model of the station over the common period of its rates.
 
-The map keeps the order of events. All updates at one instant read earlier values:
+Order of events; all updates at one instant read earlier values:
 
 * The device advances by one hand period with held force; the other blocks read its prediction.
 * The servo reads the command and the slave's state; its force is held.
-* The sensor samples just before the servo's update; its low-pass, if any, is digital.
+* The sensor samples just before the servo's update; its low-pass is digital.
 * A channel with a delay of d hand periods returns its input of d periods ago.
-
-Between events, matrix exponentials are exact. Fields of `OneAxis` and `Sampling` may be arrays that
-broadcast; results have their shape in front.
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ _MAX_EVENTS = 1000
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rates of the station; defaults: those of the shipped scenarios, with the ideal sensor."""
+    """Rates of the station; default: those of the shipped scenarios, with the ideal sensor."""
 
     hand_hz: float = 2000.0  #: of haptic device and channel
     joint_control_hz: float = 2000.0
@@ -44,13 +41,17 @@ class Sampling:
 
 
 def delay_steps(axis: OneAxis, sampling: Sampling) -> int:
-    """Return the one-way delay in hand periods: rounded, at least 1 for a positive delay."""
+    """Return the one-way delay in whole hand periods, at least 1 for a positive delay."""
     steps = math.floor(axis.delay * sampling.hand_hz + 0.5)
     return max(steps, 1) if axis.delay > 0 else 0
 
 
 def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
-    """Return the map (..., n + 3, n + 3) over the hand's period, for the cut loop without delay."""
+    """Return the map (..., n + 3, n + 3) over one hand period, for the cut loop without delay.
+
+    Raises:
+        DrakeTeleopError: if the rate of servo or sensor is no whole multiple of the hand's rate.
+    """
     M, periods = period_map(axis, sampling, 0, cut=True)
     if periods != 1:
         raise DrakeTeleopError(
@@ -64,7 +65,12 @@ def cut_map(axis: OneAxis, sampling: Sampling) -> Array:
 def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> tuple[Array, int]:
     """Return the matrix over the common period of all rates, and the hand periods in it.
 
-    The matrix (..., n + 3, n + 3) maps [states; held inputs; force received].
+    The matrix (..., n + 3, n + 3) maps n states, two held inputs and the received force. `steps`:
+    one-way delay in hand periods; `cut`: the received force is an input.
+
+    Raises:
+        DrakeTeleopError: for an ideal servo, rates without short common period, or a low-pass not
+            below half the sensor's rate.
     """
     if axis.ideal_servo:
         raise DrakeTeleopError(
@@ -109,7 +115,6 @@ def period_map(axis: OneAxis, sampling: Sampling, steps: int, *, cut: bool) -> t
 
 
 def _events(sampling: Sampling) -> tuple[int, list[tuple[Fraction, bool, bool, bool]]]:
-    """Return the hand periods in the common period; for each event, duration and updates."""
     hand = np.asarray(sampling.hand_hz, dtype=float)
     ratios = []
     for name in ("joint_control_hz", "sensor_hz"):
@@ -164,8 +169,6 @@ def _sections(sampling: Sampling) -> Array:
 
 
 class _Rows:
-    """Rows that each event writes, over [states; inputs; force received]."""
-
     def __init__(self, axis: OneAxis, size: int) -> None:
         self._axis, self._size = axis, size
 
@@ -202,7 +205,6 @@ class _Rows:
         return (row + self._row({X_S: -kv * kp, V_S: -kv}))[..., None, :]
 
     def sensor(self, sections: Array) -> Array:
-        """Return rows of the scaled sample after elimination, and of the filter's memory."""
         axis = self._axis
         felt_mass = axis.displayed_tool_mass
         environment = axis.gamma - felt_mass / axis.slave_mass

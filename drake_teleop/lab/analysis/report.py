@@ -48,7 +48,7 @@ _AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Data of the report's pictures beyond the summary."""
+    """Data of the report's pictures that the summary does not contain."""
 
     axis: OneAxis
     omega: NDArray[np.float64]  #: (n,) [rad/s]
@@ -83,7 +83,7 @@ def write_report(summary: Mapping[str, Any], curves: Curves, out: Path) -> None:
 
 
 def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the one-axis parameters with their units, as text."""
+    """Return the one-axis parameters as rows (name, value with unit)."""
     scale = f"1/{1 / axis['force_scale']:.4g}" if axis["force_scale"] > 0 else "0"
     return [
         (
@@ -105,7 +105,7 @@ def axis_rows(axis: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
-    """Return a row of the table of margins as text, for a one-way delay [s]."""
+    """Return a row of the margin table as text; `delay` is one way [s]."""
     wall = "free motion" if row["wall_N_per_m"] == 0 else f"{row['wall_N_per_m'] / 1e3:.3g} kN/m"
     if not row["stable"]:
         return (row["grip"], wall, "no", "", "", "")
@@ -120,7 +120,7 @@ def margin_cells(row: Mapping[str, Any], delay: float) -> tuple[str, ...]:
 
 
 def draw_bode(curves: Curves, measured: Mapping[str, Any] | None) -> Figure:
-    """Draw the displayed impedance over frequency, in free motion and at the wall."""
+    """Draw the impedance displayed to the hand over frequency, in free motion and at the wall."""
     hertz, s = curves.omega / (2 * np.pi), 1j * curves.omega.astype(complex)
     stiffness, damping = curves.wall
     environments = {
@@ -160,7 +160,7 @@ def _degrees(felt: Complex) -> Any:
 
 
 def draw_nyquist(curves: Curves) -> Figure:
-    """Draw the loop at the wall for each grip; it must not encircle -1."""
+    """Draw the Nyquist plot of the loop at the wall per grip; stable loops do not encircle -1."""
     with plot_style():
         figure = Picture(figsize=(9.0, 4.2))
         whole, near = figure.subplots(1, 2)
@@ -180,7 +180,7 @@ def draw_nyquist(curves: Curves) -> Figure:
 
 
 def draw_passive_loads(curves: Curves) -> Figure:
-    """Draw Llewellyn's parameter, the norm of S, and mu."""
+    """Draw Llewellyn's parameter, the norm of the scattering matrix, and mu over frequency."""
     hertz, axis = curves.omega / (2 * np.pi), curves.axis
     ratio = power_ratio(axis)
     scaled = power_scaled(curves.H, ratio) if ratio > 0 else curves.H
@@ -213,7 +213,7 @@ def draw_passive_loads(curves: Curves) -> Figure:
 
 
 def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
-    """Draw the transmitted Z-width, and the virtual walls of the device itself."""
+    """Draw the Z-width of the station, and the virtual walls that the device itself can render."""
     hertz, width = curves.omega / (2 * np.pi), transparency.transmitted_width(curves.H)
     walls = z_width["walls"]
     damping = [row["wall_damping_Ns_per_m"] for row in walls]
@@ -244,7 +244,7 @@ def draw_widths(curves: Curves, z_width: Mapping[str, Any]) -> Figure:
 
 
 def draw_maps(curves: Curves, grip: str) -> Figure:
-    """Draw stability over two parameters, for all grips."""
+    """Draw the stability maps with the limits of all grips; distortion is that of `grip`."""
     with plot_style():
         rows = -(-len(curves.maps) // 2)
         figure = Picture(figsize=(9.0, 3.3 * rows))
@@ -287,7 +287,7 @@ def _draw_map(axes: Axes, shown: Mapping[str, StabilityMap], grip: str) -> Any:
 
 
 def print_tables(summary: Mapping[str, Any], out: Path) -> None:
-    """Print margins and verdict to the terminal."""
+    """Print margins and verdict to the terminal; `out` is the folder of the written report."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape

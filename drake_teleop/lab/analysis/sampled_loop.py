@@ -33,8 +33,8 @@ _MOTION = ("x_m", "v_m", "servo_acceleration", "x_s", "v_s", "sample")
 class SampledLoop:
     """System x[k+1] = A x[k] + B u[k], y[k] = C x[k] + D u[k] over the common period of all rates.
 
-    Outputs are sampled before the updates of a period. Inputs are held: additional force of the
-    hand on the device, and of the slave on the environment [N].
+    Outputs are sampled before the updates. Inputs are held additional forces [N]: of the hand on
+    the device, and of the slave on the environment.
     """
 
     A: Array  #: (..., n, n)
@@ -59,7 +59,7 @@ class SampledLoop:
 def sampled_loop(axis: OneAxis, sampling: Sampling) -> SampledLoop:
     """Return the closed loop of the sampled model over the common period of all rates.
 
-    `axis.delay` must be one number; it is rounded to hand periods.
+    `axis.delay` must be a scalar; it is rounded to hand periods.
     """
     steps = delay_steps(axis, sampling)
     M, periods = period_map(axis, sampling, steps, cut=False)
@@ -84,7 +84,10 @@ def multipliers(system: Any) -> Complex:
 
 
 def growth_rate(system: Any) -> Any:
-    """Return the asymptotic growth rate [1/s] of a `SampledLoop` or `StateSpace`."""
+    """Return the growth rate [1/s] of the slowest-decaying motion; negative: stable.
+
+    `system` is a `SampledLoop` or a discrete `StateSpace`.
+    """
     period = system.period if isinstance(system, SampledLoop) else system.dt
     return np.log(np.abs(multipliers(system)).max(axis=-1)) / period
 
@@ -92,9 +95,8 @@ def growth_rate(system: Any) -> Any:
 def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) -> Complex:
     """Return the two-port H (N, 2, 2) of the sampled station, without hand and wall.
 
-    The spectrum of the hold, (1 - e^(-j w T)) / (j w T), is divided out of the held forces. The
-    delay is rounded to hand periods. `frequency` (N,) [rad/s] is not zero and below half the hand's
-    rate.
+    The spectrum of held forces is divided out; the delay is rounded to hand periods. `frequency`
+    (N,) [rad/s]: positive, below half the hand's rate.
     """
     bare = replace(
         axis,
@@ -124,7 +126,7 @@ def sampled_two_port(axis: OneAxis, sampling: Sampling, frequency: ArrayLike) ->
 
 
 def _resolvent(A: Array, B: Array, C: Array, z: Complex) -> Complex:
-    """Return C (z - A)^-1 B (N, p, m) at z (N,), by the Schur form of A."""
+    """Return C (z - A)^-1 B (N, p, m) at z (N,)."""
     balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
     T, Q = schur(balanced, output="complex")
     right, left = Q.conj().T @ (B / scale[:, None]), (C * scale) @ Q

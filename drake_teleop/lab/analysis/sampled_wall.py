@@ -1,13 +1,12 @@
 """Z-width of a sampled device: the stiffest virtual wall that it can render.
 
-The device with damping b [N s/m] moves continuously; its position x is sampled every Ts [s], the
-wall of stiffness K [N/m] and damping B [N s/m] answers d samples later, and the force is held:
+The device with damping b [N s/m] moves continuously; its position x is sampled every Ts [s]. The
+wall of stiffness K [N/m] and damping B [N s/m] responds d samples later with a held force:
 
     H(z) = z^-d (K + B (z - 1) / (Ts z)),    force of the wall at t_k: f_k = (H x)_k.
 
-The wall is passive if and only if b exceeds the right side of (T62), here a sum of cosines of theta
-= w Ts. Passivity is sufficient for stability. Invalid signs, and delays that are no whole number,
-raise DrakeTeleopError.
+The wall is passive if and only if b exceeds the right side of (T62); a passive wall is stable.
+Invalid signs, and delays that are no whole number, raise DrakeTeleopError.
 """
 
 from __future__ import annotations
@@ -26,7 +25,11 @@ Array = NDArray[np.float64]
 
 
 def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Array:
-    """Return the device damping for a wall H(e^(j theta)), at angles theta in (0, pi] (T62)."""
+    """Return the device damping [N s/m] that a sampled wall H(z) requires for passivity (T62).
+
+    `response`: H(e^(j theta)) at angles theta in (0, pi]; their maximum counts. `period`: sample
+    time [s].
+    """
     checked_positive(period, "period")
     H = np.asarray(response, dtype=complex)
     # Re[(1 - e^(-j theta)) H] / (1 - cos theta), without cancellation
@@ -34,7 +37,7 @@ def required_damping(response: ArrayLike, angle: ArrayLike, period: float) -> Ar
 
 
 def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> float:
-    """Return the least device damping that makes a sampled wall H(z) passive.
+    """Return the smallest device damping [N s/m] that makes a sampled wall H(z) passive.
 
     `wall` returns H at z (n,): a function or a sampled control.TransferFunction.
     """
@@ -60,7 +63,10 @@ def passive_damping_of(wall: Callable[[Complex], Complex], period: float) -> flo
 def passive_damping(
     stiffness: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Return the exact least device damping that makes the wall passive."""
+    """Return the smallest device damping [N s/m] that makes a spring-damper wall passive.
+
+    `period`: sample time [s]; `delay`: of the wall, in samples.
+    """
     K, B = np.asarray(stiffness, dtype=float), np.asarray(wall_damping, dtype=float)
     return _maximum(_cosine_coefficients(K, B, period, delay))[0]
 
@@ -68,7 +74,10 @@ def passive_damping(
 def passive_stiffness(
     device_damping: ArrayLike, wall_damping: ArrayLike, period: float, delay: int = 0
 ) -> Array:
-    """Return the largest stiffness K of a passive wall; 0 if there is none."""
+    """Return the largest stiffness [N/m] of a passive wall; 0 if there is none.
+
+    Dampings in N s/m; `period`: sample time [s]; `delay`: of the wall, in samples.
+    """
     b, B = np.broadcast_arrays(
         checked_positive(device_damping, "damping of the device"), wall_damping
     )
@@ -92,8 +101,8 @@ def passive_friction(
 ) -> Array:
     """Return the Coulomb friction [N] that compensates an encoder's resolution Delta [m].
 
-    Half a step of error in each sample gives a force error of at most
-    Delta / 2 (|K + B / Ts| + |B / Ts|). The device's damping must cover the wall in addition.
+    It is the largest force error, Delta / 2 (|K + B / Ts| + |B / Ts|). The device's damping must
+    also make the wall itself passive.
     """
     checked_positive(period, "period")
     checked_positive(resolution, "resolution of the encoder")
@@ -104,10 +113,10 @@ def passive_friction(
 def friction_stiffness(
     device_damping: ArrayLike, friction: ArrayLike, period: float, resolution: float
 ) -> Array:
-    """Return the largest passive stiffness, min(2 b / Ts, 2 f_c / Delta), if B = d = 0.
+    """Return the largest stiffness [N/m] of a passive undamped wall: min(2 b / Ts, 2 f_c / Delta).
 
-    Friction f_c compensates the encoder's resolution Delta. Diolaiti, Niemeyer, Barbagli and
-    Salisbury (2006).
+    b is the device's damping, f_c its Coulomb friction, Delta the encoder's resolution [m]; the
+    wall has no delay. Diolaiti, Niemeyer, Barbagli and Salisbury (2006).
     """
     b = checked_positive(device_damping, "damping of the device")
     checked_positive(period, "period")
@@ -126,10 +135,10 @@ def stable_stiffness(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Array:
-    """Return the wall stiffness K at which the loop becomes unstable; 0: unstable with any K.
+    """Return the wall stiffness [N/m] at which the loop becomes unstable; 0: unstable with any.
 
-    A pole reaches the unit circle where the K that closes the loop there is real. `mass`, `damping`
-    and `hand_stiffness` are of device and hand together [kg, N s/m, N/m].
+    `mass` [kg], `damping` [N s/m] and `hand_stiffness` [N/m]: device and hand together; `period`:
+    sample time [s]; `delay`: of the wall, in samples.
     """
     mass, damping, B, hand = np.broadcast_arrays(mass, damping, wall_damping, hand_stiffness)
     state, held = _sampled_device(mass, damping, hand, period)
@@ -165,7 +174,10 @@ def sampled_poles(
     *,
     hand_stiffness: ArrayLike = 0.0,
 ) -> Complex:
-    """Return the loop's multipliers (..., 3 + d) over a sample; see `stable_stiffness`."""
+    """Return the closed loop's multipliers (..., 3 + delay) over a sample.
+
+    `stiffness` is the wall's [N/m]; for the other arguments see `stable_stiffness`.
+    """
     mass, damping, K, B, hand = np.broadcast_arrays(
         mass, damping, stiffness, wall_damping, hand_stiffness
     )

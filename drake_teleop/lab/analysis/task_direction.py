@@ -1,8 +1,7 @@
 """Parameters of the one-axis model along a task direction, from the scenario's true models.
 
-One axis represents the station if a contact force causes no rotation, as along the tool. Sideways,
-wrist and tool rotate: the tip is about a hundred times softer than the servo. `linearization`
-models this.
+One axis represents the station if a contact force causes no rotation, as along the tool; otherwise
+use `linearization`.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TaskDirection:
-    """Direction of the task, with one-axis parameters at a state of rest."""
+    """Direction of the task, and the one-axis parameters at a state of rest."""
 
     axis: OneAxis
     hand: Array  #: (6,) direction of the hand's force and velocity at E, in B
@@ -51,7 +50,7 @@ def OneAxisFromScenario(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> OneAxis:
-    """Return the one-axis parameters of `task_direction`."""
+    """Return the one-axis parameters of a scenario along a direction in W; see `task_direction`."""
     return task_direction(
         scenario, direction, load_estimate=load_estimate, displacement=displacement
     ).axis
@@ -64,18 +63,17 @@ def task_direction(
     load_estimate: Array | None = None,
     displacement: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> TaskDirection:
-    """Return the one-axis parameters of a scenario along one direction of the slave's motion in W.
+    """Return the one-axis parameters of a scenario along a direction (3,) of slave motion, in W.
 
-    Masses are those of bodies that are free in all other directions: 1 / (n' J M^-1 J' n). The
-    network's delay is the mean of both ways.
+    Masses are effective, 1 / (n' J M^-1 J' n). The delay is the mean of both ways.
 
     Args:
         load_estimate: (16,) as for `MakeTeleopStation`; default: no error.
         displacement: of the master from its start [m], in B; the slave follows.
 
     Raises:
-        DrakeTeleopError: if the direction is zero, the pose is out of reach, or gripper and object
-            have different scales.
+        DrakeTeleopError: for a zero direction, a pose out of reach, or different scales of gripper
+            and object.
     """
     check_scenario(scenario)
     n_W = checked("direction", direction, 3)
@@ -134,7 +132,6 @@ def task_direction(
 
 
 def _wall_stiffness(scenario: Scenario) -> float:
-    """Return the stiffness of the leaf, or of wall and tool ball in series; else 0."""
     if scenario.leaf is not None:
         return float(scenario.leaf.stiffness)
     wall = scenario.surroundings

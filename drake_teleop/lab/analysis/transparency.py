@@ -1,6 +1,6 @@
 """Comparison of the displayed impedance with the ideal one and with human thresholds.
 
-Arrays are over frequency, impedances in N s/m, omega in rad/s.
+Arrays are over frequency, impedances in N s/m, omega in rad/s. H: hybrid matrix (see `two_port`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Real = NDArray[np.float64]
 
 
 def ideal_impedance(axis: OneAxis, s: Complex, environment: ArrayLike) -> Complex:
-    """Return the ideal impedance, which the scales specify (T52)."""
+    """Return the ideal displayed impedance [N s/m], set by the scales of force and motion (T52)."""
     felt = axis.gamma * np.asarray(environment) + axis.sigma * axis.tool_mass * s
     return device_impedance(axis, s) + axis.force_scale * axis.position_scale * felt
 
@@ -32,7 +32,7 @@ class Apparent(NamedTuple):
 
 
 def apparent(felt: Complex, omega: Real) -> Apparent:
-    """Return mass, damping, stiffness of the m s + b + k / s nearest to an impedance (n, ...)."""
+    """Return the mass, damping and stiffness that fit an impedance (n, ...) best."""
     basis = np.stack([omega, -1 / omega], axis=-1)
     flat = felt.imag.reshape(len(omega), -1)
     # Normalised columns: from 0.1 to 1000 rad/s they differ by eight orders of magnitude.
@@ -43,7 +43,7 @@ def apparent(felt: Complex, omega: Real) -> Apparent:
 
 
 class Tracking(NamedTuple):
-    """Position and force tracking between both ends."""
+    """Position and force tracking between master and slave."""
 
     position: Complex  #: slave over device, V_s / V_m; l_p is ideal
     force: Complex  #: hand over environment, F_h / F_e, including the force on the device
@@ -51,7 +51,7 @@ class Tracking(NamedTuple):
 
 
 def tracking(H: Complex, environment: Complex, device: Complex) -> Tracking:
-    """Return the tracking in contact with an environment Z_e, not 0, and a device Z_m."""
+    """Return position and force tracking in contact; impedances in N s/m, `environment` not 0."""
     _, _, h21, h22 = entries(H)
     position = -h21 / (1 + h22 * environment)
     felt = transmitted_impedance(H, environment)
@@ -60,14 +60,14 @@ def tracking(H: Complex, environment: Complex, device: Complex) -> Tracking:
 
 
 class ZWidth(NamedTuple):
-    """Displayed impedances in free motion and at a rigid wall."""
+    """Impedances displayed in free motion and at a rigid wall [N s/m]."""
 
     free: Complex
     rigid: Complex
 
     @property
     def decades(self) -> Real:
-        """Range log10 |rigid| / |free|."""
+        """Dynamic range log10(|rigid| / |free|)."""
         return np.log10(np.abs(self.rigid) / np.abs(self.free))
 
 
@@ -83,9 +83,10 @@ def transmitted_width(H: Complex) -> ZWidth:
 
 
 def sensitivity(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the derivative dZ_to / dZ_e of the displayed impedance; ideal: k_f l_p gamma.
+    """Return the derivative of the displayed impedance with respect to the environment's.
 
-    Its norm over frequencies is the fidelity of Cavusoglu, Sherman and Tendick, T-RA 18 (2002).
+    Ideal: k_f l_p gamma. Its norm over frequencies is the fidelity of Cavusoglu, Sherman and
+    Tendick, T-RA 18 (2002).
     """
     _, h12, h21, h22 = entries(H)
     return -h12 * h21 / (1 + h22 * np.asarray(environment)) ** 2
@@ -129,8 +130,8 @@ def fidelity(
 ) -> Fidelity:
     """Return level, phase and detectability of the difference from the ideal impedance.
 
-    One Weber fraction of the ideal impedance applies to mass, damping and stiffness (Fu, Landman,
-    van Paassen and Mulder, T-HMS 48, 2018; abstracts).
+    One Weber fraction applies to mass, damping and stiffness (Fu, Landman, van Paassen and Mulder,
+    T-HMS 48, 2018; abstracts).
     """
     ratio = felt / ideal
     level, phase = 20 * np.log10(np.abs(ratio)), np.angle(ratio, deg=True)
@@ -144,10 +145,10 @@ def smallest_stiffness_change(
     weber: float = WEBER_FRACTIONS["stiffness"].value,
     damping: ArrayLike = 0.0,
 ) -> Real:
-    """Return the least increase of the environment's stiffness that the hand can detect [N/m].
+    """Return the smallest increase of the environment's stiffness that the hand can detect [N/m].
 
-    Two impedances at the exploring motion's `omega` are compared as in `fidelity`. The result is
-    infinite if no stiffness differs enough; for stiffness 0 it is the softest detectable wall.
+    It explores with a motion at `omega`; detection as in `fidelity`. inf: none is detectable; for
+    stiffness 0: the softest detectable wall.
     """
     if weber <= 0:
         raise DrakeTeleopError("must be positive", where="weber")

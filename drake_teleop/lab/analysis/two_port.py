@@ -4,8 +4,7 @@
 
 F_h: force of the hand on the device; V_m: its velocity; F_e: force of the slave on the
 environment; V_s: its velocity. The station absorbs the power F_h V_m - F_e V_s. Two-ports are
-arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays one way in s and
-exact. Parameters of `OneAxis` may be arrays that broadcast with s.
+arrays (..., 2, 2), frequencies first; s in rad/s, impedances in N s/m, delays one way in s.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def two_port(h11: ArrayLike, h12: ArrayLike, h21: ArrayLike, h22: ArrayLike) -> Complex:
-    """Return matrices (..., 2, 2) of four entries."""
+    """Return matrices (..., 2, 2) of four entries that broadcast."""
     entries = np.broadcast_arrays(h11, h12, h21, h22)
     stacked = np.stack(entries, axis=-1).astype(complex, copy=False)
     return stacked.reshape(*stacked.shape[:-1], 2, 2)
@@ -41,9 +40,9 @@ def entries(H: Complex) -> tuple[Complex, Complex, Complex, Complex]:
 
 
 def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None = None) -> Complex:
-    """Return the hybrid matrix H of the position-force station (T51).
+    """Return the hybrid matrix H (..., 2, 2) of the position-force station at s [rad/s] (T51).
 
-    `servo` replaces response C/(Z_s + C) and admittance 1/(Z_s + C) of the axis.
+    `servo` replaces the axis' servo response C/(Z_s + C) and admittance 1/(Z_s + C).
     """
     response, slave_admittance = servo or (servo_response(axis, s), servo_admittance(axis, s))
     delay_factor = np.exp(-s * axis.delay)
@@ -58,13 +57,13 @@ def hybrid(axis: OneAxis, s: Complex, *, servo: tuple[Complex, Complex] | None =
 
 
 def force_velocity_exchange(s: Complex, delay: ArrayLike) -> Complex:
-    """Return the hybrid matrix H of a line that delays force and velocity (T53)."""
+    """Return the hybrid matrix H of a line that delays force and velocity by `delay` [s] (T53)."""
     delay_factor = np.exp(-s * np.asarray(delay))
     return two_port(0.0, delay_factor, -delay_factor, 0.0)
 
 
 def wave_line(s: Complex, delay: ArrayLike, impedance: ArrayLike) -> Complex:
-    """Return the hybrid matrix H of a delay line with wave variables (T53)."""
+    """Return the hybrid matrix H of a delay line with wave variables and wave `impedance` (T53)."""
     delay_factor = np.exp(-s * np.asarray(delay))
     tanh = (1 - delay_factor**2) / (1 + delay_factor**2)
     sech = 2 * delay_factor / (1 + delay_factor**2)
@@ -88,9 +87,7 @@ def transparent_channels(
 ) -> Channels:
     """Return the channels that make a station without delay transparent (T39).
 
-    Args:
-        master, slave: impedances Z_cm, Z_cs, each with its local control.
-        c5, c6: local force feedback, greater than -1.
+    `master`, `slave`: impedances with local control; `c5`, `c6`: local force feedback, above -1.
     """
     return Channels(slave, 1 + np.asarray(c6), 1 + np.asarray(c5), -master, c5, c6)
 
@@ -98,7 +95,10 @@ def transparent_channels(
 def four_channel(
     s: Complex, master: Complex, slave: Complex, channels: Channels, delay: ArrayLike = 0.0
 ) -> Complex:
-    """Return the hybrid matrix H of the four-channel station with delayed C1 to C4 (T39)."""
+    """Return the hybrid matrix H of the four-channel station; C1 to C4 are delayed (T39).
+
+    `master` and `slave` are impedances with local control.
+    """
     delay_factor = np.exp(-s * np.asarray(delay))
     c1, c2, c3, c4 = (delay_factor * np.asarray(c) for c in channels[:4])
     at_slave, at_master = 1 + np.asarray(channels.c5), 1 + np.asarray(channels.c6)
@@ -115,7 +115,7 @@ def four_channel(
 
 
 def impedance(H: Complex) -> Complex:
-    """Return the impedance matrix Z of [F_h; F_e] = Z [V_m; -V_s]; raise if h22 is 0.
+    """Return the impedance matrix Z of [F_h; F_e] = Z [V_m; -V_s]; raise an error if h22 is 0.
 
     Applied to Z, the function returns H.
     """
@@ -125,7 +125,7 @@ def impedance(H: Complex) -> Complex:
 
 
 def admittance(H: Complex) -> Complex:
-    """Return the admittance matrix Y of [V_m; -V_s] = Y [F_h; F_e]; raise if h11 is 0.
+    """Return the admittance matrix Y of [V_m; -V_s] = Y [F_h; F_e]; raise an error if h11 is 0.
 
     Applied to Y, the function returns H.
     """
@@ -135,7 +135,7 @@ def admittance(H: Complex) -> Complex:
 
 
 def chain(H: Complex) -> Complex:
-    """Return the chain matrix A of [F_h; V_m] = A [F_e; V_s]; raise if h21 is 0.
+    """Return the chain matrix A of [F_h; V_m] = A [F_e; V_s]; raise an error if h21 is 0.
 
     The chain matrix of two-ports in series is the product of theirs.
     """
@@ -145,10 +145,9 @@ def chain(H: Complex) -> Complex:
 
 
 def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) -> Complex:
-    """Return the scattering matrix S from the waves F + b V to F - b V; the slave's port has -V_s.
+    """Return the scattering matrix S, which maps the waves F + b V to F - b V (slave: V = -V_s).
 
-    `reference` contains b of both ports; b changes the norm of S, but not whether the norm exceeds
-    1.
+    `reference`: b [N s/m] of both ports; it does not change whether the norm of S exceeds 1.
     """
     h11, h12, h21, h22 = entries(H)
     b1, b2 = np.asarray(reference[0]), np.asarray(reference[1])
@@ -167,7 +166,10 @@ def scattering(H: Complex, reference: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)) 
 
 
 def reference_impedances(axis: OneAxis) -> tuple[float, float]:
-    """Return b of both ports for `scattering`: the hand's damping, alone and over k_f l_p."""
+    """Return the reference impedances b [N s/m] of both ports for `scattering`.
+
+    Master: hand damping; slave: hand damping / (k_f l_p). Scales of 0 raise DrakeTeleopError.
+    """
     scale = axis.force_scale * axis.position_scale
     if scale == 0:
         raise DrakeTeleopError(
@@ -184,9 +186,9 @@ def power_ratio(axis: OneAxis) -> float:
 
 
 def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
-    """Return H with the slave's power multiplied by `ratio`; raise if `ratio` is not positive.
+    """Return H with the slave's power multiplied by `ratio`; raise an error unless it is positive.
 
-    Scales alone make a station active or dissipative; `power_ratio` compensates them.
+    With `power_ratio` this removes the gain or loss of power by the scales.
     """
     root = np.sqrt(np.asarray(ratio, dtype=float))
     if not np.all(root > 0):
@@ -196,7 +198,7 @@ def power_scaled(H: Complex, ratio: ArrayLike) -> Complex:
 
 
 def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> Complex:
-    """Return the hybrid matrix H including parts of the impedances of hand and environment."""
+    """Return H that includes parallel impedances [N s/m] of the hand and of the environment."""
     h11, h12, h21, h22 = entries(H)
     z = np.asarray(environment)
     reduction = 1 / (1 + h22 * z)
@@ -205,7 +207,7 @@ def absorb(H: Complex, hand: ArrayLike = 0.0, environment: ArrayLike = 0.0) -> C
 
 
 def transmitted_impedance(H: Complex, environment: ArrayLike) -> Complex:
-    """Return the impedance Z_to displayed to the hand (T52)."""
+    """Return the impedance Z_to displayed to the hand for that of the environment [N s/m] (T52)."""
     return absorb(H, environment=environment)[..., 0, 0]
 
 
@@ -232,7 +234,7 @@ def transfer_function(axis: OneAxis) -> control.TransferFunction:
 
 
 def to_frd(H: Complex, omega: NDArray[np.float64]) -> control.FRD:
-    """Return a two-port or impedance as `control.FRD`."""
+    """Return a two-port (n, 2, 2) or impedance (n,) at omega (n,) [rad/s] as `control.FRD`."""
     import control
 
     return control.FRD(H if H.ndim == 1 else np.moveaxis(H, 0, -1), omega)
@@ -241,7 +243,7 @@ def to_frd(H: Complex, omega: NDArray[np.float64]) -> control.FRD:
 def from_control(system: control.lti.LTI, omega: NDArray[np.float64] | None = None) -> Complex:
     """Return the response of a python-control object: (n, outputs, inputs), or (n,) if scalar.
 
-    `omega` (n,) [rad/s] is optional for an FRD only; otherwise DrakeTeleopError is raised.
+    `omega` (n,) [rad/s] is optional for an FRD; otherwise its absence raises DrakeTeleopError.
     """
     if omega is None:
         omega = getattr(system, "omega", None)

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def verdict(figures: dict[str, Any]) -> list[str]:
-    """Return the summary's figures as short sentences, each understandable alone."""
+    """Return the summary as sentences, each understandable alone."""
     sentences = []
     if figures["method"] != "none":
         sentences += [

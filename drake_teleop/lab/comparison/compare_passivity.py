@@ -1,8 +1,8 @@
 """`drake-teleop compare-passivity`: every passivity method over every network.
 
-Three studies use the same channel: the whole station presses on leaves (`delayed_contact`); in one
-degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round trip
-is found for walls of three stiffnesses (`one_dof`). `summary.json` contains
+Three studies use the same channel: the whole station presses on leaf springs (`delayed_contact`);
+in one degree of freedom, a hand lets go and taps (`release_and_taps`), and the longest stable round
+trip is found for three walls (`one_dof`). `summary.json` contains
 
 ========= ======================================================================================
 decision  list: method, network, verdict (`decision`); felt_N and ideal pressed_N for each leaf;
@@ -94,15 +94,14 @@ def compare_command(
     """Compare the methods; write summary.json, runs.parquet, report.html and pictures into `out`.
 
     Args:
-        networks, methods: names of networks and methods.
-        scenario: a shipped one or a YAML file; its rates, integrator and environment are not used.
+        networks, methods: names of networks and passivity methods.
+        scenario: shipped name or YAML file; its rates, integrator and environment are not used.
         seed: seed of sensor noise and networks.
         jobs: number of processes; -1: one for each core.
-        quiet: True hides progress bars and tables.
-        progress: False hides only the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The summary, see the module's docstring.
+        The content of summary.json; the module lists it.
     """
     _check_names("network", networks, tuple(PRESETS))
     _check_names("method", methods, METHODS)
@@ -149,7 +148,10 @@ def compare_command(
 def longest_round_trip(
     method: str, model: OneDof, jitter: float, loss: float, seeds: Sequence[int]
 ) -> float:
-    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none."""
+    """Return the longest of `ROUND_TRIPS` [s] up to which all runs are stable; 0: none.
+
+    `seeds` are those of a network with jitter or packet loss.
+    """
     longest = 0.0
     for round_trip in ROUND_TRIPS:
         network = NetworkConfig(delay=round_trip / 2, jitter=jitter, loss=loss)
@@ -162,7 +164,7 @@ def longest_round_trip(
 
 
 def station_base(scenario: str | Path, seed: int) -> Scenario:
-    """Return the scenario without environment, with the comparison's rates and steps."""
+    """Return the scenario without environment, with the comparison's rates and step sizes."""
     return replace(
         LoadScenario(scenario).without_environment(),
         simulation=Simulation(seed=seed, max_step=_MAX_STEP),
@@ -174,9 +176,9 @@ def station_base(scenario: str | Path, seed: int) -> Scenario:
 def station_run(
     scenario: Scenario, method: str, network: str, leaf: str, estimate: NDArray[np.float64]
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
-    """Run the whole station once; return its row of the table and the traces of a picture.
+    """Run the whole station once with a leaf spring; return its table row and its traces.
 
-    `estimate` (16,) is the load estimate [offsets; phi].
+    `estimate` (16,) is the load estimate: sensor offsets [N, N m], then phi.
     """
     row: dict[str, Any] = {"method": method, "network": network, "leaf": leaf}
     names = [entry.name for entry in dataclasses.fields(Figures)]

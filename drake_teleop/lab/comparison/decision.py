@@ -1,7 +1,7 @@
-"""Decision table: one verdict for each method and network.
+"""Decision table: one verdict for each passivity method and network.
 
-The first condition that the whole station meets on any leaf is the verdict (energy: also of the
-runs of `release_and_taps`)::
+The first condition that the whole station meets on any leaf spring is the verdict (leaks: also in
+the runs of `release_and_taps`)::
 
     unstable      the station does not come to rest, or the run ended early
     left behind   the slave is more than 5 mm from the master 2 s after contact
@@ -42,13 +42,13 @@ class Cell:
 
     @property
     def share(self) -> str:
-        """Displayed share of the contact force at the worst leaf, as text; "" if unstable."""
+        """Displayed force over contact force at the worst leaf spring, as text; "" if unstable."""
         shares = [felt / pressed for felt, pressed in self.forces if pressed > 0.0]
         return f"{min(shares):.0%}" if shares else ""
 
 
 def decide(summary: Mapping[str, Any]) -> dict[tuple[str, str], Cell]:
-    """Return (method, network) -> cell from the `station` and `hands` of a summary."""
+    """Return the table (method, network) -> cell from the `station` and `hands` of a summary."""
     return {
         (row["method"], row["network"]): _cell(
             [
@@ -73,7 +73,6 @@ def _cell(runs: Sequence[Mapping[str, Any]], leaked_by_hands: float) -> Cell:
 
 
 def _motion_in_hold(run: Mapping[str, Any]) -> str:
-    """Return a run's motion in the hold as text: displacement, or rotation if larger at the tip."""
     if run["stable"]:
         return "at rest"
     if run["hunting"] is None:

@@ -1,8 +1,4 @@
-"""Task of the whole station for each method and network: swing, press on a leaf, hold, rest.
-
-The times of the task grow with the network's round trip, so that every station has equally many
-round trips to come to rest.
-"""
+"""Task of the whole station for each method and network: swing, press on a leaf spring, rest."""
 
 from __future__ import annotations
 
@@ -32,7 +28,10 @@ LEAVES = {"contact": 0.0015, "stiff contact": 0.00236}
 
 
 def task_for_round_trip(round_trip: float) -> Task:
-    """Return the task: one round trip [s] before the press, three to hold, two to rest."""
+    """Return the times of the task for a round trip [s].
+
+    One round trip is added before the press, three to the hold, two to the final rest.
+    """
     return Task(
         swing=0.3,
         swung=1.8,
@@ -48,7 +47,10 @@ def task_for_round_trip(round_trip: float) -> Task:
 def delayed_contact(
     base: Scenario, channel: Channel, passivity: PassivityConfig, leaf: str
 ) -> tuple[Scenario, Task]:
-    """Return scenario and times of the task; `base` has rates, sensor, scales and grip."""
+    """Return the scenario with this task and the task's times.
+
+    `base` gives rates, sensor, scales and grip; `leaf` is a key of `LEAVES`.
+    """
     task = task_for_round_trip(sum(line.delay for line in channel.lines()))
     settle = 0.5
     swing = Sine(
@@ -85,10 +87,7 @@ def delayed_contact(
 
 
 def station_figures(result: SimulationResult, scenario: Scenario, task: Task) -> Figures:
-    """Return the figures of a run: vertical motion and force, and the rotation of the tool.
-
-    The energy in the figures is `energy_between`.
-    """
+    """Return the measures of a run: vertical motion and force, rotation of the tool, energy."""
     heights, turned = _slave_motion(result, scenario)
     scaling = scenario.force_scaling
     return figures_of(
@@ -104,7 +103,7 @@ def station_figures(result: SimulationResult, scenario: Scenario, task: Task) ->
 
 
 def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, NDArray[np.float64]]:
-    """Return a run's t [s], forces in the master's units [N] and energy [J] for pictures."""
+    """Return a run's t [s], vertical forces at the master's scale [N] and energy [J]."""
     scaling = scenario.force_scaling
     return {
         "t": result.t,
@@ -115,10 +114,9 @@ def vertical_traces(result: SimulationResult, scenario: Scenario) -> dict[str, N
 
 
 def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.float64]:
-    """Return the energy (N,) from hand and environment plus the stores' energy at the start [J].
+    """Return the energy (N,) from hand and environment, plus the method's initial energy [J].
 
-    The sum is never negative if the station is passive between the hand, with held force, and the
-    slave's actual motion, where contact and (with sigma > 0) load act.
+    Negative: the station is active between the hand and the slave's actual motion.
     """
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
     if any(scenario.force_scaling.scales()[:2]):
@@ -129,7 +127,6 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
 def _slave_motion(
     result: SimulationResult, scenario: Scenario
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the height of So [m] and the rotation vector (N, 3) from the start [rad]."""
     arm = slave_arm(scenario)
     q = np.ascontiguousarray(result["slave_state"][:, : arm.num_joints])
     poses = _poses(arm.table, q)

@@ -1,9 +1,6 @@
 """One degree of freedom of the station: plant, task and figures, for thousands of runs.
 
-The equations are those of `OneDof`. The station's own `channel_step` connects hand and slave along
-x at 1 kHz. The channel's forces are held for a period, in which the masses take 20 integration
-steps. The operator moves freely, rests, presses on the wall, holds, lets go and rests, or follows a
-given intent.
+The station's own `channel_step` connects hand and slave along x at 1 kHz, with held forces.
 """
 
 from __future__ import annotations
@@ -46,7 +43,7 @@ _REST_POSITION, _DEPTH = -0.04, 0.02  # m, from the wall: rest position, intende
 
 @dataclass(frozen=True)
 class Task:
-    """Times of the operator's task [s]: swing, rest, press, hold, let go, rest."""
+    """Times of the operator's task [s]: swing, rest, press, hold, retreat, rest."""
 
     swing: float = 0.5
     swung: float = 3.0
@@ -100,8 +97,9 @@ at 12 instead of 14 Hz, delay 17 instead of 13 ms.
 class OneDofRun:
     """Time series (N,) of a run, one entry for each period.
 
-    `accounts` (N, 4) is the energy that entered the station so far, scaled to the master's power
-    [J]. In a passive station, HAND plus any other place never falls below -start_energy::
+    `accounts` (N, 4) is the energy [J] that entered the station so far at four places, at the
+    master's scale. In a passive station, HAND plus any other place never falls below
+    -start_energy::
 
         HAND      -sum f_(k-1) (x_k - x_(k-1))   held force, exact
         COMMAND    sum w_k (c_k - c_(k-1))       sent wrench along the command; no physical port,
@@ -125,7 +123,10 @@ class OneDofRun:
     start_energy: float  #: E_0 of the method's stores [J]
 
     def least(self, place: int) -> float:
-        """Return the least of E_0 plus the energy from hand and one other place (or hand alone)."""
+        """Return the least value over time of E_0 plus the `accounts` of HAND and `place` [J].
+
+        With `place` HAND: of HAND alone. Negative: the station is active.
+        """
         other = 0.0 if place == HAND else self.accounts[:, place]
         return self.start_energy + float(np.nanmin(self.accounts[:, HAND] + other))
 
@@ -165,7 +166,7 @@ def run_one_dof(
     Args:
         passivity: configuration of the passivity method.
         forward, backward: networks from and to the master; backward default: as forward.
-        timeout: time without packets before the safe state [s].
+        timeout: time without packets before the safe state (both ends come to rest) [s].
         intent: (N, 2) intended position [m] and velocity [m/s]; default: the task's.
         grip: (N, 3) mass, damping and stiffness of the hand [kg, N s/m, N/m], zeros after it let
             go; default: the model's.
@@ -225,7 +226,7 @@ def run_one_dof(
 
 
 def operators_intent(task: Task = Task()) -> NDArray[np.float64]:
-    """Return intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
+    """Return the intended position [m] and velocity [m/s] (N, 2) of a task; the wall is at 0."""
     t = np.arange(round(task.end / PERIOD), dtype=np.float64) * PERIOD
     x = np.full_like(t, _REST_POSITION)
     fade = np.minimum(_ramp(t, task.swing, 0.5), 1 - _ramp(t, task.swung - 0.5, 0.5))
@@ -303,7 +304,10 @@ def figures_of(
 
 
 def covering_damping(model: OneDof, round_trip: float) -> float:
-    """Return the least device damping that makes the displayed impedance passive [N s/m] (T43)."""
+    """Return the least device damping [N s/m] that makes the displayed impedance passive (T43).
+
+    `round_trip` in s.
+    """
     return max(0.0, -float(_resistance(model, round_trip).min()))
 
 
@@ -321,7 +325,6 @@ def _resistance(model: OneDof, round_trip: float) -> NDArray[np.float64]:
 
 
 def _peak_to_peak(x: NDArray[np.float64]) -> float:
-    """Return the peak-to-peak deviation from the best parabola; infinite if not finite."""
     if not np.isfinite(x).all():
         return float("inf")
     t = np.linspace(-1.0, 1.0, len(x))
@@ -329,7 +332,6 @@ def _peak_to_peak(x: NDArray[np.float64]) -> float:
 
 
 def _rise_delay(felt: NDArray[np.float64], pressed: NDArray[np.float64], steady: float) -> float:
-    """Return the samples from `pressed` to `felt`, both beyond half of `steady`, or NaN."""
     level, sign = 0.5 * abs(steady), np.sign(steady)
     exceeds, displayed = pressed * sign > level, felt * sign > level
     start = int(np.argmax(exceeds))

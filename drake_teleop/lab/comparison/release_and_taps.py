@@ -1,10 +1,6 @@
 """A hand that lets go while it presses, and one that taps, in one degree of freedom (`one_dof`).
 
-The grip is medium, the servo is the station's, the wall has 5.1 kN/m, and the network is a preset.
-
-* Let go: after some round trips of pressing, the held force moves the device of 0.15 kg alone.
-* Taps: eight of 30 mm at each of `TAP_RATES`. The displayed force is late, or comes from the
-  method's memory of the wall.
+The wall has 5.1 kN/m, the network is a preset. Each rate of `TAP_RATES` has eight taps of 30 mm.
 """
 
 from __future__ import annotations
@@ -44,7 +40,7 @@ class ReleaseAndTaps:
 
 
 def simulate_release_and_taps(method: str, network: str, seed: int = 0) -> ReleaseAndTaps:
-    """Simulate letting go and taps with a method over a preset network."""
+    """Simulate a hand that lets go and one that taps, with a passivity method over a network."""
     round_trip, model = 2 * PRESETS[network].delay, OneDof()
 
     def run(intent: NDArray[np.float64], grip: NDArray[np.float64] | None = None) -> OneDofRun:
@@ -89,11 +85,6 @@ def _tap_intent(rate: float, round_trip: float) -> NDArray[np.float64]:
 
 
 def _displayed_share(run: OneDofRun, scale: float, rate: float, way: float) -> float:
-    """Return the displayed impulse over the wall's impulse, without the first contact.
-
-    `scale` is from the wall's force to the hand, `rate` of the taps [Hz], `way` the one-way delay
-    [s].
-    """
     first = int(np.argmax(run.wall < 0.0))
     second = first + round(0.75 / rate / PERIOD)  # between first and second contact
     pressed = scale * run.wall[second:].sum()

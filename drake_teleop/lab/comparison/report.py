@@ -116,7 +116,7 @@ def draw_decision(summary: Mapping[str, Any]) -> Figure:
 
 
 def draw_hands(summary: Mapping[str, Any]) -> Figure:
-    """Draw release and taps: a row for each method, a mark for each network."""
+    """Draw the results of letting go and taps: a row for each method, a mark for each network."""
     methods, networks, rows = summary["methods"], summary["networks"], summary["hands"]
     panels = (
         ("speed after letting go [m/s]", "log", lambda row: row["release_speed"]),
@@ -167,7 +167,7 @@ def draw_runs(summary: Mapping[str, Any], traces: Traces) -> Figure:
 
 
 def draw_energy(summary: Mapping[str, Any], traces: Traces) -> Figure:
-    """Draw the energy from hand and environment plus the stores' initial energy, over time."""
+    """Draw over time the energy from hand and environment, plus the method's initial energy."""
 
     def draw(axes: Any, shown: Mapping[str, NDArray[np.float64]]) -> None:
         axes.axhline(0.0, color=GREY, linewidth=0.6)

@@ -6,10 +6,7 @@ scaled to the master's power, positive inwards [J]. With c = k_f gamma over the 
     HAND      -sum f_(k-1) . dx_k       held wrench, at every period of the channel: exact
     COMMAND    sum w_k . dc_k           sent wrench along the command: exact; no physical port
     MOTOR     -integral c f_m . dx_s    motor torque minus weight, as a wrench at So
-    ACTUAL     integral c f_w . dx_s    true contact wrench at So
-
-The channel sums the first two (signal `ports`). The others use the log's rows: MOTOR is exact if
-the torque is constant between two rows; ACTUAL is exact for a spring, otherwise of second order.
+    ACTUAL     integral c f_w . dx_s    true contact wrench at So; exact for a spring
 """
 
 from __future__ import annotations
@@ -33,7 +30,7 @@ _REQUIRED_SIGNALS = ("ports", "slave_state", "joint_torque")
 
 
 def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the energy that entered the station at its four places, up to each row of the log.
+    """Return the energy that entered the station at four places, up to each row of the log.
 
     Returns:
         (N, 4, 2) at `HAND`, `COMMAND`, `MOTOR` and `ACTUAL`, by translation and rotation [J], zero
@@ -74,10 +71,9 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def load_work(result: SimulationResult, scenario: Scenario) -> Array:
-    """Return the displayed work of weight and inertia of the slave's load along its actual motion.
+    """Return the displayed work of the slave's load (weight and inertia) along its actual motion.
 
-    With sigma > 0 this work belongs to the environment like the contact; `ACTUAL` does not contain
-    it.
+    With sigma > 0 it belongs to the environment; `ACTUAL` excludes it.
 
     Returns:
         (N, 2) work by translation and rotation [J], zero in the first row.
@@ -100,7 +96,7 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
 
 
 def start_energy(scenario: Scenario) -> Array:
-    """Return the initial energy E_0 (2,) of the method's stores, by group [J]."""
+    """Return the initial energy (2,) [J] in the passivity method, of translation and rotation."""
     scales = _motion_scale(scenario)
     power = scenario.force_scaling.force_scale / scales
     p = methods.parameters(scenario.passivity, list(power), list(scales))
@@ -109,17 +105,13 @@ def start_energy(scenario: Scenario) -> Array:
 
 
 def _motion_scale(scenario: Scenario) -> Array:
-    """Return slave over master (2,), of translation and rotation; 1 for a zero scale."""
     scaling = scenario.kinematic_scaling
     scales = np.array([scaling.translation_scale, scaling.rotation_scale])
     return np.where(scales > 0.0, scales, 1.0)
 
 
 def _motor_wrenches(scenario: Scenario, q: Array, torque: Array) -> tuple[Array, Array]:
-    """Return poses X_WS (N, 7), and the motors' wrench (N, 6) at So in W without the weight.
-
-    For a redundant arm it is the least-squares wrench: other torques only cause null-space motion.
-    """
+    """Return poses X_WS (N, 7), and the motors' wrench (N, 6) at So in W without the weight."""
     n = q.shape[1]
     arm, zero = slave_arm(scenario).table, np.zeros(n)
     poses, weight, J = np.empty((len(q), 7)), np.empty_like(q), np.empty((len(q), 6, n))

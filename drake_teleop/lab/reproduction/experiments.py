@@ -26,7 +26,7 @@ _THRESHOLD_OVER_FREE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class FreeMotion:
-    """Free movement, with the scaled wrench (N, 6) at the slave for each sigma."""
+    """Recorded free movement, with the scaled wrench (N, 6) at the slave for each sigma."""
 
     scenario: Scenario
     result: SimulationResult
@@ -35,7 +35,7 @@ class FreeMotion:
 
 @dataclass(frozen=True, eq=False)
 class ContactMotion:
-    """Contact transition, and the same movement without the sheet spring.
+    """Recorded contact transition, and the same movement without the leaf spring.
 
     Attributes:
         raw: (N, 6) measured wrench without offsets, F - F_o.
@@ -56,14 +56,20 @@ class ContactMotion:
 
 
 def free_motion(scenario: Scenario, estimate: Array, progress: Progress) -> FreeMotion:
-    """Run a free movement and calculate the scaled wrench for each sigma."""
+    """Simulate a free movement and calculate the scaled wrench for each sigma.
+
+    `estimate` (16,): sensor offsets, then phi.
+    """
     result = _simulate(scenario, estimate, progress)
     scaled = {sigma: _scaled(result, estimate, sigma) for sigma in SIGMAS}
     return FreeMotion(scenario, result, scaled)
 
 
 def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> ContactMotion:
-    """Run the contact transition with and without the sheet spring."""
+    """Simulate the contact transition with and without the leaf spring.
+
+    `estimate` (16,): sensor offsets, then phi.
+    """
     touched = _simulate(scenario, estimate, stage("Fig. 8: contact transition"))
     free_stage = stage("Fig. 8: the same without contact")
     free = _simulate(without_sheet(scenario), estimate, free_stage)
@@ -82,10 +88,9 @@ def contact_motion(scenario: Scenario, estimate: Array, stage: Stage) -> Contact
 
 
 def eliminated_reaction(scenario: Scenario, progress: Progress) -> Array:
-    """Run a free movement with an ideal sensor; subtract the true load from the reaction wrench.
+    """Simulate a free movement; subtract the true load's wrench from Drake's reaction wrench.
 
-    The ideal sensor samples V phi. Drake's reaction wrench of the tool's weld does not use the
-    regressor V, so it is an independent check of V.
+    The reaction of the tool's weld does not use the regressor V, and therefore checks V.
 
     Returns:
         (N, 6) reaction wrench minus the load's wrench, F - V phi [N, N m], after the settling time;
@@ -122,6 +127,7 @@ def free_values(run: FreeMotion, ideal: Array, component: int, unit: str) -> Val
 
     Args:
         ideal: (N, 6) result of `eliminated_reaction`.
+        component: index 0 to 5 in the wrench.
         unit: unit, as suffix of the values' names.
     """
     raw, half, rest = (run.scaled[sigma][:, component] for sigma in SIGMAS)
@@ -162,7 +168,10 @@ def contact_values(run: ContactMotion) -> Values:
 
 
 def raw_excess(run: ContactMotion) -> Array:
-    """Return the excess (4,) of f_x, f_y, f_z, |f| in contact over the contact-free range [N]."""
+    """Return how far f_x, f_y, f_z, |f| leave their contact-free range during contact (4,) [N].
+
+    The raw force is used; -inf without contact.
+    """
     touched, free = (
         np.column_stack([raw[:, :3], _force_norm(raw)])
         for raw in (run.raw[_contact_window(run)], run.raw_free)
@@ -175,7 +184,7 @@ def raw_excess(run: ContactMotion) -> Array:
 
 
 def identification_values(load: LoadIdentification, scenario: Scenario) -> Values:
-    """Return errors and expected accuracy of the load estimate."""
+    """Return errors and expected accuracy of the load estimate, by name."""
     truth = true_parameters(scenario)
     error = load.estimate - truth
     mass, moment = load.estimate[6], load.estimate[7:10]
@@ -197,7 +206,7 @@ def identification_values(load: LoadIdentification, scenario: Scenario) -> Value
 
 
 def without_sheet(scenario: Scenario) -> Scenario:
-    """Return the scenario without the sheet spring, with another seed."""
+    """Return the scenario without the leaf spring, with the next seed."""
     return replace(scenario, sheet_spring=None, simulation__seed=scenario.simulation.seed + 1)
 
 
@@ -207,7 +216,7 @@ def _simulate(scenario: Scenario, estimate: Array, progress: Progress) -> Simula
 
 
 def true_parameters(scenario: Scenario) -> Array:
-    """Return the true offsets and phi (16,) of Eq. (7)."""
+    """Return the true sensor offsets and phi (16,) of Eq. (7)."""
     return np.concatenate([scenario.wrist_sensor.offset, slave_arm(scenario).phi_load])
 
 

@@ -52,7 +52,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Verdict in words; "agrees" or "differs" only for found values that the paper reports."""
+        """Verdict as text; "agrees" or "differs" only for found values that the paper reports."""
         if self.holds is None:
             return "for the record"
         words = _AS_SET if self.origin == "set" else _AGREES
@@ -62,7 +62,7 @@ class Comparison:
 
     @property
     def pill(self) -> str:
-        """CSS class of the verdict: "differs" is highlighted, "" is neutral."""
+        """CSS class of the verdict: "agrees", "differs" (highlighted) or "" (neutral)."""
         if self.holds is False:
             return "differs"
         return "agrees" if self.verdict == "agrees" else ""
@@ -93,8 +93,7 @@ class ParameterRow:
 def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
     """Return the rows of the table that compares paper and reproduction.
 
-    Args:
-        summary: values by full name, such as "free_force.peak_raw_N".
+    `summary`: values by full name, such as "free_force.peak_raw_N".
     """
     s = summary
     delay_ms = 1e3 * (s["contact.detected_s"] - s["contact.true_s"])
@@ -136,7 +135,7 @@ def compare_with_paper(summary: Mapping[str, Any]) -> list[Comparison]:
 
 
 def unaccepted(summary: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return the rows with unaccepted values as text, from a summary of `reproduce_command`."""
+    """Return as text the rows whose values are outside the accepted range."""
     return [
         f"{row.what}: {row.ours}, accepted {row.accepted}: {row.verdict}"
         for row in compare_with_paper(flat(summary))
@@ -190,9 +189,7 @@ def parameter_rows(
 ) -> list[ParameterRow]:
     """Return the rows of the identification table.
 
-    Args:
-        true, estimate, deviation: (16,) true values, estimates and standard deviations of the
-            offsets, then phi, as in Eq. (7), SI units.
+    Arguments (16,): true values, estimates and standard deviations of offsets and phi, Eq. (7), SI.
     """
     columns = np.stack([np.asarray(column, float) for column in (true, estimate, deviation)], 1)
     rows = []
@@ -221,7 +218,7 @@ def write_report(
     parameters: Sequence[ParameterRow],
     replay: str | None = None,
 ) -> None:
-    """Write the HTML page with embedded figures; without a date, so equal runs give equal pages.
+    """Write the HTML page with embedded figures; equal runs give equal pages.
 
     Args:
         setup: description of the run: name -> text.

@@ -1,9 +1,8 @@
 """`drake-teleop reproduce`: the paper's experiments, Figs. 6, 7 and 8, in their order.
 
 1. Identification of the load (section IV) by the recursive estimator in the loop.
-2. Figs. 6 and 7: free movements with sigma = 0; curves of all sigmas from the recorded samples.
-3. The same movements with the reaction force of Drake's plant instead of the sensor.
-4. Fig. 8: contact, and the same movement without the sheet spring.
+2. Figs. 6 and 7: free movements, with the sensor and with the reaction force of Drake's plant.
+3. Fig. 8: contact, and the same movement without the leaf spring.
 """
 
 from __future__ import annotations
@@ -70,11 +69,10 @@ def reproduce_command(
 
     Args:
         seed: first seed of the noise; None: 0.
-        quiet: True hides progress bars and tables.
-        progress: False hides the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
 
     Returns:
-        The summary and the speed, which is not reproducible.
+        The summary, and the measured speed, which differs between equal runs.
     """
     seed = seed or 0
     make_folder(out)  # fail early for a bad path

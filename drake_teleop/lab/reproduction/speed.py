@@ -21,7 +21,7 @@ _RUN_S = 0.1  # simulated time of one measurement [s]
 def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
     """Return a simulator of arm and tool under constant holding torque.
 
-    With `touching`, the plant also contains the scenario's surroundings.
+    `touching=True` adds the scenario's environment to the plant.
     """
     builder = DiagramBuilder()
     surroundings = scenario.surroundings if touching else None
@@ -39,7 +39,7 @@ def MakeBarePlant(scenario: Scenario, *, touching: bool = False) -> Simulator:
 
 
 def MakeMovingStation(scenario: Scenario) -> Simulator:
-    """Return a simulator of the station at the end of its settling time."""
+    """Return a simulator of the station, advanced to the end of its settling time."""
     # The value of the estimate does not change the cost.
     station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
     simulator = MakeSimulator(station, scenario.simulation)
@@ -54,10 +54,7 @@ def cpu_seconds(
     repetitions: int = 11,
     progress: Progress = lambda done: None,
 ) -> dict[str, float]:
-    """Return the thread CPU time per simulated second of each simulator, by interleaved runs.
-
-    Other load of the machine can only add time, so the result is the minimum (as in `timeit`).
-    """
+    """Return the CPU time per simulated second of each simulator: minimum of interleaved runs."""
     times_s: dict[str, list[float]] = {name: [] for name in simulators}
     for k in range(repetitions):
         for name, simulator in simulators.items():

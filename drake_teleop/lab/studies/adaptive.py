@@ -1,7 +1,7 @@
 """Choice of the next points of an adaptive design by expected improvement (Jones 1998).
 
-Within a batch, the predicted mean of a chosen point replaces its unknown value ("kriging believer",
-Ginsbourger 2010).
+In a batch, the predicted mean replaces a chosen point's value ("kriging believer", Ginsbourger
+2010).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LOG_LENGTH_BOUNDS, _LOG_NOISE_BOUNDS = (np.log(0.05), np.log(10.0)), (np.log(1e
 
 
 def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) -> list[int]:
-    """Return the indices of `count` candidates with the largest expected improvement.
+    """Return the indices of the `count` candidates with the largest expected improvement.
 
     Args:
         places: (n, d) coordinates of the evaluated points, from 0 to 1.
@@ -50,8 +50,6 @@ def propose(places: Array, objective: ArrayLike, candidates: Array, count: int) 
 
 
 def _fit(places: Array, y: Array) -> tuple[Array, float]:
-    """Return length scales (d,) and noise variance of the Gaussian process (maximum likelihood)."""
-
     def misfit(x: Array) -> float:
         K = _kernel(places / np.exp(x[:-1]), places / np.exp(x[:-1]))
         K[np.diag_indices_from(K)] += np.exp(x[-1])
@@ -77,7 +75,6 @@ def _predict(places: Array, y: Array, queries: Array, noise: float) -> tuple[Arr
 
 
 def _kernel(a: Array, b: Array) -> Array:
-    """Return the Matern 5/2 kernel."""
     r = np.sqrt(5.0 * ((a[:, None] - b[None]) ** 2).sum(axis=-1))
     kernel: Array = (1.0 + r + r * r / 3.0) * np.exp(-r)
     return kernel

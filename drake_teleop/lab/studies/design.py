@@ -1,4 +1,4 @@
-"""Content of a study file, and the design points that follow from it."""
+"""Content of a study file, and its design points: the sets of factor values to simulate."""
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 import itertools
@@ -42,7 +42,7 @@ class Factor:
     levels: int = quantity(3, "1", 2, 1000, "values between low and high in a factorial design")
 
     def listed(self) -> Sequence[Value]:
-        """Return the values that a factorial design uses."""
+        """Return the values of a factorial design: the list, or `levels` numbers of the range."""
         if self.low is not None and self.high is not None:
             return [float(value) for value in np.linspace(self.low, self.high, self.levels)]
         return self.values or self.words or self.flags or self.vectors
@@ -55,10 +55,9 @@ class Factor:
         return listed[int(share * len(listed))]
 
     def coordinates(self, value: Value) -> list[float]:
-        """Return the coordinates of a value, each from 0 to 1.
+        """Return a value as coordinates from 0 to 1.
 
-        A number has one coordinate. Words, flags and vectors have one coordinate for each listed
-        value.
+        A number has one. A word, flag or vector has one indicator (0 or 1) per listed value.
         """
         if self.low is not None and self.high is not None:
             low, high = self.low, self.high
@@ -73,7 +72,7 @@ class Factor:
         """Check the factor's values without the scenario.
 
         Raises:
-            DrakeTeleopError: if the values are invalid; the message contains `where`.
+            DrakeTeleopError: if they are invalid; `where` is the place in the message.
         """
         ranged = [self.low is not None, self.high is not None]
         lists = (self.values, self.words, self.flags, self.vectors)
@@ -124,7 +123,7 @@ class Study:
         """Check the study without the scenario.
 
         Raises:
-            DrakeTeleopError: if a field is invalid; the message contains `where` and the field.
+            DrakeTeleopError: if a field is invalid; `where` is the file in the message.
         """
         check_ranges(self, where)
         for name in self.measures:
@@ -184,7 +183,7 @@ class Study:
             raise DrakeTeleopError(f"{what} need a confirmation", where=where, remedy=remedy)
 
     def points(self) -> list[Values]:
-        """Return all points of the design; for an adaptive design, the first ones."""
+        """Return all points (field -> value); of an adaptive design, the first ones."""
         if self.design == "factorial":
             names = [factor.field for factor in self.factors]
             combinations = itertools.product(*(factor.listed() for factor in self.factors))
@@ -196,7 +195,7 @@ class Study:
         return self._sobol(1 << (first - 1).bit_length(), self.seed)[: self.samples]
 
     def next_points(self, points: Sequence[Values], objective: Array) -> list[Values]:
-        """Return the next points of an adaptive design; none at its end.
+        """Return the next points of an adaptive design; an empty list at its end.
 
         Args:
             points: the n evaluated points.
@@ -219,9 +218,10 @@ class Study:
         return [candidates[index] for index in chosen]
 
     def rows(self, points: Sequence[Values], first: int = 0) -> list[dict[str, Any]]:
-        """Return a row without measures for each run; `first` is the number of the first point.
+        """Return one table row, still without measures, for each run of the points.
 
-        Every second seed is reserved for the load identification.
+        `first` is the number of the first point. Every second seed is reserved for the load
+        identification.
         """
         order = itertools.product(enumerate(points, first), range(self.repeats))
         return [

@@ -1,7 +1,6 @@
-"""Effects of factors with confidence intervals, and the Pareto front.
+"""Effects of factors on a measure, with 95 % intervals over seeds, and the Pareto front.
 
-In factorial designs, means are averages with Student's intervals over seeds, and effects are
-differences within each seed. Other designs use a regression. An undefined half width is nan.
+A half width is half the width of an interval; nan if undefined.
 """
 
 from __future__ import annotations
@@ -48,12 +47,13 @@ class Factorial:
     seen: Flags
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the comparable levels of a factor, or the comparable cells of two factors.
+        """Return the levels of a factor, or the cells of two factors, that can be compared.
+
+        They are compared over combinations of the other factors' levels at which all have a value.
 
         Returns:
-            (rows,) True for comparable levels or cells; (columns,) True for the combinations of
-                other levels in their means; (kept rows, n) matrix from the points' values to the
-                means.
+            (rows,) True for compared levels or cells; (columns,) True for the used combinations;
+                (kept rows, n) matrix from point values to the means.
         """
         others = [factor for factor in range(len(self.counts)) if factor not in shown]
         (row, rows), (column, columns) = (
@@ -69,13 +69,13 @@ class Factorial:
         return is_compared, combinations, weights
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return effects and half widths (kept levels,) for each factor."""
+        """Return per factor the effects and half widths (kept levels,) of values (n, seeds)."""
         means = [self.compared(factor)[2] for factor in range(len(self.counts))]
         found = [self.means(table, weights - weights.mean(axis=0)) for weights in means]
         return [effect for effect, _ in found], [half for _, half in found]
 
     def means(self, table: Array, weights: Array) -> tuple[Array, Array]:
-        """Return the sums (k,) of a table with weights (k, n), and their half widths."""
+        """Return means and half widths (k,) of values (n, seeds) with `weights` (k, n)."""
         mean, half = interval(weights @ table)
         return mean, np.hypot(half, self._missing_seed_widths(table, weights))
 
@@ -121,7 +121,7 @@ def filled(values: Array) -> Array:
 
 
 def interval(table: Array) -> tuple[Array, Array]:
-    """Return the means (n,) of a table (n, seeds) over seeds, ignoring nan, and half widths."""
+    """Return means (n,) over the seeds of a table (n, seeds), and half widths; nan is ignored."""
     count = np.isfinite(table).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.nansum(table, axis=1) / count
@@ -154,12 +154,12 @@ class MainEffect:
     """Effect of one factor on a measure; nan at levels that are not comparable.
 
     Attributes:
-        names: labels of the n levels, or of the n parts of a range.
+        names: labels of the n levels, or of the n sections of a range.
         runs: (n,) number of runs with the measure.
         mean, half: (n,) mean over other factors and seeds, and its half width.
         effect, effect_half: (n,) difference from the mean of all levels, and its half width.
         why: (n,) reason of a missing value.
-        compared, left_out: number of used and of unused combinations of other levels.
+        compared, left_out: number of used and unused combinations of other levels.
         fitted: True if the values are from a regression.
     """
 
@@ -197,7 +197,10 @@ class PairMeans:
 def estimated(
     values: Array, levels: NDArray[np.int64], seeds: NDArray[Any], count: int
 ) -> Estimate:
-    """Return the means of values (N,) at each of `count` levels; nan is ignored."""
+    """Return the means of values (N,) at each of `count` levels, with intervals; nan is ignored.
+
+    `levels` and `seeds` (N,) are those of each value.
+    """
     present, seed = np.unique(seeds, return_inverse=True)
     sums, runs = np.zeros((count, len(present))), np.zeros((count, len(present)))
     known = np.isfinite(values)
@@ -212,7 +215,7 @@ def estimated(
 
 
 def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the main effects on all measures as a table."""
+    """Return the main effects on all measures as a table: one row per measure, factor and level."""
     import polars as pl
 
     table = [
@@ -237,7 +240,7 @@ def effects(study: Study, rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, MainEffect]:
-    """Return the effect of each factor on a measure, by field."""
+    """Return the effect of each factor on a measure: field -> effect."""
     data = _MeasureData(study, rows, measure)
     return (
         {} if data.is_empty else {f.field: data.main_effect(k) for k, f in enumerate(data.factors)}
@@ -245,7 +248,7 @@ def main_effects(study: Study, rows: pl.DataFrame, measure: str) -> dict[str, Ma
 
 
 def pair_means(study: Study, rows: pl.DataFrame, measure: str) -> list[PairMeans]:
-    """Return, for each pair of factors, the means of a measure at all pairs of levels."""
+    """Return the means of a measure at all pairs of levels, for each pair of factors."""
     data = _MeasureData(study, rows, measure)
     pairs = itertools.combinations(range(len(data.factors)), 2)
     return [] if data.is_empty else [found for pair in pairs if (found := data.pair(*pair))]
@@ -328,7 +331,6 @@ class _MeasureData:
 
 
 def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.DataFrame, Array]:
-    """Return the points, and a measure's values (n, seeds)."""
     points = rows.unique("point", keep="first").sort("point")
     _, point = np.unique(rows["point"].to_numpy(), return_inverse=True)
     seeds, seed = np.unique(rows["seed"].to_numpy(), return_inverse=True)
@@ -338,7 +340,7 @@ def _values_by_point_and_seed(rows: pl.DataFrame, measure: str) -> tuple[pl.Data
 
 
 def pareto(study: Study, rows: pl.DataFrame) -> pl.DataFrame | None:
-    """Return a table of all points with their means of `PARETO`; None without these measures.
+    """Return all points with their means of the `PARETO` measures; None if the study lacks one.
 
     Only points with all three measures in every run can be on the front.
     """

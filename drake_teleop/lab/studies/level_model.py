@@ -1,9 +1,6 @@
 """Effects from an unbalanced design by one regression with all factors (docs/studies.md).
 
-The terms have zero mean: levels (a range is cut into parts), position within a part, and products
-of pairs of factors. Intervals cover residuals and seeds; points must be as good as random (Owen
-1997). Failed cells are excluded: cells without success, or with less than half the success rate of
-other cells at the same levels. A cell that is empty by chance is kept, except in adaptive designs.
+Intervals assume points that are as good as random (Owen 1997).
 """
 
 from __future__ import annotations
@@ -32,11 +29,9 @@ TOO_FEW = "too few points"
 def comparable(there: Flags) -> tuple[Flags, Flags]:
     """Return the largest complete block of a table with missing values.
 
-    Levels (or cells) are comparable only over combinations of the other factors at which all of
-    them have a successful run.
-
     Args:
-        there: (rows, columns) True where a level (row) has a value at a combination (column).
+        there: (rows, columns) True where a level (row) has a value at a combination of the other
+            factors (column).
 
     Returns:
         (rows,) True for the rows of the block: the largest pattern, the most frequent if several;
@@ -50,7 +45,10 @@ def comparable(there: Flags) -> tuple[Flags, Flags]:
 
 
 def reasons(compared: Flags, runs: NDArray[np.int64], good: NDArray[np.int64]) -> list[str]:
-    """Return for n levels or cells why they have no value; empty where `compared` (n,) is True."""
+    """Return for each of n levels or cells why it has no value; "" where `compared` (n,) is True.
+
+    `runs` and `good` (n,) are the numbers of runs and of successful runs.
+    """
     why = np.where(runs == 0, NO_RUN, np.where(good == 0, NO_SUCCESS, NOT_COMPARABLE))
     return np.where(compared, "", why).tolist()
 
@@ -70,7 +68,7 @@ class Levels:
     Attributes:
         index: (n,) level of each point.
         names: labels of the levels with a point.
-        within: (n,) position in the point's part of a range, -1/2 to 1/2; None for a list.
+        within: (n,) position in the point's section of a range, -1/2 to 1/2; None for a list.
         centred: (n, k) regression columns with zero mean: numbers, or indicators of all values but
             one.
         middles: (levels, k) these columns at the middle of each level.
@@ -84,7 +82,7 @@ class Levels:
 
 
 def levels_of(factor: Factor, column: Sequence[Value], parts: int = 5) -> Levels:
-    """Return the levels of a factor's values (n,); a range is cut into `parts`."""
+    """Return the levels of a factor's values (n,); a range is cut into `parts` equal sections."""
     listed = factor.listed()
     places = np.array([factor.coordinates(value) for value in column])
     if factor.low is not None and factor.high is not None and any(v not in listed for v in column):
@@ -112,7 +110,7 @@ class LevelModel:
         codes: for each factor, the columns (levels, k) of its levels.
         products: columns of X for each pair (i, j) of factors.
         failed: excluded cells (levels, levels) of each pair; of (i, i): excluded levels.
-        X: (n, p) design matrix; its first column is the mean.
+        X: (n, p) design matrix; first column: the mean.
         solve: (p, n) pseudo-inverse of X.
     """
 
@@ -124,7 +122,7 @@ class LevelModel:
     solve: Array
 
     def compared(self, *shown: int) -> tuple[Flags, Flags, Array]:
-        """Return the comparable levels of a factor, or the comparable cells of two factors.
+        """Return the levels of a factor, or the cells of two factors, that can be compared.
 
         Returns:
             As `Factorial.compared`, but only with combinations of factors related to failures, and
@@ -143,9 +141,9 @@ class LevelModel:
         return rows, columns, terms[rows][:, columns].mean(axis=1)
 
     def effects(self, table: Array) -> tuple[list[Array], list[Array]]:
-        """Return effects and half widths (kept levels,) for each factor.
+        """Return per factor the effects and half widths (kept levels,) of values (n, seeds).
 
-        The intervals hold together with probability `CONFIDENCE` (Bonferroni).
+        All intervals hold together with probability `CONFIDENCE` (Bonferroni).
         """
         means = [self.compared(factor)[2] for factor in range(len(self.factors))]
         # Two levels have one effect with two signs.
@@ -159,7 +157,7 @@ class LevelModel:
         return effects, halves
 
     def means(self, table: Array, terms: Array) -> tuple[Array, Array]:
-        """Return means and half widths (kept levels,) from a matrix of `compared`."""
+        """Return means and half widths (kept levels,); `terms` is the matrix of `compared`."""
         seeds = table.shape[1]
         each = terms @ self.solve @ table
         if seeds == 1:
@@ -168,7 +166,6 @@ class LevelModel:
         return each.mean(axis=1), np.hypot(self._design(table, 1) * self._spread(terms), over_seeds)
 
     def _terms(self, at: dict[int, NDArray[np.int64]]) -> Array:
-        """Return the matrix (N, p) from coefficients to the means at N combinations of levels."""
         count = len(next(iter(at.values())))
         terms, first = np.zeros((count, self.X.shape[1])), 1
         terms[:, 0] = 1.0
@@ -196,7 +193,6 @@ class LevelModel:
         return np.linalg.norm(terms @ self.solve, axis=1)
 
     def _design(self, table: Array, together: int) -> float:
-        """Return the half width that the choice of points causes, for unit spread."""
         variance = self._variance(table.mean(axis=1, keepdims=True), 1)
         return _quantile(together, self._freedom) * float(np.sqrt(variance))
 
@@ -218,10 +214,9 @@ def level_model(
     *,
     by_chance: bool = True,
 ) -> LevelModel | None:
-    """Return a regression model that the points determine, or None if there is none.
+    """Return a regression model that the points determine, or None.
 
-    It is the first of `_MODELS` that leaves half the points for residuals, or the last feasible
-    one.
+    The model with most terms that leaves half the points for residuals is preferred.
 
     Args:
         columns: for each factor, its values (n,) at the points.
@@ -288,7 +283,6 @@ def _products(a: Array, b: Array) -> Array:
 
 
 def _codes(count: int, present: NDArray[np.int64]) -> Array:
-    """Return sum-to-zero codes (count, k - 1) for the k levels in `present`."""
     codes = np.zeros((count, len(present) - 1))
     codes[present[:-1]], codes[present[-1]] = np.eye(len(present) - 1), -1.0
     return codes

@@ -1,4 +1,4 @@
-"""Measures of one run of a study."""
+"""Measures of one run of a study: peak forces, work of the hand, times."""
 
 from __future__ import annotations
 
@@ -60,17 +60,17 @@ MEASURES = (*_OF_EVERY_RUN, *TASK_MEASURES)
 
 
 def default_measures() -> list[str]:
-    """Return the names of the default measures, which every run has."""
+    """Return the names of the measures of every scenario, with or without a task."""
     return list(_OF_EVERY_RUN)
 
 
 def measured(
     result: SimulationResult, scenario: Scenario, names: Sequence[str], force_threshold: float
 ) -> dict[str, float]:
-    """Return the requested measures of one run by name.
+    """Return the measures `names` of one run, by name; `force_threshold` in N.
 
     Raises:
-        DrakeTeleopError: if a measure of a task is requested in a scenario without task.
+        DrakeTeleopError: if a task's measure is requested for a scenario without a task.
     """
     own = [name for name in names if name in _OF_EVERY_RUN]
     found = {name: _OF_EVERY_RUN[name](result, force_threshold) for name in own}

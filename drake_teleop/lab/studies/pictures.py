@@ -35,7 +35,7 @@ _HATCHES = {NO_SUCCESS: "////", NO_RUN: "....", NOT_COMPARABLE: "xxxx", TOO_FEW:
 
 
 def write_pictures(study: Study, rows: pl.DataFrame, out: Path) -> list[Path]:
-    """Write the pictures that apply to a study; remove those of an earlier run."""
+    """Write the pictures that apply to a study into `out`; delete all other PNG files there."""
     for old in out.glob("*.png"):
         old.unlink()
     measures = [name for name in study.measures if np.isfinite(numbers(rows, name)).any()]

@@ -1,8 +1,7 @@
 """Execution of a study's runs by processes of this machine or by Dask workers.
 
-Before a chunk of runs starts, the store marks it. If a run crashes (ends its process), the mark
-remains; the chunk's rows are then run one by one. A row that crashes again gets an error. With one
-job, a crash ends the study.
+If a run crashes (ends its process), the rows of its chunk are run one by one; a row that crashes
+again gets an error. With one job, a crash ends the study.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ Run: TypeAlias = Callable[[Chunk], Chunk]
 
 @dataclass(frozen=True)
 class Processes:
-    """Executor of runs; `rows_of` yields the chunks with results in the order of completion."""
+    """Executor of runs; `rows_of` yields finished chunks (groups of rows) with results."""
 
     count: int
     rows_of: Callable[[Run, Sequence[Chunk]], Iterator[Chunk]]
@@ -42,6 +41,7 @@ def processes(store: Store, jobs: int, cluster: str | None) -> Iterator[Processe
     """Start the processes of a study for the duration of the context.
 
     Args:
+        store: where started chunks are marked.
         jobs: number of processes as in joblib; 1 is this process.
         cluster: address of a Dask scheduler, or "local".
 

@@ -57,6 +57,7 @@ def run_study(
     Args:
         work: picklable function that executes one run.
         basis: JSON data of all inputs of the rows besides the study.
+        progress: whether to show a progress bar.
 
     Raises:
         DrakeTeleopError: for the reasons of `study_command`.
@@ -121,7 +122,7 @@ class StudyProgress:
         self._recent: deque[float] = deque(maxlen=_NUM_RECENT_RUNS)
 
     def start(self, progress: Progress, processes: int) -> None:
-        """Set the progress bar and the number of processes."""
+        """Set the progress bar and the number of processes; call this first."""
         self._progress, self._processes = progress, processes
 
     def add_earlier_runs(self, runs: int) -> None:
@@ -130,7 +131,7 @@ class StudyProgress:
         self._report()
 
     def add_finished_runs(self, rows: Chunk) -> None:
-        """Count finished runs and their times, at first without `ONE_TIME_COST`."""
+        """Count finished runs and their times, for the first ones without `ONE_TIME_COST`."""
         self.done += len(rows)
         for row in rows:
             if _SECONDS in row:  # missing if the run ended its process

@@ -1,8 +1,7 @@
 """`drake-teleop scaling-study`: best force scales for the simulated operator.
 
-The merit of a point (sigma, gamma) is the mean over tasks of its criteria, relative to sigma =
-gamma = 1. A bootstrap over seeds gives intervals, and the share of draws in which a point is best
-(docs/scaling-study.md).
+The merit of a point (sigma, gamma) is the mean over tasks of its criteria, relative to those of
+sigma = gamma = 1; a bootstrap over seeds gives intervals (docs/scaling-study.md).
 """
 
 from __future__ import annotations
@@ -47,12 +46,12 @@ _MAX_FAILURE_SHARE, _MIN_BEST_SHARE = 0.05, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Result for one selection of criteria; arrays (s, g) over s sigmas and g gammas.
+    """Result for one selection of criteria: arrays (s, g) over s values of sigma and g of gamma.
 
     Attributes:
-        merit: mean relative criterion; nan with too many failures.
+        merit: mean relative criterion, below 1 is better; nan with too many failures.
         low, high: limits of the merit's 95 % interval.
-        best: share of draws in which the point is the best.
+        best: share of bootstrap draws in which the point is the best.
         failures: share of failed runs in the worst task.
     """
 
@@ -75,8 +74,7 @@ def scaling_study_command(
 ) -> dict[str, Any]:
     """Run the remaining runs of the scaling studies; write the best scales and return the summary.
 
-    Args:
-        jobs, cluster, repeats, yes, quiet, progress: as for `study_command`.
+    The arguments are those of `study_command`: jobs, cluster, repeats, yes, quiet, progress.
     """
     make_folder(out)
     rows = {}
@@ -230,7 +228,7 @@ def _eta_effects(rows: pl.DataFrame) -> list[dict[str, Any]]:
 def criteria_picture(
     rows: dict[str, pl.DataFrame], sigmas: list[float], gammas: list[float]
 ) -> Figure:
-    """Draw each criterion over sigma, with a line for each gamma."""
+    """Draw each criterion over sigma, with a line for each gamma; `rows` by study name."""
     tasks = [task for task in TASKS if "force" in TASKS[task]]
     with plot_style():
         figure = Picture(figsize=(10.0, 7.6))

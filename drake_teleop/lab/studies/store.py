@@ -1,6 +1,6 @@
-"""Storage of a study's rows on disk; after a crash, each part is complete or absent.
+"""Storage of a study's rows on disk; after a crash, each file is complete or absent.
 
-The folder `runs.parquet` is one table; each part of it is named after its first run.
+The folder `runs.parquet` is one table, with a file for each chunk of runs.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _PART = "run_{:08d}.parquet"
 
 @dataclass(frozen=True)
 class Store:
-    """Table of a study's rows, in a folder of parts."""
+    """Table of a study's rows: a folder with a file per chunk (runs of one process)."""
 
     folder: Path
 
     def finished(self) -> set[int]:
-        """Return the first run of each complete chunk."""
+        """Return the first run of each stored chunk."""
         return set(map(_first_run, self._parts()))
 
     def _parts(self) -> list[Path]:
@@ -58,7 +58,7 @@ class Store:
                 mark.write(b".")
 
     def unmark(self, run: int) -> None:
-        """Remove the mark of the chunk whose first run is `run`."""
+        """Remove the counter of `mark`."""
         (self._marks / str(run)).unlink(missing_ok=True)
 
     def marked(self, times: int) -> set[int]:
@@ -100,13 +100,13 @@ def _runs_in(parts: list[Path]) -> set[int]:
 
 @contextmanager
 def open_store(out: Path, identity: dict[str, Any]) -> Iterator[Store]:
-    """Open the store in the folder `out` for this process alone.
+    """Open the store in the folder `out` and lock it for this process.
 
     Args:
         identity: JSON data of all inputs of the rows.
 
     Raises:
-        DrakeTeleopError: if the folder contains rows of other inputs, or is in use.
+        DrakeTeleopError: if `out` has rows of other inputs, or is in use.
     """
     store = Store(out / "runs.parquet")
     make_folder(store.folder)

@@ -8,8 +8,6 @@ summary.json number of runs and failed runs; mean, least and largest of each mea
 effects.csv  mean and effect of each level, with half widths of 95 % intervals
 pictures     main effects, interactions of two factors, Pareto front
 ============ =====================================================================================
-
-A stopped study continues with the same command.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationWork:
-    """Function that executes one run of the station for a study.
+    """Picklable function that executes one run of the station for a study.
 
     Args:
         data: content of the base scenario's file.
@@ -57,7 +55,7 @@ class StationWork:
     threshold: float
 
     def scenario(self, values: Values, seed: int) -> Scenario:
-        """Return the scenario of one run from the factors' values and the seed."""
+        """Return the scenario of one run: the base with the factors' values and the seed."""
         changes = values | {"simulation.seed": seed}
         return ScenarioFromData(_with_changes(self.data, changes), self.where)
 
@@ -82,16 +80,15 @@ def study_command(
     repeats: int | None = None,
     yes: bool | Callable[[str], bool] = False,
 ) -> dict[str, Any]:
-    """Run the remaining runs of a study; write summary, effects and pictures.
+    """Run the remaining runs of a study; write summary, effects and pictures; return the summary.
 
     Args:
         path: study file, or the name of a shipped study.
         jobs: number of processes; -1: one for each core.
         cluster: address of a Dask scheduler, or "local".
-        quiet: True hides progress bars and tables.
-        progress: False hides the progress bars.
+        quiet: True hides progress bars and tables; `progress` False only the bars.
         repeats: replaces the value of the file.
-        yes: True permits more than 1e5 runs; or a function that asks the user for permission.
+        yes: True permits more than 1e5 runs; or a function that asks the user.
 
     Raises:
         DrakeTeleopError: for a wrong file, too many runs, another study's folder, or missing Dask.
@@ -141,7 +138,7 @@ def LoadStudy(path: str | Path) -> Study:
     """Load a study file and check everything that does not depend on the scenario.
 
     Raises:
-        DrakeTeleopError: if the file is invalid; the message contains file and field.
+        DrakeTeleopError: if it is invalid; with file and field.
     """
     path = study_file(path)
     data = read_yaml(path)
@@ -165,7 +162,6 @@ def _check_values(factor: Factor, where: str) -> None:
 
 
 def _with_changes(data: Any, changes: dict[str, Any]) -> Any:
-    """Return a copy of a scenario's data with changed fields (`block.field`)."""
     data = copy.deepcopy(data)
     for name, value in changes.items():
         *blocks, last = name.split(".")

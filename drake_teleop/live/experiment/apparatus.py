@@ -1,7 +1,7 @@
 """Station and stimulus of an experiment's task under a condition.
 
-To render F newton of the contact force P, one interval has gamma scaled by F / P, the other
-interval gamma = 0. A mass at the hand increases sigma, or the eta of a held object.
+To render a force F, gamma is scaled by F over the contact force; the other interval has gamma = 0.
+A mass at the hand increases sigma, or eta for a held object.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FLOOR_DISTANCE_M, _FLOOR_TIME_S = 2e-3, 0.2
 
 
 def load_for(scenario: Scenario) -> IdentifiedLoad | None:
-    """Return the identified load, None if it is estimated online."""
+    """Return the scenario's identified load; None if it is estimated online."""
     return None if scenario.load_estimator.enabled else identified_load(scenario)
 
 
@@ -48,7 +48,7 @@ class Apparatus:
     """Station of a task under a condition.
 
     Attributes:
-        mass: mass of the load or object at the hand [kg].
+        mass: mass of the load, or of the held object, at the hand's scale [kg].
     """
 
     task: Task
@@ -58,7 +58,11 @@ class Apparatus:
     mass: float
 
     def inputs(self, level: float, pressed: float) -> dict[str, int]:
-        """Return the inputs for a stimulus level and an expected contact force [N]."""
+        """Return sigma, sigma_object and gamma [%] that render a stimulus `level`.
+
+        `level` is a force at the tool [N] or a mass at the hand [kg], 0 for none; `pressed` is the
+        expected contact force [N].
+        """
         condition = self.condition
         sigma, gamma = 100.0 * condition.sigma, 100.0 * condition.gamma
         share = sigma if condition.eta is None else 100.0 * condition.eta
@@ -72,7 +76,7 @@ class Apparatus:
         return {name: min(round(value), _MAX_SCALE) for name, value in values.items()}
 
     def result(self, shown: float, inputs: dict[str, int], rows: IntervalLog) -> IntervalResult:
-        """Return the result of an interval with the intended level `shown`."""
+        """Return the result of an interval; `shown` is the intended level, 0 without stimulus."""
         force = rows.force()
         if isinstance(self.task, PegInSlot):
             return IntervalResult(
@@ -120,7 +124,7 @@ def make_apparatus(
 
 
 class IntervalLog:
-    """Measures of an interval.
+    """Measures of an interval, from the log's rows.
 
     Attributes:
         time: time of the last row [s].
@@ -136,7 +140,7 @@ class IntervalLog:
         self._on_floor: float | None = None
 
     def add(self, rows: dict[str, Array]) -> None:
-        """Add the newest rows of the log."""
+        """Add the newest rows of the log: signal name -> values."""
         if not len(rows["t"]):
             return
         self.time = float(rows["t"][-1])
@@ -162,9 +166,9 @@ class IntervalLog:
         return _largest_mean(np.concatenate([np.zeros(1), *self._forces]), self._dt)
 
     def change(self, after: float) -> float:
-        """Return the largest 20 ms mean change of the rendered force [N] from time `after` [s].
+        """Return the largest 20 ms mean of the rendered force's change [N] from time `after` [s].
 
-        The change is relative to the 0.1 s before `after`.
+        The reference is the mean of the 0.1 s before `after`.
         """
         rendered = np.concatenate(self._rendered)
         start = round(after / self._dt)

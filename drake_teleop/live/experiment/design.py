@@ -169,7 +169,7 @@ def ExperimentNames() -> list[str]:
 
 
 def LoadExperiment(path: str | Path) -> tuple[Experiment, list[Scenario]]:
-    """Return a checked experiment by file or name, and its scenarios.
+    """Return a checked experiment, from a file or a shipped name, and its tasks' scenarios.
 
     Raises:
         DrakeTeleopError: for an invalid field.

@@ -1,6 +1,6 @@
 """Event handler for an experiment of one participant, in place of `Live`.
 
-Each interval is a recorded `Live`. The page receives only the rendered force.
+Each interval is a recorded `Live`; the page receives only the rendered force.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ HAND = ("x", "y", "z", "rx", "ry", "rz", "clutch")
 
 
 def without_forces(rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rows without the forces that the 3D scene shows."""
+    """Return rows without the wrenches that the 3D scene would show."""
     none = dict.fromkeys(("measured_wrench_S", "load_estimate"))
     return rows | {name: np.zeros_like(rows[name]) for name in none}
 
 
 class Guided:
-    """Event handler of an experiment, with the interface of `Live`.
+    """Event handler of an experiment, with the interface of `Live`; times `now` in s.
 
     Attributes:
         refused: number of invalid messages.
@@ -98,7 +98,7 @@ class Guided:
         return self._show(without_forces(rows))
 
     def hello(self) -> dict[str, Any]:
-        """Return the experiment's constants for a page."""
+        """Return the experiment's constants, which a new page receives first."""
         procedure = self._procedure
         known = {"scenario": f"Participant {procedure.participant}", "scenes": []}
         hidden = {"object": False, "known": False, "noise": False, "touch": 0.01}
@@ -106,7 +106,7 @@ class Guided:
         return self._live.hello() | known | hidden | {"study": study}
 
     def join(self, client: int, now: float) -> None:
-        """Add a page; the first page drives."""
+        """Add a page; the first one drives (its inputs move the hand)."""
         if self._driver is None:
             self._set_driver(client, now)
 
@@ -136,7 +136,6 @@ class Guided:
 
     @contextmanager
     def _keep_write_error(self) -> Iterator[None]:
-        """Keep a `CannotWrite` for `tick`, which raises it."""
         try:
             yield
         except CannotWrite as error:
@@ -170,7 +169,7 @@ class Guided:
             self._live.pace.start(now)
 
     def wait(self, now: float) -> float:
-        """Return the time until the next slice or frame [s]."""
+        """Return the time until the next simulation slice or page frame [s]."""
         return self._live.wait(now) if self._runs else max(0.0, self._frame_due - now)
 
     @property
@@ -188,7 +187,7 @@ class Guided:
         return self._procedure.phase == INTERVAL and self._driver is not None
 
     def tick(self, clock: Callable[[], float]) -> dict[str, Any] | None:
-        """Simulate the due slices; return a due frame.
+        """Simulate the due slices of time; return a frame for the pages if one is due.
 
         Raises:
             CannotWrite: if the disk is full.
@@ -252,7 +251,7 @@ class Guided:
 
 
 def parse_study(text: Any) -> dict[str, Any] | None:
-    """Return the valid requests of a page's message: set, rates, drive, go, answer."""
+    """Return the valid requests in a page's message: set, rates, drive, go, answer; or None."""
     message = parse(text) or {}
     found: dict[str, Any] = {}
     for kind in message.keys() & {"set", "rates"}:

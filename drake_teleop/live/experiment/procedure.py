@@ -1,7 +1,4 @@
-"""Sequence of a participant's trials, drawn from the seed and the participant's number.
-
-Each task has practice and then rounds with every condition once.
-"""
+"""Sequence of a participant's trials, drawn from the seed and the participant's number."""
 
 from __future__ import annotations
 
@@ -58,7 +55,7 @@ class IntervalResult:
 
 
 def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
-    """Return all trials of a participant."""
+    """Return all trials of a participant, in order."""
     rng = np.random.default_rng([experiment.seed, participant])
     conditions, trials = len(experiment.conditions), []
     for index in rng.permutation(len(experiment.tasks)).tolist():
@@ -76,15 +73,15 @@ def trials_of(experiment: Experiment, participant: int) -> list[Trial]:
 
 
 class Procedure:
-    """Progress of a participant, continued from the stored rows.
+    """Progress of a participant, continued from the stored trials.
 
     Attributes:
         phase: `CONSENT` to `END`.
         interval: 1 or 2.
-        level: intended level of the trial.
+        level: intended level of the trial's stimulus [N or kg].
         prepared_intervals: number of intervals so far.
         said: whether the last answer was right.
-        again: whether the trial is repeated for lack of contact.
+        again: whether the trial is repeated because the tool made no contact.
     """
 
     def __init__(self, experiment: Experiment, participant: int, store: Store) -> None:
@@ -121,12 +118,12 @@ class Procedure:
 
     @property
     def present_level(self) -> float:
-        """Stimulus level of the present interval."""
+        """Stimulus level of the present interval [N or kg]; 0 without stimulus."""
         return self.level if self.trial.signal == self.interval else 0.0
 
     @property
     def expected_force(self) -> float:
-        """Median contact force so far [N]."""
+        """Median contact force of the participant so far [N]."""
         task = self.task
         if self._pressed:
             return float(np.median(self._pressed))
@@ -141,7 +138,7 @@ class Procedure:
             self.level = task.high if trial.practice else psi.next_level()
 
     def go(self) -> None:
-        """Continue after a text page."""
+        """Continue from a phase that shows text."""
         if self.phase == CONSENT:
             self.phase = END if self.number >= len(self.trials) else TASK
         elif self.phase in (TASK, BREAK):
@@ -152,7 +149,7 @@ class Procedure:
             self._next_trial()
 
     def finish_interval(self, result: IntervalResult) -> None:
-        """End the present interval with a result."""
+        """End the present interval with a result; without contact the trial is repeated."""
         self._results[self.interval - 1] = result
         if not result.valid:
             self._new_trial()
@@ -170,13 +167,13 @@ class Procedure:
         self.phase = INTERVAL
 
     def restart_trial(self) -> None:
-        """Restart the trial after the driver has left."""
+        """Restart the trial after the page that drives has left."""
         if self.phase in (INTERVAL, GAP, ANSWER):
             self._new_trial()
             self.phase = READY
 
     def answer(self, interval: int, time_s: float) -> None:
-        """Store the chosen interval, if the phase is `ANSWER`."""
+        """Store the answer (interval 1 or 2, after `time_s`), if the phase is `ANSWER`."""
         if self.phase == ANSWER:
             self._finish_trial(interval, interval == self.trial.signal, time_s)
 

@@ -28,7 +28,7 @@ _LEVELS = 25
 
 
 def correct_probability(level: Array, threshold: Array, slope: Array, lapse: Array) -> Array:
-    """Return P(correct) for stimulus levels >= 0."""
+    """Return the probability of a correct answer at stimulus levels >= 0 (two intervals)."""
     d = (level / threshold) ** slope
     return 0.5 * lapse + (1.0 - lapse) * ndtr(d / math.sqrt(2.0))
 
@@ -60,7 +60,7 @@ class Psi:
         return correct_probability(np.float64(level), *self._grid)
 
     def next_level(self) -> float:
-        """Return the level with the least expected entropy of the threshold."""
+        """Return the level whose answer minimises the expected entropy of the threshold."""
         posterior = self._posterior.reshape(_THRESHOLDS, -1)
         right = np.einsum("ltk,tk->lt", self._p_correct, posterior)  # P(correct and threshold)
         wrong = posterior.sum(axis=1) - right

@@ -1,8 +1,7 @@
 """Thresholds, d', times and forces of an experiment with 95 % intervals.
 
 Threshold and d' (at the middle level) of a participant are posterior medians (`Psi`), times and
-forces geometric means with t intervals of the logarithm. Participant 0 is the (geometric) mean of
-all participants, with its t interval.
+forces geometric means. Participant 0 is the (geometric) mean of all, with its t interval.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ _SHARE = "share of trials done"
 
 
 class Result(NamedTuple):
-    """Row of the result table; participant 0 stands for all."""
+    """Row of the result table: a quantity with its 95 % interval; participant 0 stands for all."""
 
     task: str
     condition: str
@@ -90,7 +89,6 @@ def _participant_estimates(task: Task, rows: Sequence[Row]) -> dict[str, Estimat
 
 
 def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Estimate:
-    """Return the (geometric) mean with its t interval; limits are nan for one value."""
     x = np.asarray(values) if share else np.log(np.maximum(values, 1e-9))
     mean, half = float(x.mean()), math.nan
     if len(x) > 1:
@@ -102,7 +100,6 @@ def _mean_with_interval(values: Sequence[float], *, share: bool = False) -> Esti
 
 
 def _wilson(successes: int, n: int) -> Estimate:
-    """Return a share with Wilson's interval (J. Am. Stat. Assoc. 22, 1927)."""
     p, z2 = successes / n, _Z**2
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = _Z / (1 + z2 / n) * math.sqrt(p * (1 - p) / n + z2 / (4 * n * n))

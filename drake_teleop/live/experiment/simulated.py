@@ -1,8 +1,7 @@
 """Simulated participants: an observer with noise compares rendered forces.
 
-A scripted hand presses down and up, or moves back and forth. The response to an interval is the
-largest change of the rendered force plus normal noise; the interval with the larger response is
-the answer. The simulated operator inserts the peg.
+A scripted hand presses down and up, or moves back and forth. The answer is the interval with the
+larger response: largest change of the rendered force plus normal noise.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ _ROWS_PERIOD_MS = 200
 def all_apparatus(
     experiment: Experiment, scenarios: list[Scenario]
 ) -> dict[tuple[int, int], Apparatus]:
-    """Return the station of each task and condition, by their indices."""
+    """Return the stations: (index of task, index of condition) -> station."""
     stations = {}
     for t, (task, scenario) in enumerate(zip(experiment.tasks, scenarios, strict=True)):
         load = load_for(scenario)
@@ -93,9 +92,9 @@ def take_part(
 def compare_responses(
     observer: SimulatedParticipant, responses: list[float], rng: np.random.Generator
 ) -> int:
-    """Return the interval, 1 or 2, with the larger response after adding noise.
+    """Return the interval, 1 or 2, with the larger response [N] after adding noise.
 
-    A difference of `noise` at rest corresponds to d' = 1.
+    A difference of `noise` at rest corresponds to d' = 1. A lapse gives a random answer.
     """
     if rng.random() < observer.lapse:
         return int(rng.integers(1, 3))
@@ -107,7 +106,6 @@ def compare_responses(
 
 
 def _run_interval(apparatus: Apparatus, procedure: Procedure) -> tuple[IntervalResult, float]:
-    """Return an interval's result, and the response without noise [N]."""
     task, observer = apparatus.task, procedure.experiment.simulated
     assert not isinstance(task, PegInSlot)
     session = Session(seeded(apparatus.scenario, procedure), apparatus.load)

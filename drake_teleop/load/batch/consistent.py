@@ -1,13 +1,10 @@
-"""Physically consistent load that fits best, by a semidefinite program, Eqs. (T1) and (T5).
+"""Load with the best fit among those a rigid body can have, by a semidefinite program.
 
-A consistent least squares solution is returned unchanged (Wensing, Kim, Slotine, RA-L 2018).
-Costs of a prior load phi_0 with pseudo-inertia J_0, weighted per sample:
+Constraints: pseudo-inertia J >= 0 (Eqs. (T1), (T5); Wensing, Kim, Slotine, RA-L 2018), and tr(J E)
+>= 0 for an ellipsoid that contains the mass. Costs of a prior with pseudo-inertia J_0:
 
 - entropic: tr(J_0^-1 J) - log det J (Lee, Wensing, Park, T-RO 2020);
-- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2), a quadratic cost (Lee, Park, RA-L 2018).
-
-An ellipsoid that contains the mass adds tr(J E) >= 0, E = [[-A, A c], [c^T A, 1 - c^T A c]], with
-matrix A and centre c.
+- geodesic: 1/2 tr((J_0^-1 (J - J_0))^2) (Lee, Park, RA-L 2018).
 """
 
 from __future__ import annotations
@@ -35,7 +32,7 @@ _PRIORS = ("entropic", "geodesic")
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior of the load; `kind` names the cost, "entropic" or "geodesic".
+    """Prior knowledge of the load, as a cost of the fit: "entropic" or "geodesic" (`kind`).
 
     Attributes:
         phi: (10,) prior load about So in S, of a body with extent in all directions.
@@ -55,7 +52,7 @@ class Prior:
             raise DrakeTeleopError("is not a body with extent in all directions", where="prior.phi")
 
     def information(self, samples: int) -> Array:
-        """Return the inverse covariance (10, 10) of the prior for a number of samples."""
+        """Return the inverse covariance (10, 10) of phi from the prior, for `samples` samples."""
         parts = np.linalg.solve(pseudo_inertia(checked("prior.phi", self.phi, 10)), _BASIS)
         return np.asarray(samples * self.weight * np.einsum("aij,bji->ab", parts, parts))
 
@@ -73,7 +70,7 @@ class Ellipsoid:
     matrix: ArrayLike
 
     def row(self) -> Array:
-        """Return the coefficients (10,) of the load phi in the constraint tr(J E) >= 0.
+        """Return coefficients (10,): coefficients @ phi >= 0 if the ellipsoid can contain the mass.
 
         Raises:
             DrakeTeleopError: if the matrix is not positive definite.
@@ -92,11 +89,11 @@ def consistent_least_squares(
     prior: Prior | None = None,
     ellipsoid: Ellipsoid | None = None,
 ) -> Array:
-    """Return [offsets; phi] (16,) of the physically consistent load with the best fit.
+    """Return the [offsets; phi] (16,) with the best fit that a rigid body can have.
 
     Args:
         gram, right: (16, 16), (16,) weighted normal equations; per sample if there is a prior.
-        theta: (16,) solution of these equations.
+        theta: (16,) their solution, returned if it satisfies the constraints.
 
     Raises:
         DrakeTeleopError: if the solver finds no solution.
@@ -118,7 +115,6 @@ def consistent_least_squares(
 
 
 def _parameter_units(phi: Array) -> Array:
-    """Return the units (10,) (m0, m0 L, m0 L^2) of phi; L is a length about So."""
     m = abs(phi[0])
     if m == 0.0:
         raise DrakeTeleopError("the mass cannot be identified from this wrench", where="wrench")
@@ -128,7 +124,7 @@ def _parameter_units(phi: Array) -> Array:
 
 
 def _solve(H: Array, b: Array, unit: Array, prior: Prior | None, row: Array | None) -> Array:
-    """Return phi / unit that minimises phi^T H phi / 2 - b^T phi + prior with J(phi) >= 0."""
+    """Return phi / unit that minimises phi^T H phi / 2 - b^T phi + prior for a consistent phi."""
     entropic = prior is not None and prior.kind == "entropic"
     if prior is not None:
         J0_inverse = np.linalg.inv(pseudo_inertia(checked("prior.phi", prior.phi, 10) / unit))
@@ -182,15 +178,13 @@ def _make_program(*, distance: bool) -> tuple[Any, Any, Any, Any]:
 
 @cache
 def _distance_program(thread: int) -> tuple[Any, Any, Any, Any]:
-    """Return one program per thread; building it takes as long as solving it."""
     return _make_program(distance=True)
 
 
 def _distance_cone(H: Array, b: Array) -> tuple[Array, Array]:
-    """Return matrix (11, 11) and vector (11,) of the cone t >= |R x - d| for unknowns [x; t].
+    """Return matrix (11, 11) and vector (11,) of the cone t >= |R x - d|, R^T R = H, R^T d = b.
 
-    R and d satisfy R^T R = H and R^T d = b. With the squared distance as cost, the solver's
-    tolerance of 1e-8 would become an error of 1e-4.
+    The squared distance as cost would be less accurate.
     """
     values, vectors = np.linalg.eigh(H)
     scale = values[-1]

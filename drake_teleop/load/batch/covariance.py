@@ -1,8 +1,6 @@
 """Covariance of the batch estimators (docs/theory.md, "Details of the estimators").
 
-The covariance of `NormalEquations`, with noise of the motion, random walks of the offsets, errors
-in variables, the prior and errors of the sensor's 36 gains. `consistent` uses the covariance
-without the consistency constraint.
+It ignores the physical constraint of `consistent`.
 """
 
 from __future__ import annotations
@@ -28,11 +26,11 @@ ARM = 0.06
 
 
 def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the covariance (16, 16) of data and prior, and (16,) booleans: True if
-    prior-dominated.
+    """Return the covariance (16, 16) of data and prior, and (16,) True if the prior dominates.
 
-    With information D of the data and P of the prior (10, 10), the data's share is the diagonal of
-    (D + P)^-1 D.
+    Args:
+        covariance: (16, 16) of [offsets; phi] from the data.
+        information: (10, 10) inverse covariance of phi from the prior.
     """
     determined = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0.0)
     used = determined | (np.arange(16) >= 6)
@@ -53,8 +51,9 @@ def with_prior(covariance: Array, information: Array) -> tuple[Array, NDArray[np
 
 
 def white_covariance(plain: Array, equations: NormalEquations, fit: Fit) -> Array:
-    """Return the covariance (16, 16) for weights W between channels, whose noise correlates as
-    W^-1.
+    """Return the covariance (16, 16) of a fit with weights W between channels and noise W^-1.
+
+    `plain` is that for uncorrelated channels.
     """
     W, Z = fit.form.weights, fit.moments.mean
     predicted = np.linalg.inv(W)
@@ -77,9 +76,9 @@ def _inverse_gram(fit: Fit) -> Array:
 
 
 def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Array) -> Array:
-    """Return the covariance (16, 16) due to random walks of offsets and motion.
+    """Return the covariance (16, 16) of [offsets; phi] due to random walks of offsets and motion.
 
-    `steps` (6, 6) is the covariance of their steps per sample, as wrenches.
+    `kept` (N,) marks used samples; `steps` (6, 6) is the covariance of a step, as wrenches.
     """
     covariance = np.zeros((16, 16))
     if not steps.any():
@@ -101,7 +100,7 @@ def walk_covariance(record: Record, kept: NDArray[np.bool_], fit: Fit, steps: Ar
 
 
 def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
-    """Return the parameter errors (n, 36) that a unit error of each gain causes, scaled by `ARM`.
+    """Return the errors (n, 36) of n parameters for a unit error of each of the 36 sensor gains.
 
     Args:
         products: (bands, 6, n, 6) moments of column j in channel c with channel k of the wrench.
@@ -115,7 +114,7 @@ def gain_effects(products: Array, W: Array, inverse: Array) -> Array:
 
 
 def gain_covariance(fit: Fit, offsets: bool) -> Array:
-    """Return the covariance (16, 16) that gain errors of standard deviation 1 cause."""
+    """Return the covariance (16, 16) of [offsets; phi] for gain errors of deviation 1."""
     Z, W = fit.moments.mean, fit.form.weights
     used = excited_columns(Z) & (offsets | (np.arange(16) >= 6))
     root = inverse_root(normal_equations(Z, W)[0], used)

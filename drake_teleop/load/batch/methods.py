@@ -4,9 +4,9 @@
 |---|---|
 | `ordinary` | least squares, equal weights, Eqs. (7)-(8) |
 | `whitened` | rows divided by each channel's noise, specified or estimated |
-| `total` | `whitened` with errors in variables |
+| `total` | `whitened`, with noise in the motion |
 | `robust` | `total` without impacts and short contacts |
-| `consistent` | `robust` with physical consistency; default |
+| `consistent` | `robust`, limited to loads that a rigid body can have; default |
 
 Details: docs/theory.md, "Details of the estimators".
 """
@@ -71,11 +71,10 @@ class BatchResult:
     """Result of `identify_batch`.
 
     Attributes:
-        identification: load and offsets.
-        noise: (6,) standard deviations that determine the weights [N, N m].
-        rejected: (N,) booleans: True for rejected samples.
-        note: warning for the user, mostly empty.
-        equations: of the used samples, for `uncertainty.base_parameters`.
+        noise: (6,) standard deviations of the wrench channels, used as weights [N, N m].
+        rejected: (N,) True for rejected samples.
+        note: warning for the user, or "".
+        equations: sums of the used samples.
     """
 
     identification: Identification
@@ -145,7 +144,6 @@ def _huber(record: Record, options: Options) -> NormalForm:
 
 
 def _std_growth(whole: Fit, kept: Moments) -> float:
-    """Return the largest factor by which omitted samples increase a standard deviation."""
     if kept.samples < _MIN_SAMPLES_TO_REJECT:
         return np.inf
     used = excited_columns(whole.moments.mean)
@@ -157,7 +155,7 @@ def _std_growth(whole: Fit, kept: Moments) -> float:
 
 
 class Method(NamedTuple):
-    """Estimator: the text for `Identification.method`, and the function that fits."""
+    """Batch estimator: name for results, and fitting function."""
 
     name: str
     fit: Callable[[Record, Options], Fit]
@@ -176,7 +174,7 @@ DEFAULT_METHOD = "consistent"
 
 
 def check_method(method: str) -> None:
-    """Raise DrakeTeleopError unless the method is one of `METHODS`."""
+    """Raise DrakeTeleopError unless `method` names a batch estimator (`METHODS`)."""
     if not isinstance(method, str) or method not in METHODS:
         raise DrakeTeleopError(f"{method!r} is not one of {sorted(METHODS)}", where="method")
 
@@ -197,18 +195,17 @@ def identify_batch(
     delay_s: float = 0.0,
     gain_std: float = 0.0,
 ) -> BatchResult:
-    """Return load and sensor offsets of a free motion by one of `METHODS`.
+    """Return load and sensor offsets of a free motion, by a batch estimator.
 
     Args:
         wrench, s, omega, alpha, delay_s: as for `normal_equations.identify`, in the order of time.
-        noise: of wrench and motion; None: estimated wrench noise, exact motion, fixed offsets.
+        method: "ordinary", "whitened", "total", "robust" or "consistent".
+        noise: of wrench and motion; None: estimated wrench noise, exact motion.
         offsets: False if the wrench contains no offsets.
-        shared_noise: one estimated noise for forces and one for torques, as for averages over
-            poses at rest.
-        resolution: quantisation step of forces and torques [N, N m], for averages over poses.
+        shared_noise: True for averages over poses at rest: one noise for forces, one for torques.
+        resolution: (2,) quantisation step of forces and torques [N, N m], with `shared_noise` only.
         prior, ellipsoid: only for "consistent".
-        gain_std: standard deviation of the sensor's 36 gains, scaled by `covariance.ARM` between
-            force and torque; increases the covariance.
+        gain_std: standard deviation of the sensor's 36 gains (relative).
 
     Raises:
         DrakeTeleopError: for unsuitable options, fewer than 3 samples, or a zero wrench.
@@ -257,7 +254,6 @@ def identify_batch(
 
 
 def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
-    """Return a total least squares fit with specified, else estimated, wrench noise."""
     noise, Z = options.noise, moments.mean
     if noise.wrench is not None:
         std = np.asarray(noise.wrench, np.float64)
@@ -280,7 +276,6 @@ def _fit_moments(moments: Moments, options: Options, record: Record) -> Fit:
 
 
 def _relative_residuals(record: Record, theta: Array, shared: bool) -> Array:
-    """Return (N,) each sample's largest residual over its robust deviation."""
     n = len(record.s)
     magnitudes = np.abs(record.residual(theta, slice(0, n, max(1, n // _MAX_MEDIAN_SAMPLES))))
     median = np.median(magnitudes, axis=0)

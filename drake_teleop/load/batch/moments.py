@@ -1,12 +1,10 @@
-"""Second moments of a record, a (19, 19) matrix for any number of samples, Eq. (T4).
+"""Second moments of a record, from which all least squares estimates follow, Eq. (T4).
 
-Row c of [E V] is T_c z with constant T_c and
+They are the mean of z z^T (19, 19). Row c of the regressor [E V] is T_c z with constant T_c:
 
     z = [1, F (6), s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z]   (19)
 
-The mean of z z^T determines least squares with any weights between channels, errors in variables
-and the residual's covariance. F is the wrench, w = omega. Noise of omega counts to first
-order.
+with wrench F and w = omega.
 """
 
 from __future__ import annotations
@@ -36,9 +34,9 @@ class Noise:
     """Standard deviations of white measurement noise, independent between channels.
 
     Attributes:
-        wrench: (6,) noise of [f; tau] [N, N m]; None to estimate it from the residual.
+        wrench: (6,) [N, N m]; None to estimate it from the residual.
         s, omega, alpha: (3,), or a number for all axes [m/s^2, rad/s, rad/s^2].
-        walk: (12,), or 0, step per sample of random walks of [wrench, s, alpha].
+        walk: (12,), or 0: step per sample of random walks of [wrench, s, alpha].
     """
 
     wrench: ArrayLike | None = None
@@ -64,7 +62,7 @@ class Noise:
 
 
 class Moments:
-    """Sum of z z^T over a record; memory does not depend on its length."""
+    """Sum over a record of z z^T (19, 19), z = [1, wrench, s, alpha, products of omega]."""
 
     def __init__(self) -> None:
         self._sums = np.zeros((19, 19))
@@ -76,7 +74,7 @@ class Moments:
 
     @property
     def mean(self) -> Array:
-        """Mean of z z^T (19, 19).
+        """Mean of z z^T (19, 19) over the record.
 
         Raises:
             DrakeTeleopError: for fewer than 3 samples.
@@ -96,7 +94,7 @@ class Moments:
         alpha: ArrayLike,
         weights: ArrayLike | None = None,
     ) -> None:
-        """Add samples (N, 6) and (N, 3) as for `identify`, in any order, with weights (N,) or 1."""
+        """Add N samples with arguments as for `identify`, in any order, with `weights` (N,)."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         n = rows[0].shape[0]
         weight = np.ones(n) if weights is None else checked("weights", weights, n)
@@ -107,7 +105,10 @@ class Moments:
             self._sums += part + np.triu(part, 1).T
 
     def noise_covariance(self, noise: Noise, wrench: Array) -> Array:
-        """Return the mean noise covariance Q (19, 19) of z for the wrench noise `wrench` (6,)."""
+        """Return the mean noise covariance (19, 19) of z, for wrench noise (6,) [N, N m].
+
+        z are the signals of `Moments`.
+        """
         Q = np.zeros((19, 19))
         std = np.concatenate([wrench, noise.motion[0], noise.motion[2]])
         Q[np.arange(1, 13), np.arange(1, 13)] = std**2
@@ -122,7 +123,7 @@ class Moments:
 
     @staticmethod
     def walk_covariance(noise: Noise) -> Array:
-        """Return the covariance (19, 19) of the random walks of z per sample."""
+        """Return the covariance (19, 19) of a random-walk step of the signals z."""
         Q = np.zeros((19, 19))
         Q[np.arange(1, 13), np.arange(1, 13)] = np.square(noise.walk)
         return Q
@@ -130,7 +131,7 @@ class Moments:
 
 @cache
 def coefficients() -> Array:
-    """Return the constant T (6, 16, 19) of [E V] = T z, computed from the regressor."""
+    """Return the constant T (6, 16, 19) with regressor [E V] = T z, z the signals of `Moments`."""
     T, unit, zero = np.zeros((6, 16, 19)), np.eye(3), np.zeros(3)
     T[np.arange(6), np.arange(6), 0] = 1.0
     T[:, 6:, 7:10] = np.moveaxis(regressor(unit, zero, zero), 0, -1)
@@ -146,7 +147,7 @@ def coefficients() -> Array:
 def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
     """Return the Gram matrix (16, 16), sum of W_cd T_c Z T_d^T, and the right-hand side (16,).
 
-    Z (19, 19) is a mean of z z^T or a noise covariance, W (6, 6) the weights between the channels.
+    Z (19, 19) is a mean or a noise covariance of z, W (6, 6) the weights between channels.
     """
     T = coefficients()
     TZ = (T.reshape(96, 19) @ Z).reshape(6, 16, 19)
@@ -157,9 +158,9 @@ def normal_equations(Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def residual_covariance(Z: Array, theta: Array) -> Array:
-    """Return the mean (6, 6) of r r^T with the residual r = F - [E V] theta.
+    """Return the mean (6, 6) of r r^T for the residual r = F - [E V] theta, theta = [offsets; phi].
 
-    Z (19, 19) is a mean of z z^T, or a noise covariance.
+    Z (19, 19) is a mean of z z^T or a noise covariance of z.
     """
     L = -np.einsum("cjk,j->ck", coefficients(), theta)
     L[np.arange(6), np.arange(1, 7)] += 1.0
@@ -168,15 +169,12 @@ def residual_covariance(Z: Array, theta: Array) -> Array:
 
 
 def excited_columns(Z: Array) -> NDArray[np.bool_]:
-    """Return (16,) booleans: True for columns of [E V] that exceed rounding errors."""
+    """Return (16,) booleans: True for parameters whose column of [E V] exceeds rounding errors."""
     return np.diag(normal_equations(Z, np.eye(6))[0]) > _MIN_EXCITATION**2
 
 
 def inverse_root(gram: Array, used: NDArray[np.bool_]) -> Array:
-    """Return the matrix R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution.
-
-    Columns are scaled. R is 0 in unused columns and along singular directions.
-    """
+    """Return R (n, rank) with R^T gram R = 1; R R^T right is the minimum-norm solution."""
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, np.diag(gram), 1.0)), 0.0)
     eigenvalues, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
     kept = eigenvalues > _MIN_EIGENVALUE * eigenvalues[-1]

@@ -1,12 +1,9 @@
-"""Mixed least squares and total least squares: noise in the measured motion too, Eq. (T4).
+"""Least squares that allows for noise of wrench and motion (total least squares), Eq. (T4).
 
-The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)), the ratio of the residual
-covariance S to the covariance R that the specified noise causes (Van Huffel, Vandewalle, The Total
-Least Squares Problem, 1991, chapters 3 and 8). W = R(theta)^-1 is updated until convergence
-(Kukush, Van Huffel, Metrika 59, 2004).
-
-A direction v is omitted if its signal v^T G v exceeds its noise n = lambda v^T C v by less than
-5 sqrt(2 / N) n: the motion along v is not distinguishable from noise.
+The estimate minimises lambda = tr(W S(theta)) / tr(W R(theta)): residual covariance S over that of
+the specified noise, R (Van Huffel, Vandewalle, The Total Least Squares Problem, 1991, chapters 3
+and 8). W = R(theta)^-1 is iterated (Kukush, Van Huffel, Metrika 59, 2004). Directions in which the
+motion is indistinguishable from noise are omitted.
 """
 
 from __future__ import annotations
@@ -39,14 +36,12 @@ _MIN_MEAN_SQUARE = 1e-60  # mean square whose inverse overflows [N^2, N^2 m^2]
 
 
 class NormalForm(NamedTuple):
-    """Equations gram theta = right, divided by the number of samples, and their solution.
+    """Equations gram theta = right, per sample, and their solution theta = [offsets; phi] (16,).
 
     Attributes:
         gram: (16, 16) Gram matrix, compensated for noise.
-        right: (16,) right-hand side.
-        theta: (16,) solution [offsets; phi] [SI].
         weights: (6, 6) weights W between channels.
-        scale: lambda.
+        scale: lambda, residual over specified noise variance.
         transfer: (16, 16) matrix from the ordinary least squares solution to theta.
         undetermined: (16,) True for parameters whose variance is mostly in omitted directions.
     """
@@ -63,9 +58,13 @@ class NormalForm(NamedTuple):
 def total_least_squares(
     moments: Moments, noise: Noise, wrench_noise: Array, *, offsets: bool = True
 ) -> NormalForm:
-    """Return offsets and load, allowing for noise of the wrench (6,) [N, N m] and of the motion.
+    """Return load and offsets that allow for noise of wrench and motion.
 
-    `offsets=False` fixes the offsets at 0.
+    Args:
+        moments: of the record.
+        noise: of the motion.
+        wrench_noise: (6,) standard deviations [N, N m].
+        offsets: False fixes the offsets at 0.
 
     Raises:
         DrakeTeleopError: for fewer than 3 samples, or if the wrench is zero throughout.
@@ -91,7 +90,6 @@ def total_least_squares(
 
 
 def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> NormalForm:
-    """Return mixed TLS for weights W, without directions whose gain is below `min_gain`."""
     gram, right = normal_equations(Z, W)
     if not offsets:  # without correlation to other columns, their estimate is 0
         gram[:6, 6:] = gram[6:, :6] = 0.0
@@ -122,11 +120,7 @@ def _solve(Z: Array, Q: Array, W: Array, offsets: bool, min_gain: float) -> Norm
 
 
 def _min_root(right: Array, nu: Array, squares: float, noise: float) -> float:
-    """Return the smallest lambda for which the matrix
-    [I, -b; -b^T, squares] - lambda [diag(nu), 0; 0, noise] is singular.
-
-    This is the only root below 1 / max(nu) of the secular equation; b is `right`.
-    """
+    """Return the smallest lambda at which the augmented normal equations are singular."""
 
     def excess(ratio: float) -> float:
         return float(squares - ratio * noise - np.sum(right**2 / (1.0 - ratio * nu)))
@@ -161,29 +155,29 @@ class Record:
 
     @property
     def arrays(self) -> tuple[Array, Array, Array, Array]:
-        """Tables wrench (N, 6), s, omega and alpha (N, 3)."""
+        """Wrench (N, 6), and s, omega and alpha (N, 3)."""
         return self.wrench, self.s, self.omega, self.alpha
 
     @cached_property
     def moments(self) -> Moments:
-        """Second moments of the record."""
+        """Second moments of all samples."""
         moments = Moments()
         moments.add(*self.arrays)
         return moments
 
     def every(self, step: int) -> Record:
-        """Return a record with every `step`-th sample."""
+        """Return every `step`-th sample."""
         return Record(*(table[::step] for table in self.arrays))
 
     def residual(self, theta: Array, part: slice) -> Array:
-        """Return the residuals F - [E V] theta (n, 6) of the samples in `part`."""
+        """Return the residuals (n, 6) of the samples in `part` for theta = [offsets; phi] (16,)."""
         F, s, omega, alpha = (table[part] for table in self.arrays)
         return F - theta[:6] - non_contact_wrench(s, omega, alpha, theta[6:])
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result: normal form, wrench noise (6,), moments, rejected samples (N,), note for the user."""
+    """Result of an estimator: solution, noise (6,) [N, N m], rejected samples (N,), note."""
 
     form: NormalForm
     wrench_noise: Array

@@ -1,4 +1,4 @@
-"""Uncertainty of an identification: intervals, prior shares, determined parameter combinations."""
+"""Uncertainty of an identified load: intervals, share of the prior, determined combinations."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ _NUMBER_SHARE, _ELLIPSIS_SHARE = 0.1, 0.01
 def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
     """Return lower and upper ends (16,) of the confidence intervals of [offsets; phi] [SI].
 
-    Student's t with the degrees of freedom of each variance; (-inf, inf) for undetermined
-    parameters.
+    By Student's t distribution; (-inf, inf) for undetermined parameters.
 
     Raises:
         DrakeTeleopError: if the level is outside (0, 1).
@@ -51,9 +50,7 @@ def intervals(load: Identification, level: float = 0.95) -> tuple[Array, Array]:
 def prior_dominated(
     standard_deviations: ArrayLike, prior_std: ArrayLike, share: float = 0.5
 ) -> NDArray[np.bool_]:
-    """Return (n,) booleans: True where a standard deviation is at least `share` of the prior's.
-
-    A prior standard deviation of inf means no prior.
+    """Return (n,) True where a standard deviation is at least `share` of the prior's.
 
     Raises:
         DrakeTeleopError: if shapes differ or a prior standard deviation is not positive.
@@ -73,6 +70,7 @@ class Combination:
     Attributes:
         coefficients: (16,) factors, 1 for the leading parameter, which gives the unit.
         leading: index of the leading parameter in `PARAMETERS`.
+        value, standard_deviation: of the combination, in this unit.
         share: standard deviation over the natural scale.
         words: the sum as text; "..." stands for terms below a tenth of the largest.
     """
@@ -92,11 +90,11 @@ class Combination:
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """Base parameters: combinations of load and offsets that a record determines.
+    """Base parameters: the combinations of load and offsets that a record determines.
+
+    Gautier, Khalil, IEEE Trans. Robotics and Automation 6(3), 1990; Gautier, ICRA 1990.
 
     Attributes:
-        combinations: as many as the rank of [E V] (Gautier, Khalil, IEEE Trans. Robotics and
-            Automation 6(3), 1990; QR with pivoting: Gautier, ICRA 1990).
         without_influence: names of parameters without influence on the wrench.
         directions: principal combinations of determined but not identified parameters.
         slow_noise: names of wrench channels with drift.
@@ -109,11 +107,11 @@ class BaseParameters:
 
     @property
     def rank(self) -> int:
-        """Number of independent combinations that the record determines, at most 16."""
+        """Number of determined combinations, at most 16."""
         return len(self.combinations)
 
     def lines(self) -> list[str]:
-        """Return a text summary of the base parameters."""
+        """Return a text summary."""
         lines = [f"{self.rank} of 16 combinations of offsets and load are determined"]
         if self.without_influence:
             names = ", ".join(self.without_influence)
@@ -134,7 +132,11 @@ class BaseParameters:
 
 
 def base_parameters(equations: NormalEquations) -> BaseParameters:
-    """Return the base parameters of a record; raises as `NormalEquations.solve`."""
+    """Return the base parameters of a record.
+
+    Raises:
+        DrakeTeleopError: as `NormalEquations.solve`.
+    """
     load = equations.solve()
     theta = np.concatenate([load.offsets, load.phi])
     covariance, natural = equations.covariance(), natural_scale(load.phi)

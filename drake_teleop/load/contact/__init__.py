@@ -1,1 +1,1 @@
-"""Contact detection in the wrench that remains after elimination of the load."""
+"""Contact detection in the wrench that remains after removal of the load's wrench."""

@@ -1,6 +1,7 @@
-"""Contact detection in the eliminated wrench, sample by sample.
+"""Contact detection in a wrench from which the load's wrench is removed, sample by sample.
 
-Statistics of the normalised wrench z and of its innovations e (defined in `noise_floor`)::
+A statistic of the normalised wrench z and its innovations e (see `noise_floor`) reaches a threshold
+when contact begins::
 
     level    |z|; its square is chi-squared with six degrees of freedom
     cusum    |S|, S = (S + e) max(0, 1 - slack / |S + e|): cumulative sum (Crosier, Technometrics
@@ -8,8 +9,7 @@ Statistics of the normalised wrench z and of its innovations e (defined in `nois
     glr      max over n of |e_k + ... + e_{k-n+1}| / (w_n sqrt(n)), n = 1, 2, 4 ... `WINDOW`:
              generalised likelihood ratio (Lorden 1971; Willsky and Jones 1976)
 
-Contact begins at a threshold of the chosen statistic. It ends after `hold` samples with a level
-below `leave`; then the sums restart.
+Contact ends after `hold` samples with a level below `leave`; then the sums restart.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ LEAVE = 0.7 * RARE
 def detection_update(
     memory, contact, s, omega, alpha, acceleration, parameters, slack, following, quiet
 ):
-    """Update by one sample and write the `STATISTICS` to memory[5:8]; compiled, without checks.
+    """Update the memory by one sample and write the `STATISTICS` to memory[5:8].
 
     Args:
         memory: (SIZE,), zeros before the first sample.
-        contact: (6,) contact wrench F_c of Eq. (13).
+        contact: (6,) contact wrench F_c, Eq. (13) [N, N m].
         s, omega, alpha, acceleration: (3,) motion, as for `NoiseFloor.sigma`.
         parameters: `NoiseFloor.parameters`.
-        slack, following, quiet: as `slack`, `following`, `leave` of `ContactDetector`.
+        slack, following, quiet: `slack`, `following`, `leave` of `ContactDetector`.
     """
     variances, P, growth, root, rho, widths, fade = parameters
     V, scaled = np.empty((6, 10)), np.empty(6)
@@ -133,11 +133,12 @@ def statistics(
     slack: float = SLACK,
     following: float = 0.0,
 ) -> Array:
-    """Return the `STATISTICS` (N, 3) of each sample of a log, without contact decisions.
+    """Return level, cusum and glr (N, 3) of each sample of a log, in standard deviations.
 
     Args:
-        contact: (N, 6) contact wrench F_c of Eq. (13) [N, N m].
+        contact: (N, 6) contact wrench F_c, Eq. (13) [N, N m].
         s, omega, alpha, acceleration: (N, 3) motion, as for `NoiseFloor.sigma`.
+        slack, following: as for `ContactDetector`.
     """
     rows = checked_motion(contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration)
     out = np.empty((len(rows[0]), 3))
@@ -148,7 +149,6 @@ def statistics(
 
 @njit(cache=True)
 def _last_sum(memory, hold, widths):
-    """Return the `glr` term of the longest window (1, 2, 4 ... samples) within `hold` samples."""
     m = 0
     while 2 << m <= min(hold, WINDOW // 2):
         m += 1
@@ -163,10 +163,9 @@ def _last_sum(memory, hold, widths):
 
 @njit(cache=True)
 def hysteresis_update(memory, statistic, enter, leave, hold, widths):
-    """Return whether there is contact, after `detection_update`; compiled, without checks.
+    """Return whether there is contact, after `detection_update` of the same memory.
 
     Args:
-        memory: of `detection_update`, updated.
         statistic: index into `STATISTICS`.
         enter: threshold of this statistic at which contact begins.
         leave, hold: contact ends after `hold` samples with a level below `leave`.
@@ -187,9 +186,9 @@ def hysteresis_update(memory, statistic, enter, leave, hold, widths):
 
 @njit(cache=True)
 def flag_update(memory, contact, s, omega, alpha, acceleration, parameters, decision):
-    """Update the memory by one sample; return whether there is contact.
+    """Update the memory by one sample and return whether there is contact.
 
-    Last arguments: `ContactDetector.settings`.
+    The last two arguments are `ContactDetector.settings`.
     """
     slack, following, statistic, enter, leave, hold = decision
     detection_update(
@@ -207,17 +206,15 @@ def _flags(memory, rows, settings, out):
 
 
 class ContactDetector:
-    """Contact detector for a stream of samples.
-
-    `flag_update(memory, ..., *settings)` works on external memory, such as a Drake state.
+    """Contact detector with hysteresis for a stream of samples.
 
     Args:
-        threshold: of the statistic, such as `NoiseFloor.threshold`.
-        statistic: one of `STATISTICS`.
+        threshold: of the statistic at which contact begins, such as `NoiseFloor.threshold`.
+        statistic: "level", "cusum" or "glr".
         leave, hold: contact ends after `hold` samples with a level below `leave`.
         slack: slack of the cumulative sum [standard deviations].
-        following: sample period over time constant of the subtracted mean of F_c, which is updated
-            while the level is below `leave`; 0 for no mean.
+        following: sample period over time constant of a mean that is subtracted from the contact
+            wrench, updated while the level is below `leave`; 0: no mean.
 
     Raises:
         DrakeTeleopError: for an unknown statistic or values outside their range.
@@ -257,7 +254,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> bool:
-        """Update by one sample, arguments as for `statistics`; return whether there is contact."""
+        """Update by one sample, as for `statistics`; return whether there is contact."""
         parts = {"s": s, "omega": omega, "alpha": alpha, "acceleration": acceleration}
         motion = [checked(name, value, 3) for name, value in parts.items()]
         wrench = checked("contact", contact, 6)
@@ -271,7 +268,7 @@ class ContactDetector:
         alpha: ArrayLike,
         acceleration: ArrayLike,
     ) -> NDArray[np.bool_]:
-        """Update by N samples of a log; return (N,) booleans: True for contact."""
+        """Update by N samples of a log, as for `statistics`; return (N,) True for contact."""
         rows = checked_motion(
             contact=contact, s=s, omega=omega, alpha=alpha, acceleration=acceleration
         )
@@ -281,10 +278,10 @@ class ContactDetector:
 
 
 def wrench_axis(wrench: ArrayLike) -> tuple[Array, Array, Array]:
-    """Return direction (..., 3), nearest point (..., 3) [m] and pitch (...) [m] of a wrench's axis.
+    """Return the central axis of wrenches (..., 6) in S (Poinsot); NaN where the force is 0.
 
-    The axis is Poinsot's central axis of a wrench (..., 6) in S; the point is nearest to So.
-    Results are NaN where the force is 0.
+    Returns:
+        direction of the force (..., 3), point nearest to So (..., 3) [m], and pitch (...) [m].
     """
     w = checked("wrench", wrench, 6, leading=True)
     f, tau = w[..., :3], w[..., 3:]

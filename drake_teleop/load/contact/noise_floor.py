@@ -1,10 +1,9 @@
-"""Noise floor: standard deviation of the eliminated wrench r = F - F_o - V phi in free motion.
+"""Noise floor: standard deviation sigma of the contact wrench r = F - F_o - V phi in free motion.
 
     sigma_c^2 = n_c^2 + (J P J^T)_cc + k_c^2 |a|^2 + l_c^2 |alpha|^2,    J = [E V]
 
-n is the noise at rest, P the covariance of [offsets; phi]. a and alpha are the accelerations of S
-without gravity; their squares are held at their peaks and fade. k and l cover gain errors,
-alignment, bandwidth and elasticity. z is r / sigma, decorrelated between channels, with the
+n is the noise at rest, P the covariance of [offsets; phi]; a, alpha are accelerations of S without
+gravity, whose peaks are held and fade. z is r / sigma, decorrelated between channels, with the
 innovations e_k = (z_k - rho z_{k-1}) / sqrt(1 - rho^2).
 """
 
@@ -37,10 +36,10 @@ less often than that value, which is reached about once in a record of the same 
 
 
 def statistic_index(statistic: str) -> int:
-    """Return the column of a statistic.
+    """Return the column of a statistic: "level", "cusum" or "glr".
 
     Raises:
-        DrakeTeleopError: unless it is one of `STATISTICS`.
+        DrakeTeleopError: for another name.
     """
     if statistic not in STATISTICS:
         raise DrakeTeleopError(
@@ -53,16 +52,16 @@ def statistic_index(statistic: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class NoiseFloor:
-    """Noise floor of the eliminated wrench.
+    """Noise of the contact wrench in free motion (symbols: module `noise_floor`).
 
     Attributes:
         noise: (6,) noise n at rest [N, N m].
-        covariance: (16, 16) covariance P, finite, see `finite_covariance`.
+        covariance: (16, 16) finite covariance P of [offsets; phi].
         per_acceleration: (6, 2) factors k [N, N m per m/s^2] and l [per rad/s^2].
-        correlation: (6, 6) correlation of r / sigma between channels.
+        correlation: (6, 6) correlation between channels.
         rho: (6,) lag-one correlation of z.
         widths: (8,) w_n of sums of 1, 2, 4 ... `WINDOW` innovations; 1 for white ones.
-        fade: factor per sample on held squares of the acceleration, 0 for no hold.
+        fade: factor per sample on the held peaks of the acceleration, 0 for no hold.
         reached: (3,) largest value of each statistic in the fitted motion.
     """
 
@@ -93,7 +92,7 @@ class NoiseFloor:
             raise DrakeTeleopError("is not positive definite", where="correlation")
 
     def threshold(self, statistic: str, margin: float = MARGIN) -> float:
-        """Return the largest value of the statistic in the fitted free motion, times a margin.
+        """Return a contact threshold: `margin` times the largest statistic in free motion.
 
         Raises:
             DrakeTeleopError: for an unknown statistic, or without a fitted motion.
@@ -102,9 +101,7 @@ class NoiseFloor:
 
     @property
     def parameters(self) -> tuple[Array, Array, Array, Array, Array, Array, float]:
-        """Arguments of compiled functions: n^2, P, squares of k and l (6, 2), the matrix (6, 6)
-        that decorrelates r / sigma, rho, widths and fade.
-        """
+        """Arguments of compiled functions: n^2, P, k^2, l^2, decorrelation, rho, widths, fade."""
         root = np.linalg.inv(np.linalg.cholesky(self.correlation))
         variances, growth = self.noise**2, self.per_acceleration**2
         return variances, self.covariance, growth, root, self.rho, self.widths, self.fade
@@ -112,11 +109,12 @@ class NoiseFloor:
     def sigma(
         self, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike, acceleration: ArrayLike
     ) -> Array:
-        """Return the standard deviations sigma (N, 6) along a free motion of N consecutive samples.
+        """Return the noise sigma (N, 6) [N, N m] along a free motion of N consecutive samples.
 
         Args:
-            s, omega, alpha: (N, 3) as for `regressor`.
-            acceleration: (N, 3) acceleration a of So without gravity, in any axes [m/s^2].
+            s, omega, alpha: (N, 3) specific force, angular velocity and acceleration of S, in S
+                [SI].
+            acceleration: (N, 3) acceleration of So without gravity, in any axes [m/s^2].
         """
         rows = checked_motion(s=s, omega=omega, alpha=alpha, acceleration=acceleration)
         out = np.empty((len(rows[0]), 6))
@@ -131,14 +129,14 @@ def _square(x):
 
 @njit(cache=True)
 def hold_peaks(memory, acceleration, alpha, fade):
-    """Update the held squares of the accelerations in a detector's memory."""
+    """Update the held squared accelerations in a detector's memory."""
     memory[HELD_A] = max(_square(acceleration), fade * memory[HELD_A])
     memory[HELD_ALPHA] = max(_square(alpha), fade * memory[HELD_ALPHA])
 
 
 @njit(cache=True)
 def parameter_variance(s, omega, alpha, P, V, out):
-    """Write the parameters' variances (J P J^T)_cc into out (6,); V (6, 10) is scratch."""
+    """Write the variances (6,) due to uncertain [offsets; phi] into out; V (6, 10) is scratch."""
     regressor_into(s, omega, alpha, V)
     for c in range(6):
         value = P[c, c]
@@ -154,7 +152,7 @@ def parameter_variance(s, omega, alpha, P, V, out):
 
 @njit(cache=True)
 def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out):
-    """Write the standard deviations (N, 6) of a record's contact wrench into out."""
+    """Write the noise sigma (N, 6) of a record's contact wrench into out."""
     memory, V = np.zeros(3), np.empty((6, 10))
     for k in range(s.shape[0]):
         hold_peaks(memory, acceleration[k], alpha[k], fade)
@@ -165,15 +163,15 @@ def write_sigmas(s, omega, alpha, acceleration, variances, P, growth, fade, out)
 
 
 def checked_motion(**arrays: ArrayLike) -> list[Array]:
-    """Return the named arrays as (N, 3) tables of equal length, `contact` as (N, 6)."""
+    """Return the named arrays as (N, 3) tables of equal length; `contact` as (N, 6)."""
     sizes = {name: (value, 6 if name == "contact" else 3) for name, value in arrays.items()}
     return checked_rows(**sizes)[1]
 
 
 def finite_covariance(phi: Array, covariance: Array, *, tared: bool = False) -> Array:
-    """Return a covariance (16, 16) whose standard deviations are at most `natural_scale`.
+    """Return the covariance (16, 16) of [offsets; phi] with variances limited to `natural_scale`^2.
 
-    `tared` means offsets from the same record: their variance is 0.
+    `tared` means that offsets are from the same record: their variance is 0.
     """
     P, natural = covariance.copy(), natural_scale(phi)
     # Undetermined offsets must have been tared; otherwise the elimination is useless.

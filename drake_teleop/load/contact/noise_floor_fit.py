@@ -30,11 +30,8 @@ def fit_noise_floor(
 ) -> NoiseFloor:
     """Return the noise floor of a record of free motion; fast motion gives the best estimate.
 
-    Squares of each channel are explained by 1, |a|^2, |alpha|^2 and P (see `NoiseFloor`). Weights
-    are iterated: squares of normal noise scatter in proportion to their mean.
-
     Args:
-        contact: (N, 6) contact wrench F_c without contact [N, N m].
+        contact: (N, 6) contact wrench of a motion without contact [N, N m].
         s, omega, alpha, acceleration: (N, 3) as for `NoiseFloor.sigma`.
         covariance: (16, 16) from `finite_covariance`.
         fade: as in `NoiseFloor`.

@@ -1,4 +1,4 @@
-"""Online detection of a changed load: an object was grasped or released, Eqs. (T23), (T24).
+"""Online detection of a grasped or released object, from a changed load, Eqs. (T23), (T24).
 
     known       the known load explains the mean wrench of blocks of `BLOCK` seconds
     disturbed   neither the known nor a new load explains it: contact, or the moment of a grasp
@@ -71,7 +71,7 @@ _RESOLUTION = 1e-10
 
 @njit(cache=True)
 def whitening(motion, phi, noise, model_var, n):
-    """Return the inverse (6, 6) of the Cholesky factor of a block mean's noise covariance.
+    """Return a matrix (6, 6) that maps the wrench noise of a block mean to unit covariance.
 
     Args:
         motion: (9,) mean [s, omega, alpha].
@@ -113,8 +113,13 @@ def whitening(motion, phi, noise, model_var, n):
 
 @njit(cache=True)
 def update_estimate(estimate, V, wrench, root):
-    """Update [theta (16); covariance P (256)] by a block, Eq. (T6); return the innovation's
-    chi-squared.
+    """Update an estimate by the mean of a block, Eq. (T6); return chi-squared of its innovation.
+
+    Args:
+        estimate: [theta (16); covariance (256)], theta = [offsets; phi], updated.
+        V: (6, 10) mean regressor.
+        wrench: (6,) mean wrench [N, N m].
+        root: (6, 6) from `whitening`.
     """
     row, gain = np.empty(16), np.empty(16)
     theta, P, chi = estimate[:16], estimate[16:].reshape(16, 16), 0.0
@@ -146,9 +151,9 @@ def update_estimate(estimate, V, wrench, root):
 
 @njit(cache=True)
 def _update_filter(memory, place, block, noise):
-    """Update a filter by a block; return the chi-squared of its innovation.
+    """Update a filter by a block; return chi-squared of its innovation.
 
-    The variance of model errors counts once in the test, and times its duration in the update.
+    Model errors count once in the test, but for their duration in the update.
     """
     phi = memory[place + 6 : place + 16].copy()
     wrench, motion = memory[_WRENCH:_MOTION], memory[_MOTION:_V]
@@ -165,7 +170,6 @@ def _update_filter(memory, place, block, noise):
 
 @njit(cache=True)
 def _restart(memory, place):
-    """Reset a filter and its test to the known load; the new load's filter gets a wide prior."""
     put(memory, place, memory, _KNOWN, 272)
     if place == _NEW:
         for j in range(10):
@@ -177,7 +181,6 @@ def _restart(memory, place):
 
 @njit(cache=True)
 def _is_identified(memory, bound):
-    """Return whether mass and moments of the new load are as precise as `bound` requires."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     change = abs(theta[6] - memory[_KNOWN + 6])
     size = math.sqrt(theta[7] ** 2 + theta[8] ** 2 + theta[9] ** 2) / abs(theta[6])
@@ -188,7 +191,6 @@ def _is_identified(memory, bound):
 
 @njit(cache=True)
 def _inflate_inertia_variances(memory, noise, block):
-    """Increase the inertia variances of the new load by the bias that noise of alpha causes."""
     theta, P = memory[_NEW : _NEW + 16], memory[_NEW + 16 : SIZE].reshape(16, 16)
     expected = memory[_AGE] * (noise[12] + noise[13] + noise[14]) / block
     share = min(1.0, expected / max(memory[_POWER], 1e-300))
@@ -200,14 +202,14 @@ def _inflate_inertia_variances(memory, noise, block):
 
 @njit(cache=True)
 def change_update(memory, sample, block, noise, window, hold, bound):
-    """Update the memory by one sample; compiled, without checks.
+    """Update the change detector by one sample.
 
     Args:
-        memory: of `change_memory`, updated.
-        sample: (15 or more,) see `regressor`.
+        memory: from `change_memory`, updated.
+        sample: (15 or more,) [wrench, s, omega, alpha].
         block: samples of a block.
         noise: (17,) long-run variances per sample of wrench (6) and motion (9), squared relative
-            model error, and the duration of this error [blocks].
+            model error, and its duration [blocks].
         window, hold: durations `WINDOW` and `HOLD` [blocks].
         bound: see `change_parameters`.
     """
@@ -297,14 +299,14 @@ def change_parameters(
     model_error: float = 0.0,
     bound: float | None = None,
 ) -> Parameters:
-    """Return the last arguments of `change_update`: block, noise, window, hold, bound.
+    """Return the arguments block, noise, window, hold, bound of `change_update`.
 
     Args:
         wrench_std, motion_std: (6,), (9,) roots of long-run variances per sample [SI].
         period: time between samples [s].
         model_error: errors of gain, cross-talk and time alignment, relative to the load's wrench.
-        bound: required standard deviation of a new load's mass over the change of mass; default
-            `BOUND`, or twice the model error.
+        bound: required standard deviation of a new load's mass, relative to the change of mass;
+            default `BOUND`, or twice the model error if larger.
 
     Raises:
         DrakeTeleopError: for values outside their range.
@@ -321,11 +323,11 @@ def change_parameters(
 
 
 def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFFSET_DRIFT) -> Array:
-    """Return the memory of `change_update` before the first sample.
+    """Return the initial memory of the change detector for a known load.
 
     Args:
-        theta, covariance: (16,), (16, 16) of the known [offsets; phi]; `PRIOR_STD` replaces larger
-            standard deviations.
+        theta, covariance: (16,), (16, 16) of [offsets; phi]; standard deviations are limited to
+            `PRIOR_STD`.
         offset_drift: (6,) standard deviation of the drift since the identification [N, N m].
     """
     prior = np.square(PRIOR_STD)
@@ -347,7 +349,7 @@ def change_memory(theta: Array, covariance: Array, offset_drift: ArrayLike = OFF
 
 @njit(cache=True)
 def known_load(memory):
-    """Return [offsets; phi] (16,) of the known load as a view; its offsets may be corrected."""
+    """Return [offsets; phi] (16,) of the known load, a view into the memory."""
     return memory[_KNOWN : _KNOWN + 16]
 
 
@@ -359,13 +361,13 @@ def change_state(memory):
 
 @njit(cache=True)
 def new_load(memory):
-    """Return [offsets; phi] (16,) of the new load as a view."""
+    """Return [offsets; phi] (16,) of the new load, a view into the memory."""
     return memory[_NEW : _NEW + 16]
 
 
 @njit(cache=True)
 def new_load_age(memory):
-    """Return the number of samples since the new load's filter started."""
+    """Return the number of samples since the estimate of a new load started."""
     return memory[_SAMPLES] - memory[_START]
 
 
@@ -377,12 +379,12 @@ def watch_load(
     omega: ArrayLike,
     alpha: ArrayLike,
 ) -> NDArray[np.int_]:
-    """Update the memory by N samples of a log; return the states (N,) as indices into `STATES`.
+    """Return the detector's states (N,) for N samples of a log, as indices into `STATES`.
 
     Args:
-        memory: of `change_memory`, updated.
-        parameters: result of `change_parameters`.
-        wrench, s, omega, alpha: (N, 6), (N, 3)... as for `identify`.
+        memory: from `change_memory`, updated.
+        parameters: from `change_parameters`.
+        wrench, s, omega, alpha: as for `identify`.
     """
     _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
     states = np.empty(len(rows[0]), np.int_)
@@ -391,10 +393,10 @@ def watch_load(
 
 
 def identified_load(memory: Array, known: Identification) -> Identification:
-    """Return the new load if one was identified, else `known`.
+    """Return the last new load that the detector identified, or `known` if there is none.
 
-    `residual_rms` is per sample. Inertias without excitation keep their former values with a large
-    standard deviation; `condition_number` and `delay_s` are those of `known`.
+    Inertias without excitation keep their former values with a large standard deviation;
+    `condition_number` and `delay_s` are those of `known`.
     """
     if memory[_BASE] == KNOWN:
         return known

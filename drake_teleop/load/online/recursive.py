@@ -1,7 +1,7 @@
 """Recursive least squares for load and offsets, Eq. (T6).
 
-The six rows of a sample are rank-one updates (Ljung, System Identification, section 11.2). Without
-forgetting the result equals batch least squares with a weak prior.
+Each sample is six rank-one updates (Ljung, System Identification, section 11.2). Without forgetting
+the result equals batch least squares with a weak prior.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ _MIN_RELATIVE_VARIANCE = 1e-10
 
 @njit(cache=True)
 def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
-    """Update the estimate by each sample; compiled, without checks.
+    """Update a recursive least squares estimate by N samples, without checks.
 
     Args:
         theta: (16,) estimate [offsets; phi], updated.
         P: (16, 16) covariance, exactly symmetric, updated.
-        samples: (N, at least 15), see `regressor`.
+        samples: (N, at least 15) rows [wrench, s, omega, alpha].
         noise_std, forgetting: as for `RecursiveEstimator`.
-        largest: (16,) upper bound for the variances during forgetting.
+        largest: (16,) upper bound of the variances during forgetting.
         squares: (6,) sums of squared residuals, updated [N^2, N^2 m^2].
     """
     V, gain = np.empty((6, 10)), np.empty(16)
@@ -92,15 +92,15 @@ def rls_update(theta, P, samples, noise_std, forgetting, largest, squares):
 
 
 class RecursiveEstimator(ABC):
-    """Recursive estimator of [offsets; phi].
+    """Recursive estimator of load and sensor offsets, theta = [offsets; phi] (16,).
 
-    The estimate is theta (16,) and a `memory` array; both can be external, as in a Drake system.
+    Its state is theta and a `memory` array; both can be external, such as a Drake state.
 
     Args:
         noise_std: (6,) standard deviations of the wrench channels [N, N m].
-        forgetting: factor per sample on the weight of the past, 0 < forgetting <= 1.
+        forgetting: factor per sample on the weight of past samples, 0 < forgetting <= 1.
         prior_std: (16,) standard deviations of the prior; an upper bound during forgetting.
-        bound: relative standard deviation that `settled` requires.
+        bound: standard deviation that `settled` requires, relative to `natural_scale`.
 
     Raises:
         DrakeTeleopError: for values outside their range.
@@ -132,7 +132,10 @@ class RecursiveEstimator(ABC):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveEstimator:
-        """Return an estimator for noise of wrench (6,) and, where supported, motion (9,)."""
+        """Return an estimator for standard deviations of wrench (6,) and motion (9,).
+
+        Noise of the motion is ignored if unsupported.
+        """
         return cls(noise_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -152,11 +155,11 @@ class RecursiveEstimator(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether data, not the prior, determine all parameters to `bound` of the natural scale."""
+        """Whether data, not the prior, determine all parameters within `bound`."""
         return self.settled_at(self._theta, self._memory)
 
     def settled_at(self, theta: Array, memory: Array) -> bool:
-        """Return `settled` for an external estimate."""
+        """Return `settled` for an external theta and memory."""
         if theta[6] == 0.0:
             return False
         deviations = np.sqrt(np.diag(self.covariance_of(theta, memory)))
@@ -164,18 +167,18 @@ class RecursiveEstimator(ABC):
 
     @abstractmethod
     def initial_memory(self, theta: Array) -> Array:
-        """Return the memory for the initial estimate theta (16,)."""
+        """Return the memory for an initial estimate theta (16,)."""
 
     @abstractmethod
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return the covariance (16, 16) of an external estimate."""
+        """Return the covariance (16, 16) of an external theta and memory [SI]."""
 
     def update_into(self, theta: Array, memory: Array, sample: Array) -> None:
-        """Update an external estimate by one sample; compiled, without checks.
+        """Update an external theta and memory by one sample, without checks.
 
         Args:
             theta: (16,) estimate, updated.
-            memory: C-contiguous array, as from `initial_memory`, updated.
+            memory: C-contiguous array from `initial_memory`, updated.
             sample: array that begins with [wrench, s, omega, alpha].
         """
         self._learn(theta, memory, np.array(sample, dtype=np.float64, ndmin=2))
@@ -188,7 +191,7 @@ class RecursiveEstimator(ABC):
         """Return the RMS (6,) of the residuals [N, N m]."""
 
     def update(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by one sample of a free motion, arguments as for `identify`.
+        """Update by one sample of a free motion, (6,) and (3,), arguments as for `identify`.
 
         Raises:
             DrakeTeleopError: for invalid input; the estimate is then unchanged.
@@ -205,13 +208,13 @@ class RecursiveEstimator(ABC):
         self._samples += 1
 
     def learn(self, wrench: ArrayLike, s: ArrayLike, omega: ArrayLike, alpha: ArrayLike) -> None:
-        """Update by N samples (N, 6), (N, 3)... in one compiled loop; see `update`."""
+        """Update by N samples of a free motion, (N, 6) and (N, 3); faster than `update`."""
         _, rows = checked_rows(wrench=(wrench, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3))
         self._learn(self._theta, self._memory, np.concatenate(rows, axis=1))
         self._samples += len(rows[0])
 
     def identification(self) -> Identification:
-        """Return the present estimate as an `Identification`.
+        """Return the present estimate.
 
         Raises:
             DrakeTeleopError: before the first update.
@@ -245,7 +248,7 @@ class RecursiveEstimator(ABC):
 
 
 class RecursiveLeastSquares(RecursiveEstimator):
-    """Recursive least squares for exact motion; noise of the motion causes a bias."""
+    """Recursive least squares; noise of the measured motion biases it."""
 
     method = "recursive least squares"
 
@@ -260,11 +263,11 @@ class RecursiveLeastSquares(RecursiveEstimator):
         self._squares = np.zeros(6)
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the prior's covariance (16, 16)."""
+        """Return the covariance (16, 16) of the prior."""
         return np.diag(self._prior)
 
     def covariance_of(self, theta: Array, memory: Array) -> Array:
-        """Return a copy of the memory, the covariance (16, 16)."""
+        """Return the covariance (16, 16), a copy of the memory."""
         return memory.copy()
 
     def _learn(self, theta: Array, memory: Array, samples: Array) -> None:

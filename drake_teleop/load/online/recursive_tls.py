@@ -1,14 +1,12 @@
-"""Recursive total least squares for load and offsets: noise in the measured motion too, Eq. (T18).
+"""Recursive total least squares: load and offsets for noise of wrench and motion, Eq. (T18).
 
-The estimate minimises lambda, the weighted squared residuals over their expected value (Kubus,
-Kroeger, Wahl, IROS 2008), by one step of the inverse iteration per sample. As in `batch.moments`,
-row c of [E V] is T_c z, here with the wrench F last:
+The estimate minimises lambda, the squared residuals over their expected value (Kubus, Kroeger,
+Wahl, IROS 2008). As in `batch.moments`, row c of the regressor [E V] is T_c z, with the wrench F
+last:
 
     z = [1, s (3), alpha (3), w_x w_x, w_y w_y, w_z w_z, w_x w_y, w_x w_z, w_y w_z, F (6)]   (19).
 
-G, g are the normal equations, N is the noise in G. It is compensated only for parameters whose
-information exceeds that of the noise by 4 sqrt(2 / samples) of it. Compiled functions allocate no
-memory and check no input.
+G, g are the normal equations, N is the noise in G. Compiled functions check no input.
 """
 
 from __future__ import annotations
@@ -46,9 +44,7 @@ _MIN_SCALE_SAMPLES = 20
 
 @cache
 def terms() -> tuple[NDArray[np.uintp], Array]:
-    """Return the nonzero terms of T: indices (n, 3) [channel, element of z, parameter], and
-    factors.
-    """
+    """Return nonzero terms of T: [channel, element of z, parameter] (n, 3), factors (n,)."""
     T = coefficients()[:, :, _ORDER].swapaxes(1, 2)
     index = np.argwhere(T)
     # Unsigned, so that the compiled loops do not check for negative indices.
@@ -57,7 +53,7 @@ def terms() -> tuple[NDArray[np.uintp], Array]:
 
 @njit(cache=True)
 def scratch():
-    """Return working arrays (E, g, L, LZ, inverse, S, W) of `rtls_normal_equations`."""
+    """Return working arrays of `rtls_normal_equations`."""
     return (
         np.empty((13, 6, 16)),
         np.empty(16),
@@ -71,7 +67,11 @@ def scratch():
 
 @njit(cache=True)
 def write_z(wrench, motion, z):
-    """Write the signals of a wrench (6,) and a motion (9,) [s, omega, alpha] into z (19,)."""
+    """Write z = [1, s, alpha, products of omega, wrench] (19,).
+
+    Args:
+        wrench, motion: (6,) [N, N m], and (9,) [s, omega, alpha].
+    """
     s, omega, alpha = motion[:3], motion[3:6], motion[6:]
     z[0] = 1.0
     for i in range(3):
@@ -93,7 +93,7 @@ def add_outer_product(y, z, total):
 
 @njit(cache=True)
 def forget(memory, theta, information, forgetting):
-    """Multiply the sums in the memory by `forgetting` and centre the prior at theta."""
+    """Multiply the sums in the memory by `forgetting`, and centre the prior at theta (16,)."""
     last = memory.shape[0] - 1
     for i in range(last):
         for j in range(19):
@@ -107,7 +107,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
     """Write L, L Z and S = L Z L^T, the sum of r r^T, for the residual r = F - [E V] theta = L z.
 
     Args:
-        Z: (19, 19) sum of z z^T, or a covariance of its noise.
+        Z: (19, 19) sum of z z^T, or noise covariance of z.
         index, factors: from `terms`.
         L, LZ, S: (6, 19), (6, 19), (6, 6), written.
     """
@@ -133,7 +133,7 @@ def residual_products(Z, theta, index, factors, L, LZ, S):
 
 @njit(cache=True)
 def noise_products(Z, noise_std, motion_std, Q):
-    """Write the expected noise of the sum Z of z z^T into Q; omega to first order."""
+    """Write the expected noise of Z, the sum of z z^T (19, 19), into Q."""
     Q[:] = 0.0
     for c in range(6):
         Q[_WRENCH + c, _WRENCH + c] = Z[0, 0] * noise_std[c] ** 2
@@ -233,10 +233,10 @@ def invert(S, A, W):
 
 
 class MomentEstimator(RecursiveEstimator):
-    """Recursive estimator whose memory contains the sum of z z^T and the prior's part."""
+    """Recursive estimator whose memory is the sum of z z^T, and a row for the prior."""
 
     def initial_memory(self, theta: Array) -> Array:
-        """Return the memory (20, 19): sum of z z^T, and the prior's information times theta."""
+        """Return the memory (20, 19): sum of z z^T; in the last row the prior's right-hand side."""
         memory = np.zeros((20, 19))
         memory[-1, :16] = theta / self._prior
         return memory
@@ -247,16 +247,15 @@ class MomentEstimator(RecursiveEstimator):
         return np.sqrt(np.maximum(np.diag(S), 0.0) / self._memory[0, 0])
 
     def _within_prior(self, covariance: Array) -> Array:
-        """Return the covariance with variances limited to the prior's, same correlations."""
         shrink = 1.0 / np.maximum(1.0, np.sqrt(np.diag(covariance) / self._prior))
         return np.asarray(covariance * np.outer(shrink, shrink))
 
 
 @njit(cache=True)
 def select_compensated(G, N, strength, K, taper):
-    """Set `taper` (16,) to 1 for parameters whose noise is compensated, otherwise to 0.
+    """Set `taper` (16,) to 1 for parameters whose noise can be compensated, otherwise to 0.
 
-    G - strength N, N restricted to these parameters, is positive definite. K (16, 16) is scratch.
+    Restricted to these, G - strength N is positive definite. K (16, 16) is scratch.
     """
     taper[:] = 1.0
     for i in range(16):
@@ -289,13 +288,13 @@ def select_compensated(G, N, strength, K, taper):
 
 @njit(cache=True)
 def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space, Q, G, N):
-    """Write [G g] into G (16, >= 17) and the noise part of G into N (16, 16); return lambda.
+    """Write [G g] into G (16, >= 17) and the noise of G into N (16, 16); return lambda.
 
     Args:
         Z: (19, 19) sum of z z^T.
         noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
-        index, factors: from `terms`.
-        space, Q: scratch, from `scratch` and (19, 19).
+        index, factors, space: from `terms` and `scratch`.
+        Q: (19, 19) scratch.
     """
     E, g, L, LZ, inverse, S, W = space
     noise_products(Z, noise_std, motion_std, Q)
@@ -321,12 +320,12 @@ def rtls_normal_equations(Z, theta, noise_std, motion_std, index, factors, space
 def rtls_update(
     theta, memory, samples, noise_std, motion_std, forgetting, information, index, factors
 ):
-    """Update the estimate by each sample; compiled, without checks.
+    """Update a recursive total least squares estimate by N samples.
 
     Args:
         theta: (16,) estimate [offsets; phi], updated.
-        memory: (20, 19) sum of z z^T, and the prior's part; updated.
-        samples: (N, at least 15), see `regressor`.
+        memory: (20, 19) of `MomentEstimator`, updated.
+        samples: (N, at least 15) rows [wrench, s, omega, alpha].
         noise_std, motion_std: (6,) of the wrench, (9,) of [s, omega, alpha] [SI].
         forgetting, information: factor per sample, and (16,) inverse variances of the prior.
     """
@@ -354,7 +353,7 @@ def rtls_update(
 
 
 class RecursiveTotalLeastSquares(MomentEstimator):
-    """Recursive total least squares with constant cost per sample.
+    """Recursive total least squares, which allows for noise of the measured motion.
 
     Args:
         noise_std, forgetting, prior_std, bound: as for `RecursiveEstimator`.
@@ -381,7 +380,7 @@ class RecursiveTotalLeastSquares(MomentEstimator):
     def for_noise(
         cls, noise_std: ArrayLike, motion_std: ArrayLike, *, forgetting: float, bound: float
     ) -> RecursiveTotalLeastSquares:
-        """Return an estimator for noise of wrench (6,) and motion (9,)."""
+        """Return an estimator for standard deviations of wrench (6,) and motion (9,)."""
         return cls(noise_std, motion_std, forgetting=forgetting, bound=bound)
 
     @property
@@ -408,7 +407,6 @@ class RecursiveTotalLeastSquares(MomentEstimator):
         return self._within_prior(factor @ factor.T + unknown @ unknown.T)
 
     def _normal_equations(self, theta: Array, memory: Array) -> tuple[Array, Array, float]:
-        """Return the matrices G and N (16, 16) without prior, and lambda (1 for few samples)."""
         G, N, Q = np.zeros((16, 17)), np.zeros((16, 16)), np.empty((19, 19))
         if not memory[0, 0] > 0.0:
             return G[:, :16], N, 1.0
@@ -422,7 +420,6 @@ class RecursiveTotalLeastSquares(MomentEstimator):
 
 
 def _cholesky(A: Array) -> Array:
-    """Return the Cholesky factor of A with a diagonal raised against rounding errors."""
     return np.asarray(np.linalg.cholesky(A + _MIN_PIVOT * np.diag(np.diag(A))))
 
 

@@ -1,14 +1,13 @@
-"""Load that is eliminated while a known load is monitored, sample by sample::
+"""Monitor of a known load in use, which selects the load to eliminate, sample by sample::
 
     settled     the known load explains the wrench and is used
     disturbed   contact, or the moment of a grasp; the known load is used
     changed     another load: the fallback (gripper or nothing) is used until the known load
                 explains the wrench again or the new load is identified
 
-Changes cross-fade with the time constant `FADE`. A constant push at rest equals another weight. A
-new load therefore counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for
-`EXPLAINED` seconds, with a centre of mass within `MAX_COM_DISTANCE_M`. At rest, the offsets follow
-residuals below `MAX_OFFSET_RESIDUAL`.
+A new load counts only if it explains a force that changed by `MIN_FORCE_CHANGE_N`, for `EXPLAINED`
+seconds, with a centre of mass within `MAX_COM_DISTANCE_M`: a constant push at rest looks like a
+weight. At rest, the offsets follow residuals below `MAX_OFFSET_RESIDUAL`.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ SIZE = _CHANGE + change.SIZE
 
 
 def watched_memory(theta: Array, covariance: Array) -> Array:
-    """Return the memory of `watched_update` for identified [offsets; phi] and covariance."""
+    """Return the initial memory for a known [offsets; phi] (16,) and its covariance (16, 16)."""
     rest = np.zeros(_CHANGE)
     rest[_STATE] = SETTLED
     return np.concatenate([rest, change.change_memory(theta, covariance)])
@@ -73,7 +72,7 @@ def watched_memory(theta: Array, covariance: Array) -> Array:
 
 @njit(cache=True)
 def watched_state(memory):
-    """Return the state, an index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
+    """Return the index into `LOAD_STATES`; `LEARNING` for a memory of zeros."""
     return int(memory[_STATE])
 
 
@@ -96,7 +95,6 @@ def _is_at_rest(memory, sample, period):
 
 @njit(cache=True)
 def _force_has_changed(memory, residual, age, period):
-    """Return whether the residual force changed since the new load's start, `age` samples ago."""
     low_passed = memory[_RESIDUAL : _RESIDUAL + 3]
     lowest, highest = memory[_LOWEST:_HIGHEST], memory[_HIGHEST:_CHANGED_SAMPLES]
     share = 1.0 if age == 0.0 else period / (_LOW_PASS_S + period)
@@ -120,12 +118,12 @@ def _is_within_reach(known, new):
 
 @njit(cache=True)
 def watched_update(out, memory, sample, fallback, period, block, noise, window, hold, bound):
-    """Update `out` and `memory` by one sample; compiled, without checks.
+    """Update the load to eliminate by one sample, without checks.
 
     Args:
-        out: (16,) [offsets; phi] for the elimination, updated.
-        memory: of `watched_memory`, updated.
-        sample: (15 or more,) see `regressor`.
+        out: (16,) [offsets; phi] to eliminate, updated.
+        memory: from `watched_memory`, updated.
+        sample: (15 or more,) [wrench, s, omega, alpha].
         fallback: (10,) phi that is used for a changed load.
         period: time between samples [s].
         block, noise, window, hold, bound: from `change.change_parameters`.

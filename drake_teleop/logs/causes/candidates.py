@@ -1,4 +1,4 @@
-"""Candidate causes: extensions of a model in order of plausibility, and their minimum effects."""
+"""Candidate causes of a misfit: extensions of a model, and their minimum effects."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _DOUBTFUL_SCORE = 30.0  # score that widens intervals but names no cause
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Model that is fitted with one more extension.
+    """Fitted model with one more extension.
 
     `score` is twice the gain in log likelihood minus a cost of the added parameters.
     """
@@ -66,9 +66,9 @@ class Candidate:
 
 
 def candidates(state: State, first: bool) -> Iterator[Candidate]:
-    """Fit all possible extensions and yield those with sufficient effect.
+    """Fit the possible extensions of a model and yield those with sufficient effect.
 
-    `first`: the state is the first model of a search, the rigid load alone.
+    `first` is True if the model is the rigid load alone.
     """
     model, data = state.model, state.data
     if first:
@@ -128,7 +128,7 @@ def _fit_part(
 
 
 def has_negative_inertia(state: State) -> bool:
-    """Return whether the mass, or the inertia about an axis, is significantly negative."""
+    """Return whether mass or inertia is significantly negative."""
     mass, deviation = float(state.x[6]), float(np.sqrt(state.fit.covariance[6, 6]))
     if mass < _SIGNIFICANT * deviation:
         return mass < -4.0 * deviation
@@ -177,10 +177,7 @@ def _is_tilt_significant(state: State) -> bool:
 
 
 def tilt_start(state: State) -> Array | None:
-    """Return start parameters for a large tilt of gravity, from the force alone, or None.
-
-    The force is f = o + m a + R u with u = -m g.
-    """
+    """Return start parameters to fit a large tilt of gravity, from the force alone, or None."""
     y = state.data.only(state.rows.used).y
     sums = y.T @ y
     width = len(sums)
@@ -261,10 +258,7 @@ def _factor(state: State) -> Iterator[Candidate]:
 
 
 def similar_factors(state: State) -> list[State]:
-    """Return fits with other known factors of the torque that the record does not exclude.
-
-    A record of slow motion may not distinguish 0.1 from 0.113 (pound-force inches).
-    """
+    """Return fits with other known unit factors of the torque that the record does not exclude."""
     factor, found = state.model.factor, []
     for other in FACTORS if factor != 1.0 else ():
         if other != factor and 0.5 < other / factor < 2.0:

@@ -1,4 +1,4 @@
-"""Causes of a misfit in words: name, time, value with its interval."""
+"""Causes of a misfit in words: name, time span, and value with its interval."""
 
 from __future__ import annotations
 
@@ -46,13 +46,7 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Part of a record with one load.
-
-    Attributes:
-        start_s, stop_s: times since the start of the record [s].
-        phi: (10,) load about So in S.
-        covariance: (16, 16) covariance of [offsets; phi].
-    """
+    """Part of a record with one load phi (10,), and covariance (16, 16) of [offsets; phi]."""
 
     start_s: float
     stop_s: float
@@ -61,12 +55,12 @@ class Stretch:
 
     @property
     def identifiable(self) -> NDArray[np.bool_]:
-        """Booleans (16,): True where the part determines a parameter of [offsets; phi]."""
+        """Booleans (16,): True for identified parameters of [offsets; phi]."""
         return worth_stating(np.sqrt(np.diag(self.covariance)), self.phi)
 
 
 def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
-    """Return the causes in a fitted model in the order of time, without the parts `given`."""
+    """Return the causes in a fitted model, without its extensions `given`."""
     model, out = state.model, []
     if not (model.axes == np.eye(3)).all():
         out.append(_axes(model.axes))
@@ -89,9 +83,9 @@ def causes_of(state: State, given: tuple[str, ...] = ()) -> list[Cause]:
 
 
 def stretches(state: State, covariance: Array) -> list[Stretch]:
-    """Return the parts of a record between changes of the load.
+    """Return the parts of a record between changes of the load; none without a change.
 
-    `covariance` (16, 16) belongs to [offsets; phi] of the first part.
+    `covariance` (16, 16) is that of [offsets; phi] of the first part.
     """
     loads = [(s.time, i) for i, s in enumerate(state.model.steps) if s.kind == "load"]
     if not loads:

@@ -23,9 +23,9 @@ _SIGNIFICANT, _NOISE_LEVELS, _MASS_SHARE, _SMALLEST_ARM_M = 5.0, 2.0, 0.01, 0.00
 
 
 def add_step(state: State, kind: str) -> State | None:
-    """Return the state with one more step of "offsets" or "load" at the most likely time.
+    """Return the model with one more change of "offsets" or "load" (`kind`), or None.
 
-    None if no step is significant.
+    It is at the most likely time; None if no change is significant.
     """
     best: State | None = None
     for time in _likely_times(state, kind):
@@ -61,7 +61,7 @@ def _likely_times(state: State, kind: str) -> list[float]:
 
 
 class _StepScan:
-    """Gain in log likelihood (times 2) by a step at any instant, for white noise."""
+    """Gain in log likelihood (times 2) by a change at any instant, for white noise."""
 
     def __init__(self, state: State, kind: str) -> None:
         power = np.maximum(state.rows.rms(state.fit.residual), 1e-12)
@@ -102,7 +102,7 @@ def with_ramps(
     spans: Spans,
     widths: Sequence[float] | None = None,
 ) -> State:
-    """Fit gradual steps of `kinds` at `times` [s]; rows within `widths` (>= `RAMP_S`) are omitted.
+    """Fit gradual changes of `kinds` at `times` [s], without the rows within `widths` [s].
 
     `spans` are other omitted time spans; `state` has the initial parameters.
     """
@@ -120,7 +120,7 @@ def with_ramps(
 
 
 def without_small_steps(state: State) -> State:
-    """Remove insignificant steps one by one, the least significant first."""
+    """Remove insignificant changes one by one, the least significant first."""
     while True:
         small = [i for i in range(len(state.model.steps)) if not _is_step_significant(state, i)]
         if not small:
@@ -141,7 +141,6 @@ def _significance(state: State, i: int) -> float:
 def _ramp_middle(
     state: State, kinds: Sequence[Sequence[str]], first: int, k: int, span: tuple[float, float]
 ) -> float:
-    """Return the time at which half of the k-th change has happened."""
     data, at = state.data, first + sum(len(both) for both in kinds[:k])
     own = range(at, at + len(kinds[k]))
     rows = np.flatnonzero(data.used & in_spans(data, (span,)))

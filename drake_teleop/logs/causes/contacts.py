@@ -24,7 +24,7 @@ _LARGEST_INCREASE, _SMALL_RESIDUAL = 1.3, 1.25
 
 
 def contact_spans(state: State) -> Spans:
-    """Return the time spans (start, stop) whose residual far exceeds the noise and calm blocks."""
+    """Return time spans (start, stop) [s] with a residual far above noise and calm parts."""
     blocks = _Blocks(state)
     contact_blocks = blocks.contact_blocks(blocks.usable)
     if contact_blocks is None or not contact_blocks.any():
@@ -36,11 +36,7 @@ def contact_spans(state: State) -> Spans:
 
 
 def replace_contacts_by_steps(larger: State) -> State | None:
-    """Explain long contacts by other loads and offsets; None if these do not explain the wrench.
-
-    Each load is fitted to blocks that the former ones do not explain. If a few runs of blocks cover
-    the record, the borders between them become steps.
-    """
+    """Explain long contacts by changed loads and offsets, or return None if impossible."""
     blocks = _Blocks(larger)
     left, number = blocks.usable.copy(), np.full(len(blocks.usable), -1)
     for load in range(_MAX_LOADS):
@@ -76,8 +72,6 @@ def _runs(flags: NDArray[np.bool_], shortest: int) -> NDArray[np.bool_]:
 
 
 class _Blocks:
-    """Normal equations of a model for each block of rows."""
-
     def __init__(self, state: State) -> None:
         data = state.data
         self._state = state
@@ -111,7 +105,6 @@ class _Blocks:
         return np.asarray((level > _CONTACT_LEVEL) & (level > _CALM_RATIO * usual) & among)
 
     def _fit_calmest(self, blocks: NDArray[np.intp]) -> tuple[Array, float, Array] | None:
-        """Return residuals of the blocks, of the calmest, and the parameters' change."""
         if len(blocks) < 2 * _FEWEST_BLOCKS:
             return None
         starts = [blocks]
@@ -146,7 +139,6 @@ class _Blocks:
 
 
 def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return the residuals (blocks,) by errors of fast motion, from the calmest fast blocks."""
     data, rows = state.data, state.data.block
     y = data.with_steps(state.model.times)
     wrench = y @ state.model.wrench(x[None])[0].T
@@ -164,10 +156,7 @@ def _motion_error_level(state: State, x: Array, level: Array, usable: NDArray[np
 
 
 def replace_steps_by_contact(state: State) -> State:
-    """Replace changes of the offsets by a contact if the residual requires it.
-
-    Two changes can explain the force of a contact, but with a wrong load.
-    """
+    """Replace changes of the offsets by a contact if the residual requires it."""
     steps = sorted(enumerate(state.model.steps), key=lambda x: x[1].time)
     first, last = float(state.data.t[0]), float(state.data.t[-1])
     borders = [(-1, first), *((i, step.time) for i, step in steps), (-1, last)]

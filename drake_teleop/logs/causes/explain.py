@@ -1,4 +1,4 @@
-"""Explanation of a wrench: noise test, search for causes, and the load in the result."""
+"""Explanation of a wrench: noise test, search for causes, and the resulting load."""
 
 from __future__ import annotations
 
@@ -31,19 +31,17 @@ _NO_MASS, _NO_MASS_DEVIATIONS, _SIGNIFICANT = 0.010, 4.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """Causes of a record and the load within their model.
+    """Causes why a rigid load does not explain a wrench, and the load when they are in the model.
 
     Attributes:
-        causes: effects other than a rigid load with constant offsets.
         explained: whether the residual is sensor noise.
-        theta: (16,) [offsets; phi] of the first part of the record.
-        covariance: (16, 16) covariance of theta.
-        deviations: (16,) standard deviations of theta due to the misfit (`misfit_deviations`).
+        theta: (16,) [offsets; phi] of the first part of the record [SI].
+        covariance: (16, 16) of theta.
+        deviations: (16,) standard deviations of theta due to the misfit.
         delay_s: additional delay of the motion behind the wrench [s].
         loads: parts of a record whose load changes.
         removed_weight: (4,) [m, m c] of a weight removed from the wrench, or None.
-        given: active parts of the model that are not causes.
-        state: model and residual.
+        given: extensions of the model that are no causes.
     """
 
     causes: tuple[Cause, ...]
@@ -64,7 +62,7 @@ class Explanation:
 
     @property
     def several_gains(self) -> bool:
-        """Whether the gains stand for errors of the sensor's whole gain matrix."""
+        """Whether gain errors of single channels stand for errors of the whole gain matrix."""
         model = self.state.model
         others = {"rotation", "cable"} & set(model.parts)
         return len(model.gains) > 1 or bool(model.gains and others)
@@ -75,7 +73,7 @@ def explain(
 ) -> Explanation:
     """Test whether a rigid load explains a record, and search for causes if it does not.
 
-    `with_delay` returns the record with an additional delay [s]; `given` are active parts of the
+    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
     model, such as "weight".
     """
     with one_blas_thread():

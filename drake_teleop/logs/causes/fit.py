@@ -1,8 +1,4 @@
-"""Gauss-Newton fit with autoregressive noise of order 4 in each channel.
-
-Noise and parameters are estimated in turn. The first two iterations are unweighted: noise of a
-smaller model would absorb its misfit and hide the effect of an extension.
-"""
+"""Gauss-Newton fit with autoregressive noise of order 4 in each channel."""
 
 from __future__ import annotations
 
@@ -21,12 +17,9 @@ _RIDGE, _FLOOR = 1e-11, 1e-14
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Model fitted to rows.
+    """Model with parameters x (size,), fitted to rows of a record.
 
     Attributes:
-        model: the model.
-        rows: fitted rows.
-        x: (size,) parameters.
         covariance: (size, size); huge for undetermined parameters.
         residual: (6, W) coefficients of the residual in the signals y.
         filters: (6, 5) filters that whiten the residual e: sum over d of filters[c, d] e_c[n - d].
@@ -47,7 +40,7 @@ class Fit:
         return -0.5 * len(self.rows.whole) * float(np.log(self.power).sum())
 
     def normal(self, model: Model, x: Array) -> tuple[Array, Array]:
-        """Return Gram matrix and right-hand side of the normal equations of `model` at x."""
+        """Return Gram matrix and right-hand side of the normal equations at x (size,)."""
         whitened = self.rows.whitened(self.filters) / self.power[:, None, None]
         J = model.derivative(x).transpose(1, 0, 2)
         weighted = J @ whitened
@@ -59,7 +52,7 @@ class Fit:
 def fit(
     model: Model, rows: Rows, start: Array | None = None, *, steps: int = _MAX_ITERATIONS
 ) -> Fit:
-    """Fit a model to rows in at most `steps` iterations from the parameters `start` (size,)."""
+    """Fit a model to rows in at most `steps` iterations, from the parameters `start` (size,)."""
     x = np.zeros(model.size) if start is None else start
     count = max(float(rows.used.sum()), 1.0)
     total = (rows.data.y[rows.used][:, FORCES] ** 2).sum(axis=0) / count

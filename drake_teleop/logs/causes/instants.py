@@ -2,11 +2,9 @@
 
 All models of this package are linear in the signals of one instant,
 
-y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
+    y = [1, s, g, alpha, products of omega, F, dF/dt, R, R p, time],
 
-with s the specific force of So, g gravity, F the wrench, R = R_SW and p the position of S in the
-world. Means are exact because of this linearity. The sums of y_n y_{n-d}^T + y_{n-d} y_n^T for the
-lags d = 0 ... 4 suffice for a fit with autoregressive noise of order 4.
+with specific force s of So, gravity g, wrench F, R = R_SW and position p of So in the world.
 """
 
 from __future__ import annotations
@@ -50,16 +48,16 @@ Motion = Callable[[Array], tuple[Array, ...]]
 
 @dataclass(frozen=True, eq=False)
 class Instants:
-    """Block means of a record.
+    """Block means of a record (see module `instants`).
 
     Attributes:
         t: (M,) middle of each block [s].
         y: (M, WIDTH) signals; 0 in unused rows.
         used: (M,) True for rows without gaps and edges.
         white: (6,) standard deviation of white wrench noise in a block mean.
-        gravity_W: (3,) gravity [m/s^2], or None without orientation.
-        positions: whether p is known.
-        acceleration_noise: noise of the acceleration in a block mean [m/s^2].
+        gravity_W: (3,) gravity in the world [m/s^2], or None.
+        positions: whether positions are known.
+        acceleration_noise: in a block mean [m/s^2].
         alpha_noise_share: share of noise in the variance of an IMU's angular acceleration.
     """
 
@@ -89,7 +87,7 @@ class Instants:
 
     @cached_property
     def block(self) -> int:
-        """Number of rows in a block."""
+        """Number of rows in a block of the search for contacts and changes."""
         least = -(-len(self.t) // _MAX_BLOCKS)
         return max(least, _MIN_BLOCK_ROWS, round(_BLOCK_S / self.dt))
 
@@ -106,7 +104,7 @@ class Instants:
         return np.hstack(parts)
 
     def sums(self, y: Array, *, rows: int, lags: int = ORDER + 1) -> Array:
-        """Return sums of products of y (M, W), (blocks, lags, W, W), for blocks of `rows` rows."""
+        """Return sums (blocks, lags, W, W) of products of y (M, W), for blocks of `rows` rows."""
         width = y.shape[1]
         count = -(-len(y) // rows)
         padded = np.zeros((lags - 1 + count * rows, width))
@@ -133,9 +131,9 @@ def instants(
 
     Args:
         t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) measured [f; tau] in S about So, sign of Eq. (1) [N, N m].
-        motion: a function of time, or its values at `t`.
-        gravity_W: (3,) gravity [m/s^2]; None without orientation.
+        wrench: (N, 6) measured [f; tau] on the load, in S about So, Eq. (1) [N, N m].
+        motion: a function of time, or its values at `t` (see `Motion`).
+        gravity_W: (3,) gravity in the world [m/s^2]; None without orientation.
         lost: (N,) True for ignored samples.
         acceleration_noise: noise of the acceleration [m/s^2].
     """
@@ -165,7 +163,6 @@ def instants(
 
 
 def _smooth_alpha(y: Array, used: NDArray[np.bool_]) -> float:
-    """Smooth noisy angular accelerations in place; return the former share of noise in them."""
     alpha = y[used][:, ALPHA]
     share = _noise_share(alpha)
     for width in _SMOOTHING_WIDTHS:
@@ -232,10 +229,10 @@ def _legendre(x: Array) -> Array:
 
 
 def free_delay(data: Instants) -> float:
-    """Return the delay [s] of the smallest residual, within 0.25 s or a tenth of the record.
+    """Return the delay of the motion [s] with the smallest residual.
 
-    Each channel is fitted with free coefficients of the 16 signals of the motion, because a wrong
-    load model would bias the delay.
+    It is within 0.25 s and a tenth of the record. No load is assumed: the wrench channels are
+    fitted by the 16 motion signals.
     """
     reach = min(_DELAY_RANGE_S, 0.1 * float(data.t[-1] - data.t[0]))
     rows = data.used & (data.t > data.t[0] + reach) & (data.t < data.t[-1] - reach)

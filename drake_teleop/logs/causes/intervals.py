@@ -36,7 +36,10 @@ _LARGEST_GAIN_ERROR = 0.025
 def covariance_of(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] with misfit and rejected candidates."""
+    """Return the covariance (16, 16) of [offsets; phi], widened by misfit and rejected causes.
+
+    `blocks` (16,) is from `block_deviations`, `gains` (16, 16) the covariance due to gain errors.
+    """
     out = state.fit.covariance[LOAD, LOAD].copy()
     deviations = np.sqrt(np.diag(out))
     factor = misfit_factor(state, blocks)
@@ -49,7 +52,7 @@ def covariance_of(
 def misfit_deviations(
     state: State, rejected: Sequence[Candidate], blocks: Array, gains: Array
 ) -> Array:
-    """Return standard deviations (16,) of [offsets; phi] for a record without named causes."""
+    """Return standard deviations (16,) of [offsets; phi] for a misfit without a named cause."""
     if state.smooth_misfit > (
         _CLEAR_SMOOTH_MISFIT
         if state.residual_ratio > _LARGE_RESIDUAL_RATIO
@@ -76,10 +79,9 @@ def _squared_distances(state: State, rejected: Sequence[Candidate]) -> Array:
 
 
 def gain_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] that errors of all gains cause.
+    """Return the covariance (16, 16) of [offsets; phi] that errors of all 36 sensor gains cause.
 
-    The residual determines their size, one standard deviation for all 36 errors (of a torque at
-    `ARM`). The result is 0 if gains explain little.
+    The residual determines their size; 0 if gains explain little.
     """
     fit, rows = state.fit, state.rows
     weights = rows.whitened(fit.filters) / fit.power[:, None, None]
@@ -115,7 +117,7 @@ def gain_covariance(state: State) -> Array:
 
 
 def factor_covariance(state: State) -> Array:
-    """Return the covariance (16, 16) of [offsets; phi] by other plausible torque factors."""
+    """Return the covariance (16, 16) of [offsets; phi] by other plausible units of the torque."""
     out = np.zeros((16, 16))
     for other in similar_factors(state):
         distance = other.x[LOAD] - state.x[LOAD]

@@ -50,25 +50,28 @@ _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @dataclass(frozen=True)
 class Step:
-    """Change of the "offsets" (6) or of the "load" (10) at `time` [s]."""
+    """Change of the offsets (6 parameters) or of the load (10 parameters) at `time` [s].
+
+    `kind` is "offsets" or "load".
+    """
 
     kind: str
     time: float
 
     @property
     def size(self) -> int:
-        """Number of parameters of the step."""
+        """Number of parameters."""
         return 6 if self.kind == "offsets" else 10
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Rigid load with a selection of active extensions.
+    """Rigid load with a selection of extensions, such as drift or a rotated sensor.
 
     Attributes:
-        parts: names of active extensions, keys of `_SIZES`.
+        parts: names of extensions, such as "gravity" or "drift".
         gains: channels with a free gain.
-        steps: changes, in the order of their columns.
+        steps: changes of offsets or load.
         axes: (3, 3) signed permutation of the wrench's axes.
         factor: factor of the torque; the part "torque factor" multiplies it.
     """
@@ -80,7 +83,7 @@ class Model:
     factor: float = 1.0
 
     def extended(self, part: str) -> Model:
-        """Return the model with one more part."""
+        """Return the model with one more extension."""
         return self if part in self.parts else replace(self, parts=(*self.parts, part))
 
     @cached_property
@@ -102,7 +105,7 @@ class Model:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Indices of the columns of y, with its steps, that determine the wrench."""
+        """Indices (k,) of the columns of y, with its steps, that determine the wrench."""
         wide = bool({"gravity", "cable"} & set(self.parts))
         kept = np.ones(WIDTH + len(MOTION) * len(self.steps), bool)
         if not wide:
@@ -135,7 +138,7 @@ class Model:
         return out
 
     def wrench(self, x: Array) -> Array:
-        """Return coefficients (B, 6, W) of the wrench in y, for parameters x (B, size)."""
+        """Return coefficients (B, 6, W) of the wrench in the signals y, for x (B, size)."""
         width, parts = WIDTH + len(MOTION) * len(self.steps), self.slices
         motion = self._motion(x)
         out = np.zeros((len(x), 6, width))
@@ -172,7 +175,6 @@ class Model:
                 out[:, :, TIME.start : TIME.start + degree] += rows
 
     def _motion(self, x: Array) -> Array:
-        """Return s, alpha and products of omega as functions of y, (B or 1, 12, WIDTH)."""
         parts = self.slices
         varied = "gravity" in parts or "frame" in parts
         M = np.zeros((len(x) if varied else 1, 12, WIDTH))
@@ -194,11 +196,7 @@ class Model:
         return Rotation.from_rotvec(x[:, self.slices["rotation"]]).as_matrix() @ self.axes
 
     def derivative(self, x: Array) -> Array:
-        """Return the derivative (size, 6, k) of the coefficients in `columns` at x (size,).
-
-        Central differences are exact, because the wrench is linear in each parameter but the
-        rotation.
-        """
+        """Return the derivative (size, 6, k) of the wrench's coefficients by x (size,)."""
         steps = np.ones(self.size)
         if "rotation" in self.slices:
             steps[self.slices["rotation"]] = _ROTATION_STEP
@@ -208,7 +206,7 @@ class Model:
         return np.asarray(change[..., self.columns] / (2.0 * steps[:, None, None]))
 
     def residual(self, x: Array) -> Array:
-        """Return coefficients (6, k) of the residual in `columns`."""
+        """Return coefficients (6, k) of the residual in the signals, for parameters x (size,)."""
         out = -self.wrench(x[None])[0]
         out[np.arange(6), FORCES.start + np.arange(6)] += 1.0
         return np.asarray(out[:, self.columns])

@@ -20,14 +20,7 @@ Spans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Selected rows of a record with the signals of a model.
-
-    Attributes:
-        data: the record.
-        used: (M,) True for selected rows.
-        times: times of the model's steps [s].
-        columns: indices of columns of y with its steps.
-    """
+    """Selected rows (`used`, (M,)) of a record, and columns of its signals, for a model."""
 
     data: Instants
     used: NDArray[np.bool_]
@@ -35,7 +28,7 @@ class Rows:
     columns: NDArray[np.intp]
 
     def fits(self, model: Model) -> bool:
-        """Return whether the columns are also those of `model`."""
+        """Return whether `model` uses the same signals."""
         return self.times == model.times and np.array_equal(self.columns, model.columns)
 
     @cached_property
@@ -59,7 +52,6 @@ class Rows:
 
     @cached_property
     def _partial(self) -> Array:
-        """Histories (K, 5, W) of signals that cross an end of a run of rows."""
         padded = np.concatenate([self.used, np.zeros(ORDER, bool)])
         near = padded.copy()
         for d in range(1, ORDER + 1):
@@ -70,7 +62,7 @@ class Rows:
         return np.asarray(y[at])
 
     def whitened(self, filters: Array) -> Array:
-        """Return sums of products (6, W, W) of the rows after filters (6, 5), one per channel."""
+        """Return sums of products (6, W, W) of the signals after filters (6, 5) per channel."""
         width = self.y.shape[1]
         taps = [(filters[:, : ORDER + 1 - d] * filters[:, d:]).sum(axis=1) for d in range(5)]
         full = np.stack(taps, axis=1) @ self.sums.reshape(ORDER + 1, -1)
@@ -95,7 +87,7 @@ class Rows:
         return filters, np.maximum(power, floor)
 
     def rms(self, residual: Array) -> Array:
-        """Return the RMS (6,) of a residual (6, W)."""
+        """Return the RMS (6,) of a residual with coefficients (6, W) in the signals."""
         e = self.y @ residual.T
         return np.asarray(np.sqrt((e * e).sum(axis=0) / max(self.used.sum(), 1)))
 

@@ -40,7 +40,7 @@ _FLEXIBLE_CAUSES, _FLEXIBLE_MARGIN, _FLEXIBLE_MARGIN_SHARE = ("cable", "drift"),
 
 
 def is_noise(state: State) -> bool:
-    """Return whether the residual is sensor noise, by its size, smooth signals and extensions."""
+    """Return whether the residual of a fitted model is sensor noise."""
     if (
         has_negative_inertia(state)
         or state.residual_ratio > MAX_RESIDUAL_RATIO
@@ -62,15 +62,10 @@ Found = tuple[State, float, list[Candidate]]
 def search(
     data: Instants, with_delay: WithDelay | None = None, given: tuple[str, ...] = ()
 ) -> Found:
-    """Return the model of a record, an additional delay [s], and the last rejected candidates.
+    """Return the model that explains a record, additional delay [s], and rejected candidates.
 
-    If no model explains the record, the search is repeated with the delay from `free_delay`,
-    because a wrong model may have caused a wrong delay.
-
-    Args:
-        data: the record.
-        with_delay: function that returns the record with an additional delay of the motion [s].
-        given: active parts of the model.
+    `with_delay` returns the record with an additional delay [s]; `given` are extensions of the
+    model.
     """
     found = _search(_initial_state(data, given), 0.0, with_delay)
     if with_delay is None or may_be_coloured_noise(found[0]) or is_noise(found[0]):
@@ -85,14 +80,14 @@ def search(
 
 
 def may_be_coloured_noise(state: State) -> bool:
-    """Return whether the residual may be coloured noise: no smooth signal explains it."""
+    """Return whether the residual may be coloured noise: smooth signals do not explain it."""
     return (
         state.smooth_misfit < _GOOD_SMOOTH_MISFIT and state.residual_ratio < _COLOURED_NOISE_RATIO
     )
 
 
 def is_clear_misfit(state: State) -> bool:
-    """Return whether smooth signals explain the residual, or it exceeds coloured noise."""
+    """Return whether the residual is clearly not noise: large, or explained by smooth signals."""
     return state.smooth_misfit > MAX_SMOOTH_MISFIT or state.residual_ratio > _COLOURED_NOISE_RATIO
 
 
@@ -133,10 +128,7 @@ def _search(state: State, delay_s: float, with_delay: WithDelay | None) -> Found
 
 
 def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
-    """Return the candidates without "cable" if an attenuated inertia explains a third of its score.
-
-    Noise of the accelerations attenuates the inertial mass if the load hardly accelerates.
-    """
+    """Remove "cable" if an attenuated inertia explains a third of its score."""
     best = max(
         (x.score for x in found if x.name == "weight" and not is_plausible(x.state)), default=0
     )
@@ -146,7 +138,6 @@ def _without_attenuation(found: list[Candidate]) -> list[Candidate]:
 def _remove_delay(
     state: State, delay_s: float, with_delay: WithDelay | None
 ) -> tuple[State, float]:
-    """Remove the delay that remains in the motion; the model is linear in the delay."""
     for _ in range(_DELAY_ITERATIONS):
         if (
             with_delay is None
@@ -162,7 +153,6 @@ def _remove_delay(
 
 
 def _smallest_residual(state: State, found: list[Candidate]) -> Candidate | None:
-    """Return the most plausible candidate that reduces the residual to a fifth, or None."""
     small = [x for x in found if x.name in _SMOOTH_CAUSES]
     small = [x for x in small if x.state.residual_ratio < _FIFTH * state.residual_ratio]
     least = min([x.state.residual_ratio for x in small], default=0.0)
@@ -201,7 +191,6 @@ def _is_effective(candidate: Candidate, state: State) -> bool:
 
 
 def _best_candidate(found: list[Candidate]) -> Candidate | None:
-    """Return the most plausible candidate with nearly the best score and a small misfit."""
     best = max([x.score for x in found], default=0.0)
     if best < _MIN_SCORE:
         return None

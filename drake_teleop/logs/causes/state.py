@@ -19,13 +19,7 @@ _STIFFNESS_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Model fitted to the rows of a record outside of contacts.
-
-    Attributes:
-        data: the record.
-        spans: time spans (start, stop) of contacts [s].
-        fit: the fit to the other rows.
-    """
+    """Model fitted to the rows of a record outside of contacts (`spans`: start, stop [s])."""
 
     data: Instants
     spans: Spans
@@ -35,12 +29,12 @@ class State:
     def of(
         cls, data: Instants, model: Model, start: Array | None = None, spans: Spans = ()
     ) -> State:
-        """Return the state of a model fitted outside of the time spans."""
+        """Fit a model outside of the time spans, from the parameters `start`."""
         used = data.used & ~in_spans(data, spans)
         return cls(data, spans, fit(model, Rows(data, used, model.times, model.columns), start))
 
     def extended(self, model: Model, start: Array | None = None, **options: int) -> State:
-        """Return the state of another model, fitted to the same rows."""
+        """Fit another model to the same rows."""
         if start is None:
             start = model.start(self.x, self.model)
         return State(self.data, self.spans, fit(model, self._rows_of(model), start, **options))
@@ -61,7 +55,7 @@ class State:
         return self.fit.x
 
     def extension(self, name: str) -> tuple[Array, Array]:
-        """Return the parameters of an extension and their covariance."""
+        """Return the parameters of an extension, and their covariance."""
         where = self.model.slices[name]
         return self.x[where], self.fit.covariance[where, where]
 
@@ -89,23 +83,23 @@ class State:
 
     @cached_property
     def residual_ratio(self) -> float:
-        """Ratio of RMS residual to white noise, of the channel where it is largest."""
+        """Ratio of RMS residual to white noise, in the channel where it is largest."""
         white = np.maximum(self.data.white, 1e-12)
         return float(np.max(self.rows.rms(self.fit.residual) / white))
 
     @cached_property
     def smooth_misfit(self) -> float:
-        """Gain of twice the log likelihood per degree of freedom by generic smooth columns.
+        """Measure of how much generic smooth signals would reduce the residual.
 
-        For each channel, these are all signals, offsets of six parts of the record, R and springs.
-        The gain is about 1 or below for noise of any colour.
+        It is the gain of twice the log likelihood per degree of freedom: about 1 or below for noise
+        of any colour.
         """
         gain, freedom = self.smooth_gain
         return gain / max(1, freedom - self.model.size)
 
     @cached_property
     def smooth_gain(self) -> tuple[float, int]:
-        """Gain of twice the log likelihood by the columns of `smooth_misfit`, and their number."""
+        """Gain of twice the log likelihood by generic smooth signals, and their number."""
         columns = self.data.y[:, self._smooth()]
         if self.data.positions:
             columns = np.hstack([columns, self.data.y[:, RP] @ _springs().T])
@@ -130,7 +124,7 @@ class State:
         return np.asarray(part[:, None] == np.arange(1, _SEGMENTS), float)
 
     def score(self, model: Model) -> float:
-        """Return the first-order gain of twice the log likelihood by a larger model."""
+        """Return the first-order gain of twice the log likelihood by fitting a larger model."""
         x = model.start(self.x, self.model)
         rows = self._rows_of(model)
         residual = self.fit.residual if rows is self.rows else model.residual(x)

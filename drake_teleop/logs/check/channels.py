@@ -25,11 +25,7 @@ _MIN_NOISE_SHARE = 1e-6
 def channel_findings(
     stream: str, description: Description, tables: dict[Path, Table]
 ) -> list[Finding]:
-    """Return findings about single channels of the stream "wrench" or "imu".
-
-    They invalidate further checks. A constant channel counts as dead only beside a noisy one,
-    because simulated channels may be constant.
-    """
+    """Return findings about dead and repeated channels of the stream "wrench" or "imu"."""
     described = getattr(description, stream)
     found: list[Finding] = []
     named: dict[str, str] = {}

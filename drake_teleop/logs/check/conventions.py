@@ -1,9 +1,6 @@
 """Errors of convention in a log description, found by the laws of motion.
 
-Each suspected error has a correction of the description (`corrections`). It is reported only if
-the data agree decisively better with the correction: with Eqs. (1)-(2) for some load, or, of an
-IMU, with the poses. `drake_teleop.logs.causes` finds axes and units of the wrench and the frame of
-the poses.
+An error is reported if a corrected description agrees decisively better with the data.
 """
 
 from __future__ import annotations
@@ -47,9 +44,9 @@ _CONSTANT_SHARE = 1e-6  # smallest change of a live wrench, as a share of the la
 
 @dataclass(frozen=True)
 class Conventions:
-    """Result of the checks of a description.
+    """Result of the checks of a log description.
 
-    Args:
+    Attributes:
         findings: suspected errors.
         fit: fit of a load, after correction of IMU errors.
         mounting: mounting of the IMU relative to the pose, if determined.
@@ -81,12 +78,10 @@ def question_fit(
     delay: float | None,
     check: Callable[[], Conventions],
 ) -> tuple[Finding, ...]:
-    """Return the findings, except "lag", of a log whose identified load is suspicious.
+    """Return findings, except "lag", of a log whose identified load is suspicious.
 
     Args:
-        log: used samples.
-        load: identified load.
-        predicted: (N, 6) wrench that this load predicts.
+        predicted: (N, 6) wrench that the load predicts [N, N m].
         delay: removed delay [s]; None if undetermined.
         check: function that checks the log's description against its data.
 
@@ -155,7 +150,6 @@ def _check_moves(log: Log) -> None:
 
 
 def _is_suspicious(log: Log) -> bool:
-    """Return whether a channel of the wrench is constant or the IMU contradicts itself."""
     if log.static or log.described is None or Path(log.source).suffix.lower() in FORMATS:
         return False
     few = log.only(slice(None, None, max(1, int(0.01 / log.dt))))
@@ -169,7 +163,7 @@ def _is_suspicious(log: Log) -> bool:
 def check_conventions(
     description: Description, source: str, tables: dict[Path, Table] | None = None
 ) -> Conventions:
-    """Check a description against its data.
+    """Check a description against its data; `tables` are already read tables by path.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -228,7 +222,6 @@ def _one_clock(
     mounting: Mounting | None,
     delay: float | None,
 ) -> list[Finding]:
-    """Merge clock findings of IMU and wrench if both have the same time offset from the pose."""
     clocks = [finding for finding in findings if finding.name == "clock"]
     if len(clocks) < 2 or mounting is None or mounting.drift or delay is None:
         return findings

@@ -86,7 +86,7 @@ def _field(description: Description, path: str) -> Any:
 
 
 def edit_field(description: Description, path: str, value: Any) -> Description:
-    """Return the description with one field changed."""
+    """Return the description with one field changed; `path` is such as "imu.time.offset"."""
     first, *rest = path.split(".", 1)
     if rest:
         model: Any = getattr(description, first)
@@ -99,7 +99,6 @@ Edit = tuple[Finding, Description]
 
 
 def _edit(description: Description, name: str, text: str, path: str, value: Any) -> Edit:
-    """Return the finding "<text>; set <path>: <value>" and the edited description."""
     shown = str(value).lower() if isinstance(value, bool) else value
     finding = Finding(name, f"{text}; set {path}: {shown}", {path: value})
     return finding, edit_field(description, path, value)
@@ -161,7 +160,7 @@ def try_edit(function: Callable[[Description], Any], edited: Description) -> Any
 
 
 def load_edits(description: Description) -> Iterator[Edit]:
-    """Yield edits of signs, axes and units of wrench and motion, and `pose_edits`."""
+    """Yield edits of signs, axes and units of wrench and motion, including `pose_edits`."""
     stream = "static" if description.static else "wrench"
     sensor: Any = getattr(description, stream)
     text = "the sign of the wrench is inverted"

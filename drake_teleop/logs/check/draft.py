@@ -129,8 +129,6 @@ def _is_template(stream: dict[str, Any]) -> bool:
 
 
 class _Columns(NamedTuple):
-    """Columns of one quantity, and the unit in their names ("" for none)."""
-
     columns: list[str]
     unit: str
 
@@ -141,10 +139,7 @@ _NOTHING = _Columns([], "")
 def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
     """Return a log description guessed from names and magnitudes of a table's columns.
 
-    Args:
-        table: any table.
-        folder: folder of the draft; the path to the table is relative to it.
-        header: whether the file contains column names.
+    `folder` is that of the draft, to which the path to the table is relative.
     """
     plain = {name: _normalized(name) for name in table.columns}
     found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)

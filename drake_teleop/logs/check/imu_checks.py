@@ -1,8 +1,4 @@
-"""Checks of an IMU: consistency of its three signals, and its motion against the pose.
-
-- The angular acceleration is the derivative of the angular velocity.
-- Rotated back by the gyroscope for a few seconds, the mean specific force is minus gravity.
-"""
+"""Checks of an IMU: consistency of its three signals, and its motion against the pose."""
 
 from __future__ import annotations
 
@@ -97,7 +93,6 @@ def _angle_unit_finding(imu: Imu, log: Log) -> tuple[Finding, str, str] | None:
 
 
 def _gyro_axes(imu: Imu, log: Log, gravity: float) -> tuple[Finding, tuple | None] | None:
-    """Return a finding and corrected columns if gyroscope and accelerometer differ in axes."""
     assert imu.angular_velocity is not None
     few = log.only(slice(None, None, max(1, round(1.0 / (_ROTATION_HZ * log.dt)))))
     given = _gravity_misfit(few, np.eye(3), gravity)
@@ -158,14 +153,17 @@ def _signed_permutations() -> list[Array]:
 
 @dataclass(frozen=True)
 class MeanGravity:
-    """Ratio of the mean specific force's length to gravity, and its standard deviation."""
+    """Length of the mean specific force relative to gravity, and its standard deviation."""
 
     ratio: float
     deviation: float
 
 
 def mean_gravity(log: Log, gravity: float) -> MeanGravity | None:
-    """Return the mean ratio over all time windows; None if the record is too short."""
+    """Return the length of the mean specific force, rotated by the gyroscope, relative to gravity.
+
+    `gravity` is in [m/s^2]. None for a short record.
+    """
     forces = _mean_forces(log, np.eye(3))[0]
     if len(forces) < _MIN_WINDOWS:
         return None
@@ -194,7 +192,6 @@ def _mean_forces(log: Log, P: Array) -> Array:
 
 
 def _gravity_misfit(log: Log, P: Array, gravity: float) -> float:
-    """Return the RMS difference of mean specific forces from gravity and from each other."""
     means = _mean_forces(log, P) / gravity
     if means.shape[1] == 0:
         return np.nan

@@ -1,9 +1,4 @@
-"""Share of a wrench that a load explains, and limits for a better description.
-
-For n independent noise samples, the ratio of two unexplained variances has Fisher's distribution
-F(n, n). An edit must exceed the quantile for one false alarm in a million logs. n = 2 * cut-off *
-duration (Shannon).
-"""
+"""Share of a wrench that a load explains, and limits for a better description."""
 
 from __future__ import annotations
 
@@ -30,12 +25,11 @@ _MAX_SAMPLES = 1500
 
 @dataclass(frozen=True)
 class LoadFit:
-    """Result of a least squares fit of a load, Eq. (5).
+    """Least squares fit of a load to a log, Eq. (5).
 
-    Args:
-        unexplained: unexplained share of the wrench's variance.
+    Attributes:
+        unexplained, noise: shares of the wrench's variance: unexplained, and white noise.
         mass: fitted mass [kg].
-        noise: share of white noise in the variance.
         independent: number of independent samples.
     """
 
@@ -51,7 +45,7 @@ class LoadFit:
 
 
 def load_fit(log: Log) -> LoadFit:
-    """Return the fit of a constant offset and a load to a log, low-passed at 15 Hz."""
+    """Fit a load and constant offsets to a log, low-passed at 15 Hz."""
     cutoff = _cutoff(log)
     smooth = low_passed(log, cutoff).only(measured(log, cutoff))
     rows = slice(None, None, max(1, len(log) // _MAX_SAMPLES))
@@ -103,6 +97,6 @@ def _scale(wrench: Array) -> Array:
 
 
 def decisive_factor(fit: LoadFit) -> float:
-    """Return the factor by which another description must reduce the residual."""
+    """Return the factor by which a corrected description must reduce the unexplained share."""
     n = max(1.0, fit.independent)
     return max(MIN_IMPROVEMENT, float(fdtri(n, n, 1 - _FALSE_ALARMS / _TESTED_EDITS)))

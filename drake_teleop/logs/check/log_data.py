@@ -23,7 +23,7 @@ _TIME_COLUMN = "thinned time stamps of"
 
 
 class LogData:
-    """Tables of a log by their stream's `source`, whole and thinned."""
+    """Tables of a log, whole and thinned, which edited descriptions read without file access."""
 
     def __init__(self, description: Description, source: str, tables: dict[Path, Table]) -> None:
         self._source = source
@@ -43,7 +43,7 @@ class LogData:
             self._thin(name, stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
-        """Return the whole log, read with a description."""
+        """Return the whole log, as a description defines it."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
@@ -58,7 +58,7 @@ class LogData:
         return read_description(description, self._source, tables=self._thinned)
 
     def start(self, stream: Any, description: Description) -> float:
-        """Return the time of a stream's first row [s]."""
+        """Return the time of a stream's first row on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
         return float(self._stamps(stream)[0]) + float(stream.time.offset)

@@ -39,9 +39,9 @@ _SAME_COM = 0.03
 
 
 def position_finding(description: Description, data: LogData, lag: float) -> list[Finding]:
-    """Return findings for positions in a wrong unit, or of another point than So.
+    """Return findings for positions in a wrong unit, or of a point other than So.
 
-    With the unit k and the point r, a_P = k (a_S + alpha x r + omega x (omega x r)) in S.
+    They are compared with the accelerometer, whose clock lags the pose's by `lag` [s].
     """
     imu, pose = description.imu, description.pose
     if imu is None or pose is None or imu.specific_force is None or pose.position is None:
@@ -89,10 +89,6 @@ def position_finding(description: Description, data: LogData, lag: float) -> lis
 
 
 def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
-    """Return a finding if positions are not in the unit `now`, or None.
-
-    `kappa` is the acceleration from another instrument over that from the positions.
-    """
     if not abs(kappa) > _SIGNIFICANT * deviation:
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
@@ -112,11 +108,6 @@ def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
 def _fit_with_offset(
     columns: Array, target: Array, independent: float
 ) -> tuple[Array, Array] | None:
-    """Solve columns (N, c, k) x + offsets (c,) = target (N, c) by least squares.
-
-    Returns:
-        x (k,) and its standard deviations; None if x is undetermined.
-    """
     if len(columns) == 0:
         return None
     columns, target = columns - columns.mean(axis=0), target - target.mean(axis=0)
@@ -134,7 +125,7 @@ def _fit_with_offset(
 
 
 def usable(log: Log) -> bool:
-    """Return whether the poses of a log suffice to estimate the motion."""
+    """Return whether a log has poses of at least 4 s for splines."""
     return log.posed is not None and not log.static and float(log.t[-1] - log.t[0]) >= SHORTEST_S
 
 

@@ -15,7 +15,7 @@ _MAX_CHANGE_S = 0.2
 
 
 def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float) -> float:
-    """Return the relative rate of the poses' clock, such as 5e-5, or 0 if insignificant."""
+    """Return the relative rate error of the poses' clock, such as 5e-5, or 0 if insignificant."""
     first, grid = window.spectra(cache.at(spacing), delay), window.grid
     now, best = first, 0.0
     least = start = now.fit().cost
@@ -36,13 +36,15 @@ def clock_rate(window: Window, cache: SplineCache, delay: float, spacing: float)
 
 
 def at_rate(poses: Poses, rate: float, grid: Grid, delay: float) -> Poses:
-    """Return the poses on the wrench's clock; at mid-record, the `delay` [s] does not change."""
+    """Return the poses on the wrench's clock, for a relative rate error of their own clock.
+
+    The delay at mid-record, `delay` [s], is unchanged.
+    """
     middle = 0.5 * float(grid.t[0] + grid.t[-1]) + delay
     return Poses(middle + (poses.t - middle) / (1.0 + rate), poses.position, poses.quaternion)
 
 
 def _step(spectra: Spectra) -> tuple[float, float]:
-    """Return a Gauss-Newton step of the rate and the expected likelihood gain (times 2)."""
     fit, grid = spectra.fit(), spectra.grid
     change = np.gradient(spectra.zeta, grid.dt, axis=0)
     from_middle = (grid.t - 0.5 * (grid.t[0] + grid.t[-1]))[:, None]

@@ -1,9 +1,4 @@
-"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md).
-
-1. Initial knots and delay, disturbances and clock rate, from at most `SEARCHED_S` seconds.
-2. Knot distance, delay and use of an IMU with the least cost.
-3. Rigid load, with the frame as described and with the frame free.
-"""
+"""Estimation of load, delay and pose frame from a wrench and poses (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -67,15 +62,14 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Estimated pose frame P relative to S.
+    """Estimated frame P of the recorded poses, relative to the sensor frame S.
 
     Attributes:
-        p_SoPo_S: (3,) origin [m].
-        R_SP: (3, 3) rotation.
+        p_SoPo_S: (3,) origin of P from So, in S [m].
+        R_SP: (3, 3) rotation from axes of P to those of S.
         position_deviations: (3,) standard deviations of the origin [m]; inf if undetermined.
-        turn_deviations_deg: (3,) standard deviations of rotations about the axes of S [deg].
-        shifted: whether the origin differs from the description.
-        turned: whether the axes differ.
+        turn_deviations_deg: (3,) those of rotations about the axes of S [deg].
+        shifted, turned: whether origin, axes differ significantly from the description.
     """
 
     p_SoPo_S: Array
@@ -87,7 +81,7 @@ class Frame:
 
     @property
     def position_known(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where a coordinate is determined."""
+        """Booleans (3,): True where a coordinate of the origin is determined."""
         return np.asarray(self.position_deviations < MAX_SHIFT_DEVIATION)
 
     @property
@@ -98,13 +92,13 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """Motion from poses, with knots and delay fitted to a wrench.
+    """Motion from splines of poses, with knots and delay that fit a wrench best.
 
     Attributes:
-        splines: of the poses, on the wrench's clock.
-        delay_s: delay of the motion behind the wrench [s].
-        delay_deviation: standard deviation of the delay [s]; inf if undetermined.
-        clock_rate: relative rate of the poses' clock, such as 5e-5; 0 if insignificant.
+        splines: on the wrench's clock.
+        delay_s, delay_deviation: delay of the motion behind the wrench, and its standard deviation
+            [s]; inf if undetermined.
+        clock_rate: relative rate error of the poses' clock, such as 5e-5; 0 if insignificant.
         imu_agrees: whether an IMU agrees with the poses; True without one.
     """
 
@@ -122,16 +116,15 @@ class PoseMotion:
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate(PoseMotion):
-    """Load, delay and frame from a wrench and poses.
+    """Load, delay and pose frame from a wrench and poses.
 
     Attributes:
-        fit: load with the frame as described or estimated.
-        frame: estimated frame of the fit `free`.
-        free: fit of the load with a free frame.
-        seen: figures of the linear model.
-        t: (M,) instants [s].
-        rejected: (M,) True for disturbed instants.
-        note: note for the user; usually empty.
+        fit: load, with the pose frame as described or as estimated on request.
+        free: load, with the pose frame always estimated.
+        frame: pose frame of `free`.
+        seen: units, axes and masses before a rigid load is assumed.
+        t, rejected: (M,) instants [s], and True for disturbed ones.
+        note: note for the user, or "".
     """
 
     fit: RigidFit
@@ -144,12 +137,12 @@ class PoseEstimate(PoseMotion):
 
     @property
     def theta(self) -> Array:
-        """Estimate (16,) of [offsets; phi]."""
+        """Estimate (16,) of [offsets; phi] [SI]."""
         return self.fit.state.theta
 
     @property
     def covariance(self) -> Array:
-        """Covariance (16, 16) of theta."""
+        """Covariance (16, 16) of [offsets; phi] [SI]."""
         return self.fit.covariance[LOAD, LOAD]
 
 
@@ -167,13 +160,13 @@ def estimate_from_poses(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseEstimate:
-    """Estimate load, offsets, delay and pose frame P.
+    """Estimate load, sensor offsets, delay and pose frame P from a wrench and poses.
 
     Args:
         t: (N,) times, evenly spaced [s].
-        wrench: (N, 6) [f; tau] in S about So, sign of Eq. (1) [N, N m].
+        wrench: (N, 6) [f; tau] on the load, in S about So, Eq. (1) [N, N m].
         poses: of P, on the same clock except for a delay.
-        gravity_W: (3,) gravity [m/s^2].
+        gravity_W: (3,) gravity in the world [m/s^2].
         p_SoPo_S: (3,) origin of P [m], or None to estimate it.
         R_SP: (3, 3) rotation of P, or None to estimate it.
         delay: delay of the poses behind the wrench [s], or None to estimate it.
@@ -239,10 +232,12 @@ def motion_of_load(
     lost: NDArray[np.bool_] | None = None,
     imu: Inertial | None = None,
 ) -> PoseMotion:
-    """Return the motion with which an identified load fits a wrench best.
+    """Return the motion from poses of S with which an identified load fits a wrench best.
 
-    `load` (6, 16) is from `load_coefficients`. Other arguments are those of `estimate_from_poses`,
-    for P = S. Raises an error for wrong shapes, or if fewer than 32 instants remain.
+    `load` (6, 16) is from `load_coefficients`; other arguments as for `estimate_from_poses`.
+
+    Raises:
+        DrakeTeleopError: for wrong shapes, or if fewer than 32 instants remain.
     """
     with one_blas_thread():
         found = _find_motion(
@@ -261,8 +256,6 @@ def motion_of_load(
 
 @dataclass(frozen=True, eq=False)
 class _FoundMotion:
-    """Splines of all poses, spectra that determined knots and delay, window of the whole record."""
-
     splines: PoseSplines
     last: Spectra
     window: Window
@@ -363,7 +356,6 @@ def _start(p_SoPo_S: ArrayLike | None, R_SP: ArrayLike | None, seen: ReadOff) ->
 
 
 def _free_start(fit: RigidFit, start: State, seen: ReadOff) -> State:
-    """Return the start of the free fit: described frame, or the linear model's if it differs."""
     turned = seen.usable and not seen.mirrored and np.trace(seen.R_SP @ start.R) < 2.9
     if not turned:
         return fit.state
@@ -401,7 +393,6 @@ def _estimate_frame(free: RigidFit, start: State) -> Frame:
 
 
 def _is_significant(x: Array, covariance: Array, least: float, largest_deviation: float) -> bool:
-    """Return whether the vector x is determined, and longer than `least` and its noise."""
     if not np.isfinite(np.diag(covariance)).all():
         return False
     length = np.linalg.norm(x)

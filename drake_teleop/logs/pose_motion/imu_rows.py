@@ -1,7 +1,4 @@
-"""Comparison of an IMU with splines of poses, Eqs. (T82), (T83).
-
-The poses determine the IMU's bias, axes and clock. The corrected IMU then refines the splines.
-"""
+"""Correction of an IMU's bias, axes and clock by splines of poses, Eqs. (T82), (T83)."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ _COMPARISON_RATE_HZ, _ROWS_RATE_HZ, _MIN_LENGTH_S = 125.0, 500.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class _Sensor:
-    """Model y = b + (1 + D) x(t + tau) of a sensor for the motion x, and its noise power."""
+    """Sensor model y = b + (1 + D) x(t + tau) for the motion x, and its noise power."""
 
     D: Array
     b: Array
@@ -83,11 +80,7 @@ def _fit_sensor(
     which: int,
     pose_noise: tuple[float, int],
 ) -> _Sensor | None:
-    """Fit a sensor's data y (K, 3) at t (K,) to the splines; return None if these do not explain y.
-
-    `which` is 0 for the specific force and 1 for the angular velocity. `pose_noise` is the power of
-    the poses' noise and its exponent of the angular frequency.
-    """
+    """Fit a sensor's data y (K, 3) to the motion of splines; None if these do not explain y."""
     dt = float(np.median(np.diff(t)))
     place = np.round((t - t[0]) / dt).astype(int)
     even = t[0] + dt * np.arange(place[-1] + 1)
@@ -131,7 +124,6 @@ def _fit_sensor(
 def _least_squares(
     y: Complex, X: Complex, one: Complex, change: Complex, weight: Array
 ) -> tuple[Array, Array, float]:
-    """Return D (3, 3), b (3,) and tau of y = X D^T + b + tau change, fitted to spectra."""
     K = len(y)
     columns = np.zeros((K, 3, 13), complex)
     for i in range(3):
@@ -149,10 +141,6 @@ def _least_squares(
 def _noise_power(
     residual: NDArray[np.floating], pose_noise: NDArray[np.floating], white: float
 ) -> float:
-    """Return the IMU's noise power from the residual's power and the poses' noise power, both (K,).
-
-    Return `white` where the poses' noise dominates at most frequencies.
-    """
     power = max(float(np.median(residual)), white)
     for _ in range(_POWER_ITERATIONS):
         weight = 1.0 / (power + pose_noise) ** 2

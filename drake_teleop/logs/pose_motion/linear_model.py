@@ -1,4 +1,4 @@
-"""Linear model of the wrench with free coefficients C, Eqs. (T73) to (T75); choice of knots."""
+"""Linear model of the wrench in 16 signals of the motion, Eqs. (T73) to (T75); choice of knots."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ _SPACING_FACTOR, _SPACING_FACTOR_OF_LOAD, _MIN_COST_RISE = 0.84, 0.92, 25.0
 
 @dataclass(frozen=True, eq=False)
 class LinearFit:
-    """Fit of the linear model.
+    """Fit of the wrench by free coefficients of 16 signals of the motion.
 
     Attributes:
-        coefficients: (6, 16) C; zero for constant signals.
-        covariance: (6, 16, 16) covariances of the rows of C.
+        coefficients: (6, 16); zero for constant signals.
+        covariance: (6, 16, 16) of the rows of coefficients.
         power: (bands, 6) mean noise power.
-        costs: (6,) costs of the channels.
+        costs: (6,) negative log likelihood of each channel.
     """
 
     coefficients: Array
@@ -67,12 +67,12 @@ class LinearFit:
 
     @property
     def cost(self) -> float:
-        """Total cost, Eq. (T75)."""
+        """Negative log likelihood, up to a constant, Eq. (T75)."""
         return float(self.costs.sum())
 
 
 def fit_linear_model(Z: Array, levels: Levels) -> LinearFit:
-    """Fit the model to second moments Z (bands, 38, 38)."""
+    """Fit the wrench by 16 signals of the motion, from second moments Z (bands, 38, 38)."""
     return _fit_moments(Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z), levels)
 
 
@@ -83,11 +83,7 @@ def _wrench_powers(Z: Array) -> Array:
 def _fit_moments(
     zz: Array, zf: Array, ff: Array, levels: Levels, load: Array | None = None
 ) -> LinearFit:
-    """Fit the model to moments of signals and wrench.
-
-    These are zz (..., bands, 16, 16), zf (..., bands, 16, 6) and ff (bands, 6). Leading dimensions
-    are separate fits. With `load` (6, 16), only the constants are free.
-    """
+    """Fit the model to moments of signals and wrench; with a known load only the constants."""
     floor = _rounding_power(ff, levels.sizes)
     if load is not None:
         explained = zz @ load.T
@@ -133,7 +129,7 @@ def _inverses(gram: Array) -> Array:
 
 
 def least_power(Z: Array, sizes: Array) -> Array:
-    """Return the power (6,) of rounding errors in each channel."""
+    """Return the power (6,) of rounding errors in the wrench channels."""
     return _rounding_power(_wrench_powers(Z), sizes)
 
 
@@ -144,7 +140,7 @@ def _rounding_power(ff: Array, sizes: Array) -> Array:
 
 
 def fit_levels(Z: Array, of: Bands) -> Levels:
-    """Return noise levels whose corner frequency has the lowest cost in each channel, Eq. (T74)."""
+    """Return noise levels with the drift of lowest cost in each wrench channel, Eq. (T74)."""
     levels = Levels.flat(of)
     least, shape = fit_linear_model(Z, levels).costs - _MIN_COST_REDUCTION, levels.shape.copy()
     for corner in _CORNERS_HZ:
@@ -157,14 +153,13 @@ def fit_levels(Z: Array, of: Bands) -> Levels:
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Spectra of a record for one taper, splines and delay.
+    """Spectra of wrench (K, 6) and motion signals (K, 16) of a record, for one taper and delay.
 
     Attributes:
         of: frequency bands.
-        wrench: (K, 6) spectrum of the wrench.
-        signals: (K, 16) spectrum of the signals of P at t + `delay`.
         delay: delay of the signals [s].
-        grid, taper, zeta: of the record; zeta (M, 16) are the signals in time.
+        grid, taper: instants of the record, and their weights (M,).
+        zeta: (M, 16) signals in time.
     """
 
     of: Bands
@@ -182,17 +177,13 @@ class Spectra:
 
     @cached_property
     def taper_fixed(self) -> bool:
-        """Whether the taper stays in place when the delay of the signals changes.
-
-        It stays if it excludes interior samples, because their edges would bias the delay, or if
-        the load is known.
-        """
+        """Whether the taper (weights of samples) stays in place if the delay changes."""
         inside = np.flatnonzero(self.taper > 0.5)
         edged = len(inside) > 0 and len(inside) <= inside[-1] - inside[0]
         return bool(edged or self.grid.load is not None)
 
     def at(self, delay: float) -> Spectra:
-        """Return the spectra with the signals at another delay [s]; `zeta` is unchanged."""
+        """Return the spectra with the signals at another delay [s]."""
         shift, signals = delay - self.delay, self.signals
         if self.taper_fixed:
             before = shift_taper(self.grid, self.taper, shift)
@@ -202,7 +193,7 @@ class Spectra:
         return replace(self, signals=late)
 
     def moments(self) -> Array:
-        """Return second moments (bands, 38, 38), with derivatives of the signals, not the taper."""
+        """Return second moments (bands, 38, 38) of signals, wrench, and derivatives of signals."""
         rates = 2j * np.pi * self.of.frequency[:, None] * self.signals
         edges = taper_derivative(self.grid, self.taper)
         rates -= signal_spectrum(self.grid, edges, self.zeta, len(rates))
@@ -210,7 +201,7 @@ class Spectra:
         return moments(self.signals, self.wrench, self.of, rates)
 
     def fit(self) -> LinearFit:
-        """Fit all coefficients with flat levels; only the constants if the load is known."""
+        """Fit the coefficients of all signals; only the constants if the load is known."""
         Z, load = moments(self.signals, self.wrench, self.of), self.grid.load
         parts = Z[:, :SIGNALS, :SIGNALS], Z[:, :SIGNALS, FORCES], _wrench_powers(Z)
         fit = _fit_moments(*parts, Levels.flat(self.of), load)
@@ -219,7 +210,7 @@ class Spectra:
         return replace(fit, coefficients=np.hstack([fit.coefficients, load[:, 1:]]))
 
     def costs(self, delays: Array) -> Array:
-        """Return the costs (D,) at the delays (D,) [s]."""
+        """Return the negative log likelihoods (D,) of fits with delays (D,) [s]."""
         if self.taper_fixed:
             Z = np.array([moments(x.signals, x.wrench, x.of) for x in map(self.at, delays)])
             zz, zf = Z[..., :SIGNALS, :SIGNALS], Z[..., :SIGNALS, FORCES]
@@ -230,11 +221,7 @@ class Spectra:
         return fits.costs.sum(axis=-1)
 
     def _delayed_moments(self, delays: Array) -> tuple[Array, Array]:
-        """Return the moments zz (D, bands, 16, 16) and zf (D, bands, 16, 6) at delays (D,).
-
-        The taper moves with the signals. Phases then cancel in products of signals, except with the
-        constant.
-        """
+        """Return moments of signals and wrench at delays (D,); the taper moves with the signals."""
         of, Z = self.of, moments(self.signals, self.wrench, self.of)
         fixed = np.column_stack([self.wrench, self.signals[:, 0]]) * of.weight[:, None]
         products = np.conj(self.signals)[:, :, None] * fixed[:, None]
@@ -261,7 +248,7 @@ class Spectra:
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Data of a fit: grid, taper (M,), gravity (3,) [m/s^2] and highest frequency [Hz]."""
+    """Data of a fit: weights `taper` (M,), gravity (3,) [m/s^2], highest frequency [Hz]."""
 
     grid: Grid
     taper: Array
@@ -269,7 +256,7 @@ class Window:
     top: float
 
     def part(self, rows: slice) -> Window:
-        """Return the window of some rows of the grid, with ramps at its ends."""
+        """Return the window of some rows of the grid."""
         grid = self.grid
         wrench = grid.wrench[rows.start * grid.stride : rows.stop * grid.stride]
         grid = replace(grid, t=grid.t[rows], wrench=wrench)
@@ -277,7 +264,7 @@ class Window:
         return replace(self, grid=grid, taper=taper)
 
     def spectra(self, splines: PoseSplines, delay: float) -> Spectra:
-        """Return spectra of the wrench and of the motion `delay` [s] later."""
+        """Return spectra of the wrench, and of the motion `delay` [s] later."""
         of = bands(self.grid, self.taper, self.top)
         count = len(of.frequency)
         zeta = splines.signals(self.grid.t + delay, self.gravity_W)
@@ -289,7 +276,7 @@ class Window:
 def best_delay(
     spectra: Spectra, reach: float, finest: float = _FINEST_STEP_S
 ) -> tuple[float, float]:
-    """Return the delay of lowest cost within `reach`, accurate to `finest` [s], and this cost."""
+    """Return the delay [s] of lowest cost within `reach` [s], to `finest` [s], and this cost."""
     step = min(_COARSE_STEP_S, reach / 2)
     at: Array = spectra.delay + step * np.arange(-round(reach / step), round(reach / step) + 1.0)
     costs = spectra.costs(at)
@@ -321,7 +308,10 @@ def delay_deviation(spectra: Spectra) -> float:
 def guess_spacing(
     window: Window, cache: SplineCache, delay: float, *, known: bool
 ) -> tuple[float, float]:
-    """Return knot distance and delay of lowest cost on a coarse grid."""
+    """Return knot distance [s] and delay [s] of lowest cost on a coarse grid.
+
+    The delay is fixed if `known`.
+    """
     spacings, found = _allowed_spacings(cache)[::2], []
     start = window.spectra(cache.at(spacings[0]), delay)
     for h in spacings:
@@ -337,10 +327,9 @@ def guess_spacing(
 def choose_spacing(
     window: Window, choices: Sequence[SplineCache], delay: float, *, known: bool
 ) -> tuple[SplineCache, float, float]:
-    """Return the element of `choices`, knot distance [s] and delay [s] of lowest cost.
+    """Return the set of splines, knot distance [s] and delay [s] of lowest cost.
 
-    Knots are slightly closer than at the minimum, because fits do not compensate for motion that
-    the splines miss.
+    Knots are slightly closer than at the minimum. The delay is fixed if `known`.
     """
     start = window.spectra(choices[0].at(SPACINGS[0]), delay)
     found = []
@@ -365,7 +354,7 @@ def choose_spacing(
 
 
 def averaged_splines(poses: Poses) -> SplineCache:
-    """Return a cache of splines of averaged poses, at the rate that a search needs."""
+    """Return splines of averaged poses, at the rate that a search needs."""
     return SplineCache(poses.averaged(max(1, int(poses.rate / _SEARCH_RATE_HZ + 1e-6))))
 
 

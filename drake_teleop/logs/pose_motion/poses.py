@@ -48,7 +48,7 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Inertial:
-    """IMU data of S at So, in the axes of S.
+    """IMU data at the sensor origin So, in the axes of S.
 
     Attributes:
         t: (K,) times, evenly spaced except for gaps [s].
@@ -66,7 +66,7 @@ class Inertial:
         return float(1.0 / np.median(np.diff(self.t)))
 
     def averaged(self, fastest: float) -> Inertial:
-        """Return means of rows, at least `fastest` per second [Hz], without means across gaps."""
+        """Return means of consecutive rows, at a rate of at least `fastest` [Hz]."""
         count = max(1, int(self.rate / fastest))
         rows = len(self.t) // count * count
         at = self.t[:rows].reshape(-1, count)
@@ -81,14 +81,12 @@ class Inertial:
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """Poses of a log with their description.
+    """Poses of S in a log, and the described frame P that was recorded.
 
     Attributes:
-        poses: poses of S, if the description is right.
-        gravity_W: (3,) gravity [m/s^2].
+        gravity_W: (3,) gravity in the world [m/s^2].
         p_SoPo_S: (3,) described origin of P [m].
         R_SP: (3, 3) described rotation of P.
-        imu: IMU data, or None.
     """
 
     poses: Poses
@@ -98,6 +96,6 @@ class Posed:
     imu: Inertial | None = None
 
     def earlier(self, start: float) -> Posed:
-        """Return the poses and IMU data with times relative to `start` [s]."""
+        """Return poses and IMU data with times relative to `start` [s]."""
         imu = None if self.imu is None else replace(self.imu, t=self.imu.t - start)
         return replace(self, poses=replace(self.poses, t=self.poses.t - start), imu=imu)

@@ -1,4 +1,4 @@
-"""Units, axes and masses from the linear model's coefficients, before a load is assumed."""
+"""Units, axes and masses from the coefficients of the linear model, before a load is assumed."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _ITERATIONS = 5
 
 @dataclass(frozen=True, eq=False)
 class ReadOff:
-    """Figures of the linear model.
+    """Units, axes and masses that the free coefficients of a linear model of the wrench imply.
 
     Attributes:
         kappa: unit error of position; 1e-3 for mm described as m.
-        kappa_deviation: standard deviation of kappa; inf if undetermined.
+        kappa_deviation: its standard deviation; inf if undetermined.
         gravity_force: (3, 3) M_g, force over minus gravity [kg].
         deviation: largest standard deviation of M_g [kg].
         R_SP: (3, 3) polar factor of M_g; determinant -1 if mirrored.
@@ -27,7 +27,7 @@ class ReadOff:
         oblique_deg: angle between permutation and R_SP [deg].
         gravity_torque: (3, 3) torque over minus gravity [kg m].
         turning_force: (3, 3) force over minus angular acceleration [kg m]; equal if Po is So.
-        moment_deviations: standard deviations of the norms of turning_force and gravity_torque.
+        moment_deviations: of the norms of turning_force and gravity_torque [kg m].
     """
 
     kappa: float
@@ -54,7 +54,7 @@ class ReadOff:
 
 
 def read_off(fit: LinearFit) -> ReadOff:
-    """Return the figures of a fitted linear model."""
+    """Return units, axes and masses that a fitted linear model implies."""
     C, variances = fit.coefficients, np.diagonal(fit.covariance, axis1=1, axis2=2)
     M_a, M_g = C[:3, 1:4], C[:3, 4:7]
     kappa, deviation = _ratio(M_a, M_g, variances[:3, 1:4], variances[:3, 4:7])
@@ -86,7 +86,6 @@ def _norm_deviation(variances: Array) -> float:
 
 
 def _ratio(a: Array, g: Array, variances_a: Array, variances_g: Array) -> tuple[float, float]:
-    """Return kappa of a = kappa g, both (3, 3), weighted by variance, and its deviation."""
     known = (variances_a > 0.0) & (variances_g > 0.0)
     if not known.any():
         return np.nan, np.inf

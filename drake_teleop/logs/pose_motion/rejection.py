@@ -23,7 +23,7 @@ _MIN_MARGIN_S = 0.1
 
 
 def find_disturbances(spectra: Spectra, spacing: float) -> tuple[NDArray[np.bool_], str]:
-    """Return (M,) booleans: True for disturbed instants; and a note for the user.
+    """Return (M,) booleans: True for disturbed instants (contact, impact, saturation), and a note.
 
     For an identified load only the offsets are fitted.
     """
@@ -70,7 +70,6 @@ def _in_time(spectrum: NDArray[np.complex128], grid: Grid) -> Array:
 
 
 def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) -> Array:
-    """Return (M,) ratios of residual to robust deviation, of the worst channel."""
     weighted = x * weights[:, None]
     C = np.linalg.lstsq(weighted.T @ x, weighted.T @ y, rcond=1e-12)[0]
     residual = np.abs(y - x @ C)
@@ -80,7 +79,6 @@ def _distances(x: Array, y: Array, weights: Array, inside: NDArray[np.bool_]) ->
 
 
 def _information_loss(x: Array, inside: NDArray[np.bool_], kept: NDArray[np.bool_]) -> float:
-    """Return the largest growth of a deviation, relative to a random loss of as many samples."""
     if kept.sum() < 2 * x.shape[1]:
         return np.inf
     every, some = (

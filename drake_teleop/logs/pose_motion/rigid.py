@@ -1,7 +1,4 @@
-"""Rigid load, delay and transform between pose frame and sensor, Eqs. (T78) to (T81).
-
-The fit is Gauss-Newton on second moments that are compensated for noise of the poses.
-"""
+"""Rigid load, delay and transform between pose frame P and sensor, Eqs. (T78) to (T81)."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ _RANK_TOLERANCE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Parameters: theta (16,), delay tau [s], lever arm r = p_PoSo (3,) [m], R_PS (3, 3)."""
+    """Parameters: theta = [offsets; phi] (16,), delay tau [s], r = p_PoSo (3,) [m], R_PS (3, 3)."""
 
     theta: Array
     tau: float
@@ -42,14 +39,14 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """Fit of a rigid load.
+    """Fit of a rigid load to wrench and poses.
 
     Attributes:
         state: estimated parameters; tau is relative to the delay of the moments.
-        covariance: (23, 23) of [theta, tau, r, rho], rho the rotation about the axes of S; inf on
-            the diagonal if undetermined, 0 if not free.
-        misfit: log likelihood ratio to the linear model (times 2).
-        degrees: degrees of freedom of the misfit.
+        covariance: (23, 23) of [theta, tau, r, rotation about the axes of S]; inf on the diagonal
+            if undetermined, 0 if not free.
+        misfit, degrees: log likelihood ratio to the linear model (times 2), and its degrees of
+            freedom.
         misfit_of_gains: expected increase of the misfit by stated gain errors.
         one_weight: whether all bands had one weight.
     """
@@ -75,13 +72,17 @@ class RigidFit:
 
     @property
     def inflation(self) -> float:
-        """Factor on standard deviations due to misfit; noise causes 1.5 times the degrees."""
+        """Factor (>= 1) on standard deviations due to misfit."""
         left = self.misfit - _GAIN_ALLOWANCE * self.misfit_of_gains
         return float(np.sqrt(max(1.0, left / (_NOISE_RATIO * self.degrees))))
 
 
 def motion_map(R: Array, r: Array) -> Array:
-    """Return the matrix M (19, 22) of z = M [zeta; F], Eq. (T79)."""
+    """Return the matrix M (19, 22) with z = M [zeta; F], Eq. (T79).
+
+    It maps the 16 signals zeta of pose frame P and the wrench F to the signals z of the sensor, for
+    R = R_PS and r = p_PoSo [m].
+    """
     M = np.zeros((19, SIGNALS + 6))
     M[0, 0] = 1.0
     M[1:7, SIGNALS:] = np.eye(6)
@@ -94,7 +95,6 @@ def motion_map(R: Array, r: Array) -> Array:
 
 
 def _centripetal(r: Array) -> Array:
-    """Return the matrix (3, 6) from products of omega to omega x (omega x r)."""
     x, y, z = r
     return np.array([[0.0, -x, -x, y, z, 0.0], [-y, 0.0, -y, x, 0.0, z], [-z, -z, 0.0, 0.0, x, y]])
 
@@ -103,10 +103,9 @@ _PRODUCT_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def load_coefficients(phi: Array, removed_weight: Array | None = None) -> Array:
-    """Return the coefficients C (6, 16) of a load in the linear model for P = S, Eq. (T73).
+    """Return the coefficients (6, 16) of a load phi (10,) in the linear model, Eq. (T73).
 
-    `phi` (10,) is the load. `removed_weight` (4,) is [m, m c] of a weight that the wrench does not
-    contain.
+    `removed_weight` (4,) is the [m, m c] of a weight that the wrench does not contain.
     """
     C = _coefficients_of(phi)
     if removed_weight is not None:
@@ -139,15 +138,14 @@ def fit_rigid(
     *,
     gain: float = 0.0,
 ) -> RigidFit:
-    """Fit a rigid load; use one weight for all bands if no rigid load explains the wrench.
+    """Fit a rigid load; all bands get one weight if no rigid load explains the wrench.
 
     Args:
         Z: (bands, 38, 38) second moments, `Spectra.moments`.
         Q: (bands, 38, 38) noise of the poses in Z, `spectra.noise_moments`.
         levels: noise of the bands.
-        start: initial state.
         free: (23,) True for estimated parameters.
-        linear: linear model, whose residual gives the first weights.
+        linear: fit of the linear model, whose residual gives the first weights.
         gain: standard deviation of the sensor gains.
     """
     record = _Record(Z, Q, levels, free, linear.power)
@@ -180,8 +178,6 @@ class _Record:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """Solution: state, columns B (6, 23, 38), weights W, residual covariances R (bands, 6, 6)."""
-
     state: State
     B: Array
     W: Array
@@ -212,7 +208,6 @@ def _solve(record: _Record, state: State, *, one_weight: bool = False) -> _Solut
 
 
 def _covariance(record: _Record, solution: _Solution, inflation: float, gain: float) -> Array:
-    """Return the covariance (23, 23) due to noise, gain errors and misfit."""
     B, W, inverse, undetermined = solution.B, solution.W, solution.inverse, solution.undetermined
     middle = _normal(B, np.zeros((6, WIDTH)), record.Z, W @ solution.R @ W)[0]
     covariance = 0.5 * inverse @ middle @ inverse
@@ -230,7 +225,6 @@ def _covariance(record: _Record, solution: _Solution, inflation: float, gain: fl
 
 
 def _weight_estimation_factors(record: _Record, solution: _Solution) -> Array:
-    """Return factors (23,) on standard deviations, because weights are estimated, Eq. (T81)."""
     levels, B = record.levels, solution.B
     half = np.einsum("cjk,ji->cik", B, solution.inverse)
     weight = np.diagonal(solution.W, axis1=1, axis2=2)
@@ -253,7 +247,7 @@ def _residual_map(state: State) -> Array:
 
 
 def _columns(state: State) -> tuple[Array, Array]:
-    """Return the residual e (6, 38) and B = -de/dx (6, 23, 38), in coefficients of y."""
+    """Return B = -de/dx (6, 23, 38) and the residual e (6, 38), in coefficients of y."""
     L, M = _residual_map(state), _map(state)
     B = np.zeros((6, PARAMETERS, WIDTH))
     B[:, LOAD] = coefficients() @ M
@@ -278,7 +272,6 @@ def _normal(B: Array, Le: Array, Z: Array, W: Array) -> tuple[Array, Array]:
 
 
 def _inverse(gram: Array, free: NDArray[np.bool_]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the pseudo-inverse (23, 23) and flags (23,) of undetermined parameters."""
     diagonal = np.diag(gram)
     used = free & (diagonal > 0.0)
     scale = np.where(used, 1.0 / np.sqrt(np.where(used, diagonal, 1.0)), 0.0)
@@ -301,7 +294,6 @@ def _residual_sums(record: _Record, state: State) -> Array:
 def _residual_covariances(
     record: _Record, state: State, sums: Array, used: Array | None = None
 ) -> Array:
-    """Return the residual covariances R_b (bands, 6, 6) of Eq. (T80)."""
     levels, sizes = record.levels, record.levels.sizes[:, None]
     P = _residual_powers(record.Q, state) / sizes[..., None]
     own = np.diagonal(P, axis1=1, axis2=2) * (sizes if used is None else sizes - 0.5 * used)
@@ -313,7 +305,6 @@ def _residual_covariances(
 
 
 def _used_freedom(B: Array, Z: Array, W: Array, inverse: Array) -> Array:
-    """Return the degrees of freedom (bands, 6) that the parameters use."""
     diagonal = np.diagonal(W, axis1=1, axis2=2)
     half = np.einsum("cjk,ji->cik", B, inverse)
     gram = np.einsum("cik,bkm,cim->bc", half, Z, B, optimize=True)

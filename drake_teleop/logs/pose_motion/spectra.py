@@ -1,8 +1,4 @@
-"""Spectra, second moments and noise of wrench and signals in frequency bands (docs/theory.md).
-
-The signals have about 100 Hz, the wrench its own rate over the same time span, so that the
-frequencies of their spectra agree.
-"""
+"""Spectra, second moments and noise of wrench and signals in frequency bands (docs/theory.md)."""
 
 from __future__ import annotations
 
@@ -38,12 +34,10 @@ WIDTH = 2 * SIGNALS + 6
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Instants of the signals and samples of the wrench.
+    """Instants t (M,) of the motion signals [s], about 100 Hz, and samples of the wrench.
 
     Attributes:
-        t: (M,) instants, evenly spaced, about 100 Hz [s].
         wrench: (N, 6) samples, N = M stride.
-        stride: wrench samples per instant.
         load: (6, 16) coefficients of an identified load, or None.
     """
 
@@ -81,10 +75,9 @@ class Bands:
     """Frequency bands, which form groups with a common noise level.
 
     Attributes:
-        frequency: (K,) used frequencies [Hz].
-        band: (K,) index of each frequency's band.
+        frequency, band: (K,) used frequencies [Hz], and their bands.
         weight: (K,) half the independent numbers of each frequency.
-        group: (count,) index of each band's group.
+        group: (count,) group of each band.
     """
 
     frequency: Array
@@ -110,7 +103,7 @@ class Bands:
 
 
 def bands(grid: Grid, taper: Array, top: float) -> Bands:
-    """Return bands up to `top` [Hz]; groups with few numbers are joined to the next."""
+    """Return frequency bands up to `top` [Hz]; small groups are joined to the next."""
     frequency = grid.frequency[grid.frequency <= top]
     worth = (taper**2).sum() ** 2 / ((taper**4).sum() * grid.length)
     weight = np.full(len(frequency), worth)
@@ -131,20 +124,20 @@ def bands(grid: Grid, taper: Array, top: float) -> Bands:
 
 
 def end_taper(t: Array, start: float, stop: float) -> Array:
-    """Return a taper (M,), 1 between start and stop, 0 outside, with cosine ramps."""
+    """Return a taper (M,): 1 from `start` to `stop` [s], 0 outside, with cosine ramps."""
     ramp = min(RAMP_S, 0.1 * (stop - start))
     x = np.clip(np.minimum(t - start, stop - t) / ramp, 0.0, 1.0)
     return 0.5 - 0.5 * np.cos(np.pi * x)
 
 
 def exclude(taper: Array, lost: NDArray[np.bool_], dt: float, margin: float = 0.0) -> Array:
-    """Return the taper, set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
+    """Return the taper (M,), set to 0 within `margin` [s] of `lost` (M,), with cosine edges."""
     edge = np.clip((distance(lost) * dt - margin) / EDGE_S, 0.0, 1.0)
     return np.asarray(taper * (0.5 - 0.5 * np.cos(np.pi * edge)))
 
 
 def distance(flags: NDArray[np.bool_]) -> Array:
-    """Return the number (M,) of instants to the nearest flag; inf without any."""
+    """Return the number (M,) of instants to the nearest set flag; inf without any."""
     at = np.arange(len(flags), dtype=float)
     before = np.maximum.accumulate(np.where(flags, at, -np.inf))
     after = np.minimum.accumulate(np.where(flags, at, np.inf)[::-1])[::-1]
@@ -172,7 +165,7 @@ def signal_spectrum(grid: Grid, taper: Array, zeta: Array, count: int) -> Comple
 
 
 def shifted(spectrum: Complex, frequency: Array, shift: float) -> Complex:
-    """Return spectra (K, 16) with signals and taper `shift` [s] later, except the constant."""
+    """Return spectra (K, 16) of signals and taper `shift` [s] later; the constant is unchanged."""
     out = spectrum * np.exp(2j * np.pi * frequency * shift)[:, None]
     out[:, 0] = spectrum[:, 0]
     return out
@@ -193,9 +186,9 @@ def _filter(grid: Grid, x: Array, response: NDArray[np.complexfloating]) -> Arra
 
 
 def moments(zeta: Complex, wrench: Complex, of: Bands, rates: Complex | None = None) -> Array:
-    """Return second moments (bands, 38, 38), sums of Re y* y^T.
+    """Return second moments (bands, 38, 38) of y = [zeta (16), F (6), d zeta/dt (16)].
 
-    y is [zeta (16), F (6), d zeta/dt (16)]. Without rates the result is (bands, 22, 22).
+    They are sums of Re y* y^T. Without rates the result is (bands, 22, 22).
     """
     parts = [zeta, wrench] if rates is None else [zeta, wrench, rates]
     y = np.hstack(parts) * np.sqrt(of.weight)[:, None]
@@ -214,11 +207,10 @@ _MIN_REMAINING_SHARE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Noise with one level for each group of bands and channel.
+    """Noise of the wrench, with one level for each group of bands and channel.
 
     Attributes:
-        sizes: (bands,) half the independent numbers of each band.
-        group: (bands,) index of each band's group.
+        sizes, group: (bands,) half the independent numbers of each band, and its group.
         shape: (bands, 6) power relative to the level.
     """
 
@@ -232,10 +224,9 @@ class Levels:
         return cls(of.sizes, of.group, np.ones((of.count, 6)))
 
     def power(self, sums: Array, used: Array | None = None) -> Array:
-        """Return the noise power (..., bands, 6) that a residual of power `sums` (..., bands, 6)
-        implies.
+        """Return the noise power (..., bands, 6) of residuals with power `sums` (..., bands, 6).
 
-        `used` (bands, 6) are degrees of freedom used by parameters.
+        `used` (bands, 6) are degrees of freedom that parameters use.
         """
         remaining = self._numbers
         if used is not None:
@@ -258,7 +249,7 @@ class Levels:
         return self.grouped(self.sizes)[:, None]
 
     def costs(self, power: Array) -> Array:
-        """Return the costs (..., 6), Eq. (T75), of noise powers (..., bands, 6)."""
+        """Return negative log likelihoods (..., 6) of noise powers (..., bands, 6), Eq. (T75)."""
         return np.asarray(self.sizes @ np.log(power))
 
 
@@ -310,7 +301,6 @@ def noise_moments(
 
 
 def _rotation_covariances(zeta: Array, weight: Array) -> tuple[Array, Array, Array, Array]:
-    """Return signal covariances (16, 16) for unit rotation noise; factors 1, w^2, w^2, w^4."""
     still, cross, products, alpha = np.zeros((4, SIGNALS, SIGNALS))
     mean = weight @ zeta
     for left in (_A, _G):

@@ -27,12 +27,10 @@ _CHUNK_ROWS = 2**17
 
 @dataclass(frozen=True, eq=False)
 class ImuRows:
-    """IMU data that refine the splines, corrected to the axes, clock and zero bias of the poses.
+    """IMU data at times t (K,) [s], corrected to axes, clock and zero bias of poses.
 
     Attributes:
-        t: (K,) times [s].
-        rate: samples per second [Hz].
-        acceleration_W: (K, 3) acceleration of So [m/s^2], or None.
+        acceleration_W: (K, 3) acceleration of So in the world [m/s^2], or None.
         quaternion_rate: (K, 4) derivative of the quaternion [1/s], or None.
         pose_powers: noise power densities of position [m^2/Hz] and rotation [rad^2/Hz].
         own_powers: noise power densities of acceleration and angular velocity.
@@ -58,7 +56,7 @@ class ImuRows:
         pose_powers: tuple[float, float],
         own_powers: tuple[float, float],
     ) -> ImuRows:
-        """Return the rows of specific force s and omega (K, 3), oriented by `splines`."""
+        """Return IMU data from specific force s and omega (K, 3) in S, oriented by `splines`."""
         q = splines.quaternion(t)
         n = np.sum(q * q, axis=1, keepdims=True)
         acceleration = rates = None
@@ -71,7 +69,7 @@ class ImuRows:
         return cls(t, rate, acceleration, rates, pose_powers, own_powers)
 
     def share(self, frequency: Array) -> tuple[Array, Array]:
-        """Return the shares of the poses' noise that remain at frequencies (K,), Eq. (T83)."""
+        """Return the shares (K,) of position and rotation noise that remain, Eq. (T83)."""
         w = 2.0 * np.pi * frequency
         left = []
         for pose, own, order, rows in zip(
@@ -87,14 +85,7 @@ class ImuRows:
 
 
 class PoseSplines:
-    """Least-squares splines of poses.
-
-    Attributes:
-        poses: fitted poses, whose quaternion signs do not jump.
-        spacing: knot distance [s].
-        rate: rate of the poses [Hz].
-        imu_rows: IMU data, or None.
-    """
+    """Least-squares splines of poses of a frame P, with knots every `spacing` [s]."""
 
     def __init__(self, poses: Poses, spacing: float, imu_rows: ImuRows | None = None) -> None:
         self.poses, self.spacing, self.rate, self.imu_rows = poses, spacing, poses.rate, imu_rows
@@ -108,11 +99,6 @@ class PoseSplines:
             self._spline = self._fit(t, _thin_knots(knots, t))
 
     def _fit(self, t: Array, knots: Array) -> BSpline:
-        """Return the spline from banded normal equations.
-
-        They are five times faster than `scipy.interpolate.make_lsq_spline` and sufficiently
-        accurate.
-        """
         poses, imu_rows = self.poses, self.imu_rows
         values = (np.hstack([poses.position[x], poses.quaternion[x]]) for x in self._blocks)
         times = (t[x] for x in self._blocks)
@@ -139,11 +125,11 @@ class PoseSplines:
         return BSpline(knots, np.hstack(columns), DEGREE)
 
     def quaternion(self, t: Array) -> Array:
-        """Return quaternions (N, 4) at times t, nearly of unit length."""
+        """Return quaternions (N, 4) [w, x, y, z] of R_WP at times t, nearly of unit length."""
         return np.asarray(self._at(t, 0)[:, 3:])
 
     def position(self, t: Array) -> Array:
-        """Return positions (N, 3) at times t [m]."""
+        """Return positions (N, 3) of Po in the world at times t [m]."""
         return np.asarray(self._at(t, 0)[:, :3])
 
     def _at(self, t: Array, order: int) -> Array:
@@ -153,7 +139,7 @@ class PoseSplines:
     def signals(self, t: Array, gravity_W: Array) -> Array:
         """Return the signals zeta (N, 16) of Eq. (T73) at times t (N,) [s], in the axes of P.
 
-        Before and after the poses, the signals of the ends are held.
+        They are [1, acceleration, -gravity, alpha, products of omega]. Values at the ends are held.
         """
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         zeta = np.empty((len(t), SIGNALS))
@@ -165,12 +151,12 @@ class PoseSplines:
         return zeta
 
     def motion(self, t: Array, gravity_W: Array) -> tuple[Array, Array, Array]:
-        """Return specific force of Po, omega and alpha of P (N, 3), in the axes of P."""
+        """Return specific force of Po, omega and alpha of P (N, 3) at times t, in P [SI]."""
         a, minus_g, omega, alpha = self._motion(t, gravity_W)
         return a + minus_g, omega, alpha
 
     def gravity(self, t: Array, gravity_W: Array) -> Array:
-        """Return gravity (N, 3) in the axes of P [m/s^2]."""
+        """Return gravity (N, 3) at times t, in the axes of P [m/s^2]."""
         out = np.empty((len(t), 3))
         for part in _row_blocks(len(t)):
             q = self.quaternion(t[part])
@@ -197,11 +183,7 @@ class PoseSplines:
         return _in_P(q, n, second[:, :3]), _in_P(q, n, gravity_rows), omega, alpha
 
     def noise(self) -> tuple[float, float]:
-        """Return the noise per axis of position [m] and rotation [rad], as standard deviations.
-
-        It is estimated from residuals just above the frequencies that the splines pass, because
-        noise can be coloured.
-        """
+        """Return the standard deviations per axis of noise of position [m] and rotation [rad]."""
         if self.imu_rows is not None:
             position_power, rotation_power = self.imu_rows.pose_powers
             return float(np.sqrt(position_power * self.rate)), float(
@@ -234,7 +216,7 @@ class SplineCache:
 
     @property
     def rate(self) -> float:
-        """Rate of the fitted poses and IMU rows together [Hz]."""
+        """Rate of the fitted poses and IMU data together [Hz]."""
         return self.poses.rate + (0.0 if self.imu_rows is None else self.imu_rows.rate)
 
     def at(self, spacing: float) -> PoseSplines:
@@ -245,7 +227,10 @@ class SplineCache:
 
 
 def passed(frequency: Array, spacing: float) -> Array:
-    """Return the share of white noise's power that splines pass, Eq. (T72)."""
+    """Return the share (K,) of white noise's power that splines pass, Eq. (T72).
+
+    `frequency` (K,) in [Hz], knot distance `spacing` in [s].
+    """
     x = np.minimum(frequency * spacing, 0.999)
     share: Array = 1.0 / (1.0 + (x / (1.0 - x)) ** (2 * (DEGREE + 1)))
     return np.where(frequency * spacing < 1.0, share, 0.0)
@@ -263,7 +248,6 @@ def _knots(t: Array, spacing: float, *, with_imu: bool = False) -> Array:
 
 
 def _thin_knots(knots: Array, t: Array) -> Array:
-    """Return knots with at least `MIN_POSES_PER_KNOT` samples between them."""
     inner, kept, last = knots[DEGREE + 1 : -DEGREE - 1], [], 0
     for knot, before in zip(inner, np.searchsorted(t, inner), strict=True):
         if min(before - last, len(t) - before) >= MIN_POSES_PER_KNOT:
@@ -297,7 +281,6 @@ def _normal(
 
 
 def _normal_of_rates(t: Array, x: Array, knots: Array, order: int) -> tuple[Array, Array]:
-    """Return the normal equations for values x of a derivative of the spline."""
     change = eye_array(len(knots) - DEGREE - 1, format="csr")
     for k in range(order):  # maps coefficients of a spline to those of its derivative
         inner, degree = knots[k : len(knots) - k], DEGREE - k
@@ -332,7 +315,6 @@ def _in_P(q: Array, n: Array, x: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return cross products (N, 3), five times faster than NumPy."""
     out = np.empty(a.shape)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.subtract(a[:, j] * b[:, k], a[:, k] * b[:, j], out=out[:, i])

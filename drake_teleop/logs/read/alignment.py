@@ -22,12 +22,12 @@ SMOOTHER_WINDOW = 1.8
 
 
 def spacing(t: Array) -> float:
-    """Return the mean step of the times `t` (N,)."""
+    """Return the mean step of the times `t` (N,) [s]."""
     return float(t[-1] - t[0]) / (len(t) - 1)
 
 
 def uniform_times(t: Array) -> Array:
-    """Return equidistant times over the span of `t` (N,) at its median rate, or `t` itself."""
+    """Return equidistant times over the span of `t` (N,), at its median rate."""
     even = np.linspace(t[0], t[-1], len(t))
     if np.abs(t - even).max() < 1e-3 * spacing(t):
         return t
@@ -36,7 +36,7 @@ def uniform_times(t: Array) -> Array:
 
 
 def resample(t_new: Array, t: Array, x: Array) -> Array:
-    """Interpolate samples x (N, ...) linearly at `t_new`; hold the end values."""
+    """Interpolate samples x (N, ...) at `t` linearly at `t_new`; hold the end values."""
     if np.array_equal(t_new, t):
         return x
     out = np.empty((len(t_new), *x.shape[1:]))
@@ -59,8 +59,7 @@ def _interpolate(t_new: Array, t: Array, x: Array) -> Array:
 def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
     """Filter samples x (N, ...) of spacing `dt` [s] without phase shift, Eq. (T10).
 
-    The ends are continued by point reflection. A cut-off of None or above the Nyquist rate changes
-    nothing. `scipy.signal.sosfiltfilt` has another gain near the Nyquist rate.
+    There is no filter for a cut-off of None or above the Nyquist rate.
     """
     if cutoff_hz is None or cutoff_hz >= 0.5 / dt:
         return x
@@ -85,11 +84,9 @@ def low_pass(x: Array, dt: float, cutoff_hz: float | None) -> Array:
 def smooth_derivatives(
     x: Array, dt: float, bandwidth_hz: float | None
 ) -> tuple[Array, Array, Array]:
-    """Return smoothed x, dx/dt and d^2x/dt^2 of samples (N, ...) by sliding polynomials of degree
-    5.
+    """Return smoothed x (N, ...), dx/dt and d^2x/dt^2 by sliding polynomials of degree 5.
 
-    This is the filter of Savitzky and Golay (1964). The window is 1.8 / `bandwidth_hz` [s], at
-    least 9 samples. `scipy.signal.savgol_filter` is inaccurate above 700 samples.
+    Filter of Savitzky and Golay (1964), window 1.8 / `bandwidth_hz` [s], at least 9 samples.
     """
     n = len(x)
     weights = smoother(n, dt, bandwidth_hz)
@@ -110,13 +107,13 @@ def smooth_derivatives(
 
 
 def noise_gain(dt: float, bandwidth_hz: float | None) -> Array:
-    """Return the gains (3,) of `smooth_derivatives` for white noise: [1], [1/s], [1/s^2]."""
+    """Return factors (3,) of `smooth_derivatives` on white noise: [1], [1/s], [1/s^2]."""
     weights = smoother(10**9, dt, bandwidth_hz)
     return np.linalg.norm(weights[:3], axis=1) * np.array([1.0, 1.0, 2.0])
 
 
 def smoother(n: int, dt: float, bandwidth_hz: float | None) -> Array:
-    """Return weights (6, w) that map the w <= n samples of a window to polynomial coefficients."""
+    """Return weights (6, w) that map w <= n samples to the coefficients of their polynomial."""
     window = 0.0 if bandwidth_hz is None else SMOOTHER_WINDOW / bandwidth_hz
     half = max(_MIN_WINDOW_SAMPLES // 2, min(round(window / (2 * dt)), (n - 1) // 2))
     powers = np.vander(np.arange(-half, half + 1) / half, _POLYNOMIAL_DEGREE + 1, increasing=True)
@@ -134,10 +131,7 @@ def _differentiate_polynomials(coefficients: list[Array], tau: Array, order: int
 
 
 def angular_motion(R_WS: Array, dt: float, bandwidth_hz: float | None) -> tuple[Array, Array]:
-    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3).
-
-    They are the skew parts of R^T dR/dt and R^T d^2R/dt^2.
-    """
+    """Return omega_WS_S [rad/s] and alpha_WS_S [rad/s^2] (N, 3) of equidistant R_WS (N, 3, 3)."""
     _, first, second = smooth_derivatives(R_WS, dt, bandwidth_hz)
     R_SW = np.swapaxes(R_WS, 1, 2)
     return _skew_part(R_SW @ first), _skew_part(R_SW @ second)
@@ -150,7 +144,7 @@ def _skew_part(A: Array) -> Array:
 
 
 def low_passed(log: Log, cutoff_hz: float | None) -> Log:
-    """Return the log with wrench and motion filtered by `low_pass`."""
+    """Return the log with wrench and motion low-passed (zero phase); unchanged for static poses."""
     if log.static:
         return log
     return replace(
@@ -163,9 +157,10 @@ def low_passed(log: Log, cutoff_hz: float | None) -> Log:
 
 
 def undelayed(log: Log, delay_s: float) -> Log:
-    """Return the log with its motion advanced by `delay_s` [s], the lag behind the wrench.
+    """Return the log with its motion advanced by `delay_s` [s]; remove samples without motion.
 
-    Samples without motion are removed; an error is raised if fewer than 8 remain.
+    Raises:
+        DrakeTeleopError: if fewer than 8 samples remain.
     """
     if log.static or delay_s == 0:
         return log
@@ -198,14 +193,14 @@ def undelayed(log: Log, delay_s: float) -> Log:
 
 
 def measured(log: Log, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True for samples that no gap affects, even after a low-pass."""
+    """Return (N,) booleans: True for samples that no gap affects, even after the low-pass."""
     if log.bridged is None:
         return np.ones(len(log), bool)
     return ~widened(log.bridged, 0 if cutoff_hz is None else math.ceil(2 / (cutoff_hz * log.dt)))
 
 
 def ends(log: Log, length_s: float, cutoff_hz: float | None) -> NDArray[np.bool_]:
-    """Return (N,) booleans: True within `length_s`, or a low-pass period, of either end."""
+    """Return (N,) booleans: True within `length_s` [s], or a low-pass period, of either end."""
     out = np.zeros(len(log), bool)
     if log.static:
         return out

@@ -1,4 +1,4 @@
-"""Estimates for the value `auto` in the frames of IMU and pose."""
+"""Estimates for `auto` in the frames of IMU and pose of a log description."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def describe_mounting(
 ) -> tuple[Description, tuple[str, ...]]:
     """Return the description with estimates for `auto` in the IMU's frame and position, and notes.
 
-    Raises an error if the data do not determine a value.
+    Raises:
+        DrakeTeleopError: if the data do not determine a value.
     """
     imu = description.imu
     assert imu is not None
@@ -102,7 +103,6 @@ def _rotation_notes(found: Mounting) -> list[str]:
 
 
 def _choose_lever_arm(mounting: Mounting | None, at_Io: Log, where: str) -> LeverArm:
-    """Return the lever arm from the pose, or else from the wrench."""
     lever = None
     if mounting is not None and mounting.fits:
         lever = mounting.lever
@@ -144,7 +144,8 @@ def describe_pose_frame(
 ) -> tuple[Description, tuple[str, ...]]:
     """Return the description with estimates for `auto` in the pose frame, and notes.
 
-    The estimates are from the wrench. Raises an error if the data do not determine a value.
+    Raises:
+        DrakeTeleopError: if the data do not determine a value.
     """
     from drake_teleop.logs.pose_motion.estimate import estimate_from_poses
 

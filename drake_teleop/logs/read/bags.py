@@ -1,8 +1,8 @@
 """ROS bags and MCAP files: each topic becomes a table whose columns are message fields.
 
 Columns are numbers and arrays (up to 64) by path (`wrench.force.x`, `data.0`), unique short names
-(`force.x`), `received`, `header.stamp` [s], and `stamp`, the latter if present. Groups with
-covariance -1 are absent, as in ROS.
+(`force.x`), `received` [s], `header.stamp` [s] if set, and `stamp`, the latter of these two. Groups
+with covariance -1 are absent, as in ROS.
 """
 
 from __future__ import annotations
@@ -66,14 +66,7 @@ _STREAM_TYPES = {
 
 @dataclass(frozen=True)
 class Topic:
-    """Topic of a bag.
-
-    Attributes:
-        name: name, such as "/ft/wrench".
-        type: message type, such as "geometry_msgs/msg/WrenchStamped".
-        messages: number of messages.
-        rate_hz: mean rate; 0 for an empty bag.
-    """
+    """Topic of a bag: name, message type, number and mean rate [Hz] of messages."""
 
     name: str
     type: str
@@ -82,12 +75,16 @@ class Topic:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether the path is a folder with metadata.yaml or ends in one of `SUFFIXES`."""
+    """Return whether a path is a folder with metadata.yaml, or a .mcap, .db3 or .bag file."""
     return os.path.isfile(path / "metadata.yaml") or path.suffix.lower() in SUFFIXES
 
 
 def topics_of(path: Path) -> list[Topic]:
-    """Return the topics of a bag, sorted by name; raise an error if it cannot be read."""
+    """Return the topics of a bag, sorted by name.
+
+    Raises:
+        DrakeTeleopError: if it cannot be read.
+    """
     with _open_bag(path) as reader:
         seconds = reader.duration * 1e-9
         return [
@@ -99,9 +96,10 @@ def topics_of(path: Path) -> list[Topic]:
 
 
 def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
-    """Return the messages of a topic as a table.
+    """Return the messages of a topic as a table, for TF of one child frame.
 
-    Raises an error if bag, topic or child frame are missing, or the child frame is ambiguous.
+    Raises:
+        DrakeTeleopError: if bag, topic or child frame are missing, or the child frame is ambiguous.
     """
     with _open_bag(path) as reader:
         connections = [entry for entry in reader.connections if entry.topic == topic]
@@ -132,9 +130,10 @@ def read_topic(path: Path, topic: str, child_frame: str | None = None) -> Table:
 
 
 def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
-    """Return the table of a stream: its file, or its topic of a bag.
+    """Return the table of a stream of a description: its file, or its topic of a bag.
 
-    Raises an error for a bag without a topic.
+    Raises:
+        DrakeTeleopError: for an unreadable file, or a bag without a topic.
     """
     if not isinstance(stream, Static) and stream.topic is not None:
         return read_topic(stream.file, stream.topic, stream.child_frame)
@@ -214,7 +213,6 @@ def _open_bag(path: Path) -> Iterator[AnyReader]:
 
 
 def _check_unpacked_size(path: Path) -> None:
-    """Reject an MCAP file whose chunks declare an implausible uncompressed size."""
     total, limit = 0, path.stat().st_size * _MAX_UNPACK_RATIO + _MAX_UNPACKED_BYTES
     with path.open("rb") as file:
         file.seek(8)
@@ -228,7 +226,6 @@ def _check_unpacked_size(path: Path) -> None:
 
 @contextmanager
 def _limit_memory() -> Iterator[None]:
-    """Raise MemoryError above `_MAX_MEMORY_BYTES` of additional memory (Linux only)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -312,7 +309,6 @@ def _numeric_fields(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _remove_absent_groups(columns: dict[str, NDArray]) -> tuple[str, ...]:
-    """Remove column groups whose covariance begins with -1; return their names."""
     absent = tuple(
         name.removesuffix("_covariance")
         for name, values in columns.items()

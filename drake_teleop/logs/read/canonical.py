@@ -1,4 +1,4 @@
-"""Canonical log: wrench and motion of the sensor frame S at common instants."""
+"""Canonical log: wrench and motion of the sensor frame S at common instants, with fixed columns."""
 
 from __future__ import annotations
 
@@ -53,22 +53,21 @@ class Log:
 
     Attributes:
         t: (N,) uniform time [s]; row numbers for static poses.
-        wrench: (N, 6) [f; tau] that the sensor exerts on the load, about So, Eq. (1) [N, N m].
+        wrench: (N, 6) [f; tau] that the sensor exerts on the load, about So [N, N m].
         specific_force: (N, 3) s = a - g of So, in S [m/s^2].
         angular_velocity: (N, 3) omega_WS_S [rad/s].
         angular_acceleration: (N, 3) alpha_WS_S [rad/s^2].
-        gravity: (N, 3) gravity in S [m/s^2], or None.
+        gravity: (N, 3) gravity in S [m/s^2].
         static: True if the samples are separate poses at rest.
-        bridged: (N,) True for samples interpolated over gaps, or None.
+        bridged: (N,) True for samples interpolated over gaps.
         notes: assumptions of the reader.
-        source: file name for messages.
         posed: recorded poses, if they have positions.
-        gain_std: stated standard deviation of the sensor gains.
-        R_WS: (N, 3, 3) orientation of S, or None.
-        gravity_W: (3,) gravity in the world [m/s^2], or None.
-        one_sided_s: length of each end with one-sided derivatives [s].
+        gain_std: standard deviation of the sensor gains (relative).
+        R_WS: (N, 3, 3) orientation of S in the world W.
+        gravity_W: (3,) gravity in W [m/s^2].
+        one_sided_s: length of each end whose derivatives are one-sided [s].
         described: the description, with estimates for `auto`.
-        free: causes left to the data: "gravity" and "weight".
+        free: "gravity" and "weight" if these are estimated from the data.
         resolution: step of force and torque of static poses [N, N m].
 
     Raises:
@@ -117,7 +116,7 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Sample spacing [s]; steps across removed gaps do not count."""
+        """Sample spacing [s], without steps across removed gaps."""
         steps = np.diff(self.t)
         return float(steps[steps < 1.5 * np.median(steps)].mean())
 
@@ -127,7 +126,7 @@ class Log:
         return replace(self, t=self.t - start, posed=posed)
 
     def only(self, rows: slice | NDArray[np.bool_]) -> Log:
-        """Return the log with the selected rows."""
+        """Return the selected rows of the log."""
         if not isinstance(rows, slice) and rows.all():
             return self
         arrays = {name: getattr(self, name) for name in _ROW_SHAPES}
@@ -136,12 +135,16 @@ class Log:
 
     @property
     def motion(self) -> tuple[Array, Array, Array]:
-        """Specific force, angular velocity and angular acceleration."""
+        """Specific force, angular velocity and angular acceleration, (N, 3) each [SI]."""
         return self.specific_force, self.angular_velocity, self.angular_acceleration
 
 
 def write_log(log: Log, path: str | Path) -> None:
-    """Write a log as a canonical table; raise an error unless it is .csv or .parquet."""
+    """Write a log as a canonical table.
+
+    Raises:
+        DrakeTeleopError: unless the path ends in .csv or .parquet.
+    """
     import polars as pl
 
     path = Path(path)
@@ -158,10 +161,13 @@ def write_log(log: Log, path: str | Path) -> None:
 
 
 def describe_canonical(path: Path, table: Table) -> Description:
-    """Return the description of a canonical table.
+    """Return the description of a canonical table (columns `t`, `f_x` ... of docs/logs.md).
 
-    Rows without `t` are static poses. So are rows slower than 5 Hz, if gravity turns by more than
-    10 deg in a fifth of the steps. Raises an error if wrench or motion is absent.
+    Rows are static poses if `t` is absent, or if they are slower than 5 Hz and gravity turns by
+    more than 10 deg in a fifth of the steps.
+
+    Raises:
+        DrakeTeleopError: if wrench or motion is absent.
     """
 
     def present(names: Sequence[str]) -> bool:

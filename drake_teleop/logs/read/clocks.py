@@ -42,10 +42,9 @@ _WINDOW = 50
 
 @dataclass(frozen=True)
 class Clock:
-    """Times of the rows of a stream.
+    """Times t (N,) of the rows of a stream, increasing, on the common clock [s].
 
     Attributes:
-        t: (N,) times, increasing, on the common clock [s].
         rows: (N,) row of the table for each time.
         total: number of stamps before removal.
         notes: corrections.
@@ -59,14 +58,17 @@ class Clock:
     episodes: int = 1
 
     def select(self, x: Array) -> Array:
-        """Return those rows of values x (total, ...) that have a time."""
+        """Return those rows of x (total, ...) that have a time."""
         return x if len(self.rows) == self.total else x[self.rows]
 
 
 def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: str) -> Clock:
-    """Return the times of a stream's rows; raise an error according to the table of this module.
+    """Return checked and corrected times of a stream's rows (see module `clocks`).
 
-    A repeated row equals the previous row in all `columns`. `where` names the field.
+    A row is repeated if it equals the previous row in all `columns`.
+
+    Raises:
+        DrakeTeleopError: for stamps that decrease or are too uneven, or an implausible rate.
     """
     if time.column is None:
         assert time.rate is not None
@@ -159,10 +161,7 @@ def _to_common_clock(t: Array, time: Time) -> Array:
 
 
 def spread(t: Array) -> Array:
-    """Return times for rows with shared stamps, by means over 50 distinct stamps.
-
-    Windows end at steps of more than three median steps. `t` (N,) must not decrease.
-    """
+    """Return evenly spaced times for rows that share time stamps `t` (N,) [s]."""
     distinct = np.unique(t)
     step = float(np.median(np.diff(distinct)))
     per_stamp = len(t) / len(distinct)
@@ -172,22 +171,18 @@ def spread(t: Array) -> Array:
 
 
 def gaps(t: Array, bandwidth_hz: float | None) -> Array:
-    """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s].
-
-    A gap is longer than four median steps and half a period of the low-pass.
-    """
+    """Return start and end (G, 2) of the gaps in increasing times `t` (N,) [s]."""
     steps = np.diff(t)
     at = np.flatnonzero(steps > shortest_gap(float(np.median(steps)), bandwidth_hz))
     return np.stack([t[at], t[at + 1]], axis=1)
 
 
 def shortest_gap(step: float, bandwidth_hz: float | None) -> float:
-    """Return the least length of a gap [s] for a median `step` [s]."""
+    """Return the least length of a gap [s]: four steps, and half a period of the bandwidth."""
     return max(MIN_GAP_STEPS * step, 0.0 if bandwidth_hz is None else 0.5 / bandwidth_hz)
 
 
 def _smooth_stamps(t: Array, half: int, dt: float) -> Array:
-    """Return the moving average of the stamps over 2 half + 1 rows; the ends are straight lines."""
     n = len(t)
     if t[0] == t[-1]:
         return t[0] + dt * (np.arange(n) - (n - 1) / 2)

@@ -1,7 +1,6 @@
-"""CSV files of recorders and spreadsheets: separator, decimal sign, header and encoding.
+"""CSV files, with detection of separator, decimal sign, header and encoding (UTF-8, UTF-16).
 
-With separators `;` and tab, or in quotes, a comma can be the decimal sign. Lines with `#` before
-the header are comments, except names directly before the numbers. UTF-8 and UTF-16 are accepted.
+Lines with `#` before the header are comments, except column names directly before the numbers.
 """
 
 from __future__ import annotations
@@ -29,7 +28,10 @@ _DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
 
 
 def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
-    """Return the table of a CSV file and its first data line; errors are those of polars."""
+    """Return the table of a CSV file, and the number of its first data line.
+
+    Errors are those of polars.
+    """
     import polars as pl
 
     with path.open("rb") as file:
@@ -67,7 +69,6 @@ def read_csv(path: Path, header: bool) -> tuple[pl.DataFrame, int]:
 
 
 def _normalize(path: Path, source: Path | bytes, head: bytes) -> bytes | None:
-    """Return the text with LF and decimal points, without an empty end; None if unchanged."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - _HEAD_BYTES))
         tail = file.read() if isinstance(source, Path) else source
@@ -88,7 +89,7 @@ def _content_length(text: bytes) -> int:
 
 
 def _parse(parse: Callable[..., pl.DataFrame]) -> pl.DataFrame:
-    """Parse with the types of the first rows if all are numeric, else of all rows (slow)."""
+    """Parse with types from the first rows if these are numeric, else from all rows (slow)."""
     import polars as pl
 
     with suppress(pl.exceptions.ComputeError):

@@ -23,9 +23,8 @@ _MIN_SAMPLES = 32
 def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) -> float | None:
     """Return the delay of the motion behind the wrench [s], or None if undetermined.
 
-    The delay minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c of the
-    wrench w, within +-0.25 s or a tenth of the record. Offsets o, and phi if not given, are fitted.
-    The cut-off is 30 Hz by default.
+    It minimizes sum_c log var(w_c - o_c - (V(t + delay) phi)_c) over the channels c of the wrench
+    w, within +-0.25 s or a tenth of the record. Offsets o, and phi (10,) if not given, are fitted.
     """
     cutoff = min(cutoff_hz or 30.0, 0.2 / log.dt)
     smooth = low_passed(log, cutoff)
@@ -49,9 +48,12 @@ def estimate_delay(log: Log, cutoff_hz: float | None, phi: Array | None = None) 
 def delay_of(
     log: Log, cutoff_hz: float | None, delay: str | float, phi: Array | None = None
 ) -> tuple[float, str]:
-    """Return the delay to remove [s] and its source; "auto" is estimated.
+    """Return the delay of the motion to remove [s], and its source; `delay` is in [s], or "auto".
 
-    Raises an error if `delay` is another text.
+    The source is "static", "given", "estimated" or "undetermined" (0).
+
+    Raises:
+        DrakeTeleopError: for another text.
     """
     if log.static:
         return 0.0, "static"

@@ -163,7 +163,7 @@ class _Stream(Strict):
 
     @property
     def source(self) -> Path:
-        """Path of the file, in a bag with the topic."""
+        """Path that identifies the table: the file, in a bag with the topic."""
         return self.file
 
     @property
@@ -174,8 +174,6 @@ class _Stream(Strict):
 
 
 class _Recorded(_Stream):
-    """Stream with a clock: a table, or a topic with default columns."""
-
     topic: str | None = Field(default=None, description="of a ROS bag or MCAP file")
     child_frame: str | None = Field(default=None, description="which transform of the topic")
     time: Time
@@ -243,7 +241,7 @@ class Imu(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether the frame or the position is `auto`."""
+        """Whether frame or position is `auto`."""
         return self.frame == "auto" or self.position == "auto"
 
 
@@ -279,12 +277,12 @@ class Pose(_Recorded):
 
     @property
     def automatic(self) -> bool:
-        """Whether position or rotation of the posed frame is `auto`."""
+        """Whether position or rotation is `auto`."""
         return self.position_in_sensor == "auto" or self.rotation_in_sensor == "auto"
 
     @property
     def R_SP(self) -> Array | None:
-        """Rotation (3, 3) from the posed frame to S; None if its axes are those of S."""
+        """Rotation (3, 3) from the axes of the posed frame P to those of S; None if equal."""
         for rotation in (self.rotation_in_sensor, self.frame):
             if isinstance(rotation, tuple):
                 return np.array(rotation)
@@ -368,11 +366,11 @@ class Description(Strict):
 
     @property
     def gravity_W(self) -> Array:
-        """Gravity (3,) in W [m/s^2]; along -z for `auto`."""
+        """Gravity (3,) in the world [m/s^2]; along -z for `auto`."""
         return np.array([0.0, 0.0, -STANDARD_GRAVITY] if self.gravity == "auto" else self.gravity)
 
     def posed(self, poses: Poses, imu: Inertial | None = None) -> Posed:
-        """Return the poses of S with gravity, the described pose frame and IMU data."""
+        """Return the poses of S together with gravity, described pose frame and IMU data."""
         assert self.pose is not None
         origin, rotation = self.pose.position_in_sensor, self.pose.R_SP
         rotation = np.eye(3) if rotation is None else rotation
@@ -384,7 +382,7 @@ class Description(Strict):
 
 
 def json_schema() -> str:
-    """Return the JSON schema of a description (docs/log-description.schema.json)."""
+    """Return the JSON schema of a log description."""
     schema: dict[str, Any] = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     schema |= Description.model_json_schema()
     # With a topic, only the file is required.
@@ -398,9 +396,10 @@ def json_schema() -> str:
 
 
 def load_description(path: str | Path) -> Description:
-    """Read a description from a YAML file, whose paths are relative to its folder.
+    """Read a log description; its paths are relative to its folder.
 
-    Raises an error that names file and field.
+    Raises:
+        DrakeTeleopError: naming file and field.
     """
     path = Path(path)
     if not os.path.exists(path):

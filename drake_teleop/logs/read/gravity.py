@@ -33,8 +33,7 @@ def weight_wrench(weight: Array, gravity: Array) -> Array:
 def restore_weight(log: Log, weight: Array, motion_log: Log) -> Log:
     """Return the log with the wrench of a removed weight [m, m c] (4,) in S [kg, kg m] added.
 
-    The robot's own pose has the wrench's clock. The orientation in `motion_log`, the same log with
-    motion, is therefore evaluated at the delay.
+    `motion_log` is the same log with motion, from which the delay is estimated and removed.
     """
     assert motion_log.gravity is not None
     at = np.clip(log.t + free_delay(log_instants(motion_log)), motion_log.t[0], motion_log.t[-1])
@@ -50,9 +49,10 @@ _MAX_DEVIATION_DEG = 2.0
 def describe_gravity(
     description: Description, source: str, read: Callable[[Description], Log]
 ) -> tuple[Description, tuple[str, ...]]:
-    """Return the description with an estimate of standard magnitude for `gravity: auto`, and notes.
+    """Return the description with an estimate for `gravity: auto`, and notes.
 
-    Raises an error if the direction is undetermined.
+    Raises:
+        DrakeTeleopError: if the direction is undetermined.
     """
     start = description.model_copy(update={"gravity": tuple(description.gravity_W.tolist())})
     log, deviation = read(start), np.inf

@@ -1,4 +1,4 @@
-"""Lag and drift of an IMU's clock behind the pose's clock, for any axes."""
+"""Lag and drift of an IMU's clock behind the pose's clock, for an IMU with any axes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Pairs = list[tuple[Array, Array]]
 
 
 def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
-    """Return pairs of signals (N, 3): of the pose at `t`, and of the IMU on its clock."""
+    """Return pairs of signals (N, 3): of the pose at times `t`, and of the IMU on its own clock."""
     pairs = [(resample(t, pose.t, pose.specific_force), imu.specific_force)]
     if gyroscope:
         pairs.append((resample(t, pose.t, pose.angular_velocity), imu.angular_velocity))
@@ -25,9 +25,9 @@ def signal_pairs(t: Array, imu: Log, pose: Log, gyroscope: bool) -> Pairs:
 
 
 def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -> float:
-    """Return the shift [s] at which affine maps of the IMU signals fit those of the pose best.
+    """Return the lag of the IMU's clock [s], within +-`reach`, with the best fit to the pose.
 
-    Effects that are linear in `arm` (N, k) are removed first.
+    Any affine map of the IMU's axes is permitted. Effects linear in `arm` (N, k) are removed.
     """
     U, singular, _ = np.linalg.svd(arm - arm.mean(axis=0), full_matrices=False)
     U = U[:, singular > 1e-3 * singular[0]]
@@ -57,10 +57,10 @@ def best_shift(t: Array, pairs: Pairs, t_imu: Array, reach: float, arm: Array) -
 def clock_drift(
     t: Array, pairs: Pairs, t_imu: Array, lag: float, independent: float
 ) -> tuple[float, float]:
-    """Return the lag at mid-record [s] and its drift [s/s], starting from a constant `lag` [s].
+    """Return the lag of the IMU's clock at mid-record [s], and its drift [s/s].
 
-    `independent` is the number of independent samples. A drift that is insignificant or below 10 ms
-    in total is returned as 0.
+    `lag` [s] is a constant start, `independent` the number of independent samples. A drift that is
+    insignificant or below 10 ms in total is 0.
     """
     tau = t - t.mean()
     found = np.array([lag, 0.0])

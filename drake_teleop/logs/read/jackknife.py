@@ -18,11 +18,10 @@ _MAX_EVALUATIONS = 15  # evaluations of the solver: valid records need six
 def solve(
     residual: Callable[[Array], Array], x: Array, linear: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the solution (n,) and standard deviations (n,); inf if undetermined.
+    """Return the solution x (n,) and its standard deviations (n,); inf if undetermined.
 
     Args:
-        residual: function of x (n,) that returns residuals (N, 3 k). Each three channels are
-            weighted by their residual.
+        residual: function of x that returns residuals (N, 3 k).
         x: start.
         linear: (N, 3 k, m) constant derivatives by the last m parameters.
     """

@@ -1,7 +1,4 @@
-"""Position of an accelerometer on the sensor, from the wrench of a rigid load, Eqs. (T20), (T21).
-
-The force determines m c - m p, the torque determines m c.
-"""
+"""Position of an accelerometer on the sensor, from a rigid load's wrench, Eqs. (T20), (T21)."""
 
 from __future__ import annotations
 
@@ -48,15 +45,14 @@ class LeverArm:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """Booleans (3,): True where a coordinate is determined."""
+        """Booleans (3,): True where the standard deviation is below 5 mm."""
         return self.deviations < MAX_LEVER_DEVIATION
 
 
 def lever_arm_from_wrench(log: Log) -> LeverArm | None:
-    """Return the lever arm, fitted to a wrench with offsets, load and delay, Eq. (T21).
+    """Return the position of the accelerometer, fitted with offsets, load and delay, Eq. (T21).
 
-    Returns None if more than 5 % of the variance remains (contact), or gaps leave less than a
-    tenth of the samples.
+    None for a poor fit (contact), or few samples outside of gaps.
     """
     cutoff = min(CUTOFF_HZ, 0.2 / log.dt)
     delay = estimate_delay(log, None) or 0.0
@@ -94,17 +90,16 @@ def common_times(start: float, stop: float, logs: Sequence[Log], cutoff: float) 
 
 
 def lever_matrix(omega: Array, alpha: Array) -> Array:
-    """Return the matrix K (N, 3, 3) of Eq. (T20)."""
+    """Return the matrix K (N, 3, 3): K p is the acceleration of a point p relative to the origin.
+
+    Eq. (T20), for omega and alpha (N, 3).
+    """
     W = cross_matrix(omega)
     return cross_matrix(alpha) + W @ W
 
 
 def observable_axes(K: Array, log: Log, cutoff: float) -> NDArray[np.bool_]:
-    """Return (3,) booleans: True for axes along which the motion is large enough.
-
-    Noise of the motion biases the lever arm to zero. Below the cut-off it is at most a seventh of
-    that in the next octave, because its power density grows at least with f^2.
-    """
+    """Return (3,) True for axes along which the motion far exceeds its noise."""
     alpha = log.angular_acceleration
     above = low_pass(alpha, log.dt, 2 * cutoff) - low_pass(alpha, log.dt, cutoff)
     noise = above.var(axis=0) / 7

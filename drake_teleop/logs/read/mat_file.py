@@ -36,7 +36,7 @@ _BROKEN = "it is damaged or incomplete"
 
 
 def read_mat(path: Path) -> dict[str, NDArray]:
-    """Return arrays by name; fields are named `structure.field`.
+    """Return the numeric arrays of a MATLAB file by name; fields are named `structure.field`.
 
     Raises:
         ValueError: if the file is invalid or has no arrays.
@@ -111,7 +111,6 @@ def _parse_numbers(part: tuple[int, memoryview], order: str) -> NDArray:
 
 
 def _add_array(name: str, array: NDArray, found: dict[str, NDArray]) -> None:
-    """Add an array to `found`: vectors as 1-D, matrix stacks with the stack axis first."""
     if array.size < 2 or not name:
         return
     if array.ndim == 2 and 1 in array.shape:

@@ -1,7 +1,6 @@
 """Rotation, position and clock of an IMU on the sensor, by comparison with the pose, Eq. (T20).
 
-Without positions only the rotation is found. Standard deviations exclude interpolation (about
-0.1 % of p) and scale errors.
+Without positions only rotation and clock are found.
 """
 
 from __future__ import annotations
@@ -38,20 +37,19 @@ _MAX_LAG_S = 1.0
 
 @dataclass(frozen=True)
 class Mounting:
-    """Mounting of the IMU relative to the pose.
+    """Mounting of an IMU relative to the pose.
 
     Attributes:
         R_SI: (3, 3) rotation from the described IMU axes to S.
         lag_s: constant lag of the IMU's clock behind the pose's clock [s].
-        lag_middle_s: lag at mid-record [s].
-        middle_s: mid-record on the pose's clock [s].
+        lag_middle_s, middle_s: lag at mid-record, and this time on the pose's clock [s].
         drift: growth of the lag [s/s]; 0 if insignificant.
-        unexplained: unexplained share of the specific force's variance.
-        unexplained_turning: this share of the angular velocity; None without a gyroscope.
-        mirrored: a reflection fits clearly better, so R_SI is invalid.
-        speed_ratio: angular speed of gyroscope over pose (rms), or None.
+        unexplained: unexplained share of the variance of the specific force.
+        unexplained_turning: that of the angular velocity; None without a gyroscope.
+        mirrored: True if a reflection fits clearly better, so that R_SI is invalid.
+        speed_ratio: angular speed of gyroscope over pose (RMS), or None.
         deviations_deg: (3,) standard deviations of R_SI about the axes of S [deg].
-        lever: lever arm; None without positions.
+        lever: position of the accelerometer; None without positions.
     """
 
     R_SI: Array
@@ -88,7 +86,7 @@ class Mounting:
 
     @property
     def fits(self) -> bool:
-        """Whether IMU and pose agree."""
+        """Whether IMU and pose agree, with small unexplained shares."""
         omega_agrees = (
             self.unexplained_turning is None or self.unexplained_turning < MAX_UNEXPLAINED
         )
@@ -100,18 +98,20 @@ class Mounting:
 
     @property
     def determined(self) -> bool:
-        """Whether the rotation about every axis is determined."""
+        """Whether the rotation is determined to 1 deg about every axis."""
         return self.fits and bool((self.deviations_deg < MAX_DEVIATION_DEG).all())
 
 
 def find_mounting(imu: Log, pose: Log, *, position: bool = False) -> Mounting | None:
-    """Estimate rotation, position and clock of an IMU; `pose` is the same log read without the IMU.
+    """Estimate rotation, position and clock of an IMU relative to the pose.
 
-    The clock is found within +-1 s by free linear maps. Then least squares refine rotation, biases,
-    lever arm and lag, starting from the rotation of Kabsch (1976), at 8 Hz.
+    By least squares at 8 Hz, starting from the rotation of Kabsch (1976); lags are within +-1 s.
+    None if the specific force changes by less than 0.5 m/s^2 (RMS), or gaps leave too few samples.
 
-    Returns None if the specific force changes by less than 0.5 m/s^2 (rms), or gaps leave too few
-    samples.
+    Args:
+        imu: the log.
+        pose: the same log, read without the IMU.
+        position: True to estimate the position of the accelerometer.
     """
     start, stop = max(imu.t[0], pose.t[0]), min(imu.t[-1], pose.t[-1])
     reach = min(_MAX_LAG_S, 0.2 * float(stop - start))
@@ -177,12 +177,6 @@ def _refine(
     R: Array,
     lag: float,
 ) -> tuple[Array, Array, Array]:
-    """Solve the least squares of `find_mounting` for k signals in `pairs`.
-
-    `t` (N,) are times on the pose's clock, `drift_lag` (N,) lags by drift, `t_imu` (M,) times on
-    the IMU's clock [s]; K (N, 3, 3) is the matrix of Eq. (T20). Returns (7 + 3 k,) rotation vector
-    [rad], lag [s], lever arm [m] and biases, their standard deviations, and (N, 3 k) residuals.
-    """
     known, moving = (np.stack(signals, axis=1) for signals in zip(*pairs, strict=True))
 
     def residual(x: Array) -> Array:
@@ -212,7 +206,6 @@ def _kabsch(x: Array, y: Array) -> tuple[Array, bool]:
 
 
 def _rotate(R: Array, vector: Array) -> Array:
-    """Return R rotated by a rotation vector (3,) in S [rad]."""
     return rotation_matrices(vector[None], "rotation_vector")[0] @ R
 
 

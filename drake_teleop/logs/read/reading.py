@@ -63,14 +63,14 @@ def read_log(
 ) -> Log:
     """Read a canonical table (.csv, .parquet, .npz) or a log description (.yaml, .yml).
 
-    Streams are interpolated on the wrench's clock at its median rate; faster streams are low-passed
-    first. Angular velocity comes from the gyroscope, else the orientation; angular acceleration
-    from the file, else by differentiation; specific force from the accelerometer, else the
+    Signals are interpolated on the wrench's clock at its median rate; faster streams are low-passed
+    first. Angular velocity is from the gyroscope, else from the orientation; angular acceleration
+    from the file, else differentiated; specific force from the accelerometer, else from the
     position, else it is -gravity.
 
     Args:
         path: the file.
-        bandwidth_hz: see `smooth_derivatives`.
+        bandwidth_hz: bandwidth of derivatives, see `smooth_derivatives`; None: the largest.
         differentiate: False leaves the motion zero where poses are its only source, for users of
             `Log.posed`.
 
@@ -103,13 +103,11 @@ def read_log(
 def read_description(
     description: Description, source: str, *, tables: dict[Path, Table] | None = None
 ) -> Log:
-    """Return the log of a description with absolute paths, read as by `read_log`."""
+    """Return the log of a description with absolute paths, as `read_log`."""
     return _Reader(description, source, 30.0, tables).log()
 
 
 class _Reader:
-    """Reader of the streams of one description."""
-
     def __init__(
         self,
         description: Description,
@@ -165,7 +163,6 @@ class _Reader:
         return restore_weight(log, np.array(weight), self._read_other(other))
 
     def _replace_auto(self, describe: _Describe, *, differentiate: bool = True) -> None:
-        """Replace `auto` in the description by the estimates of `describe`."""
         self._description, notes = describe(
             self._description, self._source, partial(self._read_other, differentiate=differentiate)
         )
@@ -197,7 +194,6 @@ class _Reader:
     def _vectors(
         self, name: str, field: str, quantity: Any, table: Table, rows: int, sign: float = 1.0
     ) -> Array:
-        """Return (rows, 3) values of a field in SI units, in the axes of the file."""
         where = f"{self._source}:{name}.{field}.columns"
         values = table.numbers(quantity.columns, 3, where, rows)
         values -= getattr(quantity, "bias", 0.0)
@@ -211,7 +207,6 @@ class _Reader:
         return values
 
     def _pose(self, stream: Pose, *, differentiate: bool) -> Stream:
-        """Return the pose stream with its differentiated motion, or, to save memory, without."""
         table = self._table(stream)
         clock = self._clock("pose", stream, table)
         t, raw = uniform_times(clock.t), None
@@ -447,7 +442,6 @@ class _Reader:
         )
 
     def _bridged(self, t: Array) -> NDArray[np.bool_] | None:
-        """Return (N,) booleans: True for samples that a gap affects; None without gaps."""
         if not self._gaps:
             return None
         flags = np.zeros(len(t), bool)

@@ -46,7 +46,7 @@ def rotation_error(R: Array) -> Array:
 
 
 def nearest_rotation(R: Array) -> Array:
-    """Return the rotations closest to near-rotations (..., 3, 3)."""
+    """Return the rotation closest to each near-rotation (..., 3, 3)."""
     # Newton-Schulz iteration for the polar factor; 4 steps reduce an error of 0.3 below 1e-15.
     for _ in range(4):
         R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)

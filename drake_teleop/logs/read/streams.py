@@ -59,7 +59,7 @@ class Stream:
 
 
 def on_clock(t: Array, stream: Stream, values: Array) -> Array:
-    """Return `values` of a stream at times `t`, low-passed if the stream is faster."""
+    """Return `values` of a stream at times `t` [s], low-passed if the stream is faster."""
     rate = 1 / spacing(t)
     faster = stream.dt * rate < 0.9
     return resample(t, stream.t, low_pass(values, stream.dt, 0.4 * rate if faster else None))
@@ -84,7 +84,10 @@ def move_to_So(
     alpha: Array | None,
     pose: Stream | None,
 ) -> Array:
-    """Return the specific force of So from that of Io, a point of the same rigid body."""
+    """Return the specific force (N, 3) of So from that of Io, a point of the same rigid body.
+
+    omega and alpha are those of the pose if None.
+    """
     if omega is None or alpha is None:
         assert pose is not None and pose.angular_velocity is not None
         assert pose.angular_acceleration is not None
@@ -94,7 +97,7 @@ def move_to_So(
 
 
 class Orientations:
-    """Orientations R_WS, or their inverses, of `rows` rows of a table."""
+    """Orientations of S in a table's columns, of any form."""
 
     def __init__(
         self,
@@ -118,7 +121,11 @@ class Orientations:
         return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
-        """Return `rotations` as quaternions (n, 4) [w, x, y, z], if possible without matrices."""
+        """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z].
+
+        Raises:
+            DrakeTeleopError: for a row that is not a rotation.
+        """
         if not self._orientation.form.startswith("quaternion"):
             return quaternions(self.rotations(rows))
         q = self._columns[rows]
@@ -143,7 +150,11 @@ class Orientations:
 
 
 def common_time(wrench_t: Array, streams: Sequence[Stream], source: str) -> Array:
-    """Return uniform times at the wrench's rate that all streams cover."""
+    """Return uniform times at the wrench's rate, within the time spans of all streams.
+
+    Raises:
+        DrakeTeleopError: if the streams have fewer than 16 samples in common.
+    """
     start = max([wrench_t[0], *(stream.t[0] for stream in streams)])
     stop = min([wrench_t[-1], *(stream.t[-1] for stream in streams)])
     spans = "; ".join(

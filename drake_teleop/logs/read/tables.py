@@ -36,8 +36,8 @@ class Table:
     """Columns of one file.
 
     Attributes:
-        path: file name for messages.
-        columns: arrays (N,) of any type by name; also (N, ...) with columns `name[0]`, row-major.
+        columns: arrays (N,) of any type by name; also (N, ...), with its elements as `name[0]`,
+            row-major.
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
         whole: table of all rows, if these are a part of them.
@@ -81,9 +81,11 @@ class Table:
     def numbers(
         self, names: Sequence[str | int], width: int, where: str, rows: int | None = None
     ) -> Array:
-        """Return the finite numbers (N, width) of the named columns, side by side.
+        """Return the numbers (N, width) of the named columns, side by side.
 
-        Raises an error if a column is absent, a cell is not finite, or `width` or `rows` differ.
+        Raises:
+            DrakeTeleopError: if a column is absent, a cell is not finite, or `width` or `rows`
+                differ.
         """
         columns = [self._column(str(name), where) for name in names]
         self._check_rows(names, columns, where, rows)
@@ -115,7 +117,11 @@ class Table:
         return np.hstack(columns)
 
     def raw(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N, k) of a column, with NaN and infinity; raise if it is absent."""
+        """Return the numbers (N, k) of a column, with NaN and infinity; `where` names it in errors.
+
+        Raises:
+            DrakeTeleopError: if the column is absent or a cell is not a number.
+        """
         name = str(name)
         if name not in self.columns:
             return self._column(name, where)
@@ -124,7 +130,11 @@ class Table:
         return numbers
 
     def single(self, name: str | int, where: str) -> Array:
-        """Return the numbers (N,) of a column as `raw`; raise an error if it is wider."""
+        """Return the numbers (N,) of a column, with NaN and infinity.
+
+        Raises:
+            DrakeTeleopError: as `raw`, or if the column has several numbers in a row.
+        """
         numbers = self.raw(name, where)
         if numbers.shape[1] != 1:
             raise DrakeTeleopError(
@@ -142,7 +152,7 @@ class Table:
         where: str,
         remedy: str = "check the column and its unit, or delete the row",
     ) -> None:
-        """Raise an error that names the first row with a finite value beyond `largest`."""
+        """Raise an error that names the first row with a finite value beyond +-`largest`."""
         if not values.size or (values.min() >= -largest and values.max() <= largest):
             return
         bad = ((np.abs(values) > largest) & np.isfinite(values)).any(axis=1)
@@ -197,7 +207,7 @@ class Table:
 
 
 def decimal_step(values: Array) -> float:
-    """Return the largest power of ten <= 1 that divides all values, or 0."""
+    """Return the largest power of ten <= 1 of which all values are multiples, or 0."""
     for decimals in range(_MAX_DECIMALS if values.any() else 0):
         error = np.abs(values - np.round(values, decimals))
         if (error <= 4.0 * np.finfo(float).eps * np.abs(values)).all():
