@@ -202,6 +202,17 @@ def test_episodes_follow_each_other_on_one_clock(tmp_path: Path) -> None:
     assert found.identification.mass == pytest.approx(PHI[0], abs=5e-3)
 
 
+@pytest.mark.filterwarnings("error")
+def test_rows_without_a_finite_stamp_do_not_shorten_the_checks(tmp_path: Path) -> None:
+    t = pl.col("t")
+    frame = table().gather_every(5)[:80].with_columns(
+        t=pl.when(t.is_between(0.5, 0.525)).then(np.inf).otherwise(t)
+    )
+    summary = inspect_command(described(tmp_path, frame), tmp_path / "out", quiet=True)
+    assert "unusable" not in [finding["name"] for finding in summary["findings"]]
+    assert summary["fit"]["unexplained"] < 0.05
+
+
 def test_episodes_in_several_files_are_refused(tmp_path: Path) -> None:
     path = described(tmp_path, pl.concat([table(), table(start=11.0)]))
     (tmp_path / "other.parquet").write_bytes((tmp_path / "table.parquet").read_bytes())

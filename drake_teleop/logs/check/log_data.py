@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.bags import read_stream
@@ -61,48 +62,47 @@ class LogData:
         """Return the time of a stream's first row on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        return float(self._stamps(stream)[0]) + float(stream.time.offset)
+        return float(self._stamps(stream)[0][0]) + float(stream.time.offset)
 
     def _stride(self, stream: Any) -> int:
         time: Time | None = getattr(stream, "time", None)
         if time is None:
             return 1
-        if time.rate is not None:
-            rate = time.rate
-        else:
-            t = self._stamps(stream)
-            if len(t) < 2:  # read_log raises the error
-                return 1
-            rate = 1 / max(1e-12, float(np.median(np.diff(t))))
+        t, _ = self._stamps(stream)
+        if len(t) < 2:  # read_log raises the error
+            return 1
+        rate = 1 / max(1e-12, float(np.median(np.diff(t))))
         # A short record keeps enough samples.
-        most = min(rate / _RATE_HZ, self._table(stream).rows / MINIMUM_SAMPLES)
+        most = min(rate / _RATE_HZ, len(t) / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
     def _table(self, stream: Any) -> Table:
         return self.tables[stream.source].filled(stream.columns)
 
-    def _stamps(self, stream: Any) -> Array:
+    def _stamps(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
+        """Return the finite time stamps of a stream [s], and their rows."""
+        if stream.time.column is None:
+            rows = np.arange(self._table(stream).rows)
+            return rows / stream.time.rate, rows
         t, _ = seconds(stream.time, self._table(stream), "time")
+        rows = np.flatnonzero(np.isfinite(t))
+        t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
-        return spread(t) if shared else t
+        return (spread(t) if shared else t), rows
 
     def _thin(self, name: str, stream: Any, thin: Table, k: int) -> None:
-        table = self._table(stream)
+        table, rows = self._table(stream), None
+        if getattr(stream, "time", None) is not None:
+            t, rows = self._stamps(stream)
+            thin.columns[f"{_TIME_COLUMN} {name}"] = _means(t[:, None], k)
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
                 x = table.raw(column, field)
+                x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
                 thin.columns[column] = taken if field == "orientation" else _means(x, k)
-        time: Time | None = getattr(stream, "time", None)
-        if time is not None and time.column is not None:
-            t = self._stamps(stream)
-        elif time is not None and time.rate is not None:
-            t = np.arange(table.rows) / time.rate
-        else:
-            return
-        thin.columns[f"{_TIME_COLUMN} {name}"] = _means(t[:, None], k)
 
 
 def _streams(description: Description) -> dict[str, Any]:
