@@ -271,5 +271,5 @@ def test_column_names_stay_inside_comments_of_a_draft(tmp_path) -> None:
     path = tmp_path / "x.parquet"
     names = ["t", "fx", "fy", "fz", "a\nimu: {file: /etc/passwd}\n#"]
     pl.DataFrame({name: np.arange(5.0) for name in names}).write_parquet(path)
-    draft = yaml_data(draft_description(read_table(path), tmp_path), "draft")
+    draft = yaml_data(draft_description(read_table(path), tmp_path).text(), "draft")
     assert set(draft) == {"wrench"}

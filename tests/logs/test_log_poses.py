@@ -129,7 +129,7 @@ def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
 
 
 LIMITS = {
-    "read.tables._MAX_CELLS_IN_MEMORY": 100,
+    "read.table_files._MAX_CELLS_IN_MEMORY": 100,
     "read.reading._CHUNK_ROWS": 300,
     "read.alignment._CHUNK_ROWS": 170,
     "pose_motion.splines._CHUNK_ROWS": 260,

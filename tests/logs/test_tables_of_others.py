@@ -205,8 +205,10 @@ def test_episodes_follow_each_other_on_one_clock(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error")
 def test_rows_without_a_finite_stamp_do_not_shorten_the_checks(tmp_path: Path) -> None:
     t = pl.col("t")
-    frame = table().gather_every(5)[:80].with_columns(
-        t=pl.when(t.is_between(0.5, 0.525)).then(np.inf).otherwise(t)
+    frame = (
+        table()
+        .gather_every(5)[:80]
+        .with_columns(t=pl.when(t.is_between(0.5, 0.525)).then(np.inf).otherwise(t))
     )
     summary = inspect_command(described(tmp_path, frame), tmp_path / "out", quiet=True)
     assert "unusable" not in [finding["name"] for finding in summary["findings"]]

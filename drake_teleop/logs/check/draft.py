@@ -74,6 +74,7 @@ _UNITS = {
     "time": ("s", "ms", "us", "ns"),
 }
 _POSE_VECTOR = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
+_POSE_WIDTHS = (7, 8)
 _QUATERNION_TOLERANCE = 0.01  # of the length
 _MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
 _MIN_COUNTS = 2000.0  # median of integers that are raw counts
@@ -177,7 +178,7 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> Dra
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
-    if table.rows <= _MAX_STATIC_ROWS and _FILL_IN in str(draft.get("wrench", {}).get("time")):
+    if _FILL_IN in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
         draft = _static(draft)
     times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
     used |= times - {None}
@@ -258,12 +259,12 @@ def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str,
 
 
 def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
-    """Return position and quaternion of a numbered vector with seven numbers of a pose."""
+    """Return position and quaternion of a numbered vector, which may end with a gripper's width."""
     groups: dict[str, list[str]] = {}
     for name, (words, _) in plain.items():
         if re.search(_POSE_VECTOR, words):
             groups.setdefault(_without_number(words), []).append(name)
-    for columns in (group for group in groups.values() if len(group) >= 7):
+    for columns in (group for group in groups.values() if len(group) in _POSE_WIDTHS):
         for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
             quaternion = columns[first : first + 4]
             length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
