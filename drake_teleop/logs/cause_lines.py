@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from drake_teleop.common.texts import yaml_data
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, UNITS, Description
+from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.logs.read.table_files import FORMATS
 
 Fields = dict[str, Any]

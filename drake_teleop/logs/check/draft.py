@@ -14,8 +14,12 @@ import numpy as np
 
 from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.read.description import UNITS
-from drake_teleop.logs.read.description_fields import FORCE_UNITS, POSITION_UNITS, TORQUE_UNITS
+from drake_teleop.logs.read.description_fields import (
+    FORCE_UNITS,
+    POSITION_UNITS,
+    TORQUE_UNITS,
+    UNITS,
+)
 from drake_teleop.logs.read.tables import Table
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"

@@ -14,8 +14,8 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import UNITS, Description
-from drake_teleop.logs.read.description_fields import POSITION_UNITS
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description_fields import POSITION_UNITS, UNITS
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, install_extra
 
 _MAX_VALUES, _MAX_ROW = 2**28, 64  # numbers of an array, and of one row: wider ones are images
 
@@ -70,5 +70,5 @@ def _library(name: str, path: Path) -> Any:
         raise DrakeTeleopError(
             f"reading {path.suffix} files needs {name}",
             where=str(path),
-            remedy="pip install 'drake_teleop[formats]'",
+            remedy=install_extra("formats"),
         ) from None

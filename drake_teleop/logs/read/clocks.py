@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.description import UNITS, Time
+from drake_teleop.logs.read.description import Time
+from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.logs.read.tables import Table
 
 EPISODE_GAP_S = 1.0
@@ -127,6 +128,22 @@ def seconds(time: Time, table: Table, where: str) -> tuple[Array, int]:
         t = t + columns[:, 1] * UNITS["ns"]
     t, episodes = join_episodes(t)
     return (t if table.kept is None else t[table.kept]), episodes
+
+
+def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
+    """Return a note about the episodes of a wrench's clock; raise an error for several files."""
+    if num_files > 1:
+        raise DrakeTeleopError(
+            f"the clock starts {clock.episodes} times, and the streams are in several files",
+            where=where,
+            remedy="write all streams into one table, or each episode into files of its own",
+        )
+    if not where.endswith("wrench.time"):
+        return []
+    return [
+        f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or more"
+        " apart; samples near their ends are not used"
+    ]
 
 
 def join_episodes(t: Array) -> tuple[Array, int]:

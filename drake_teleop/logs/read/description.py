@@ -24,6 +24,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
+    STANDARD_GRAVITY,
+    UNITS,
     Acceleration,
     AngularAcceleration,
     AngularVelocity,
@@ -43,49 +45,8 @@ from drake_teleop.logs.read.description_fields import (
 )
 from drake_teleop.logs.read.rotations import EULER_AXES
 
-STANDARD_GRAVITY = 9.80665
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
-
-UNITS = {
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "N": 1.0,
-    "mN": 1e-3,
-    "kN": 1e3,
-    "daN": 10.0,
-    "gf": 1e-3 * STANDARD_GRAVITY,
-    "kgf": STANDARD_GRAVITY,
-    "ozf": 0.27801385095378125,
-    "lbf": 4.4482216152605,
-    "N m": 1.0,
-    "mN m": 1e-3,
-    "kN m": 1e3,
-    "daN m": 10.0,
-    "N cm": 1e-2,
-    "N mm": 1e-3,
-    "gf cm": 1e-5 * STANDARD_GRAVITY,
-    "kgf cm": 1e-2 * STANDARD_GRAVITY,
-    "kgf m": STANDARD_GRAVITY,
-    "ozf in": 0.007061551814228644,
-    "lbf in": 0.1129848290276167,
-    "lbf ft": 1.3558179483314004,
-    "m/s^2": 1.0,
-    "rad": 1.0,
-    "deg": np.pi / 180,
-    "rad/s": 1.0,
-    "deg/s": np.pi / 180,
-    "rad/s^2": 1.0,
-    "deg/s^2": np.pi / 180,
-    "m": 1.0,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "in": 0.0254,
-    "mm/s^2": 1e-3,
-}
-"""SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
 class Time(Strict):

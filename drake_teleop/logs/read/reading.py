@@ -25,7 +25,7 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
+from drake_teleop.logs.read.clocks import Clock, episodes_note, gaps, read_clock
 from drake_teleop.logs.read.description import (
     NO_YAML,
     Description,
@@ -372,7 +372,9 @@ class _Reader:
             )
         found_gaps = gaps(t, self._bandwidth_hz)
         if clock.episodes > 1:
-            self._note_episodes(name, clock)
+            described = (self._description.wrench, self._description.imu, self._description.pose)
+            files = len({stream.source for stream in described if stream is not None})
+            self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")
         elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
@@ -383,21 +385,6 @@ class _Reader:
             half_window = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock
-
-    def _note_episodes(self, name: str, clock: Clock) -> None:
-        described = self._description
-        streams = (described.wrench, described.imu, described.pose)
-        if len({stream.source for stream in streams if stream}) > 1:
-            raise DrakeTeleopError(
-                f"the clock starts {clock.episodes} times, and the streams are in several files",
-                where=f"{self._source}:{name}.time",
-                remedy="write all streams into one table, or each episode into files of its own",
-            )
-        if name == "wrench":
-            self._notes.append(
-                f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or"
-                " more apart; samples near their ends are not used"
-            )
 
     def _half_window(self, dt: float) -> float:
         window = SMOOTHER_WINDOW / self._bandwidth_hz if self._bandwidth_hz else 0.0

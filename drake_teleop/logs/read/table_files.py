@@ -113,7 +113,10 @@ def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
 
 
 def _expand(
-    label: str, column: pl.Expr, dtype: pl.DataType, frame: pl.LazyFrame
+    label: str,
+    column: pl.Expr,
+    dtype: pl.DataType | pl.datatypes.DataTypeClass,
+    frame: pl.LazyFrame,
 ) -> dict[str, pl.Expr]:
     """Return the numeric parts of a column by name."""
     import polars as pl
