@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import h5py
 import numpy as np
 import polars
 import yaml
@@ -371,9 +372,20 @@ def encoded(suffix: str, columns: dict[str, np.ndarray]) -> bytes:
     if suffix == ".mat":
         savemat(stream, columns)
         return stream.getvalue()
+    if suffix == ".npy":
+        rows = np.empty(len(columns["t"]), [(name, x.dtype) for name, x in columns.items()])
+        for name, column in columns.items():
+            rows[name] = column
+        np.save(stream, rows)
+        return stream.getvalue()
+    if suffix == ".h5":
+        with h5py.File(stream, "w") as file:
+            for name, column in columns.items():
+                file[name] = column
+        return stream.getvalue()
     frame = polars.DataFrame({name: polars.Series(name, x) for name, x in columns.items()})
-    write = frame.write_csv if suffix == ".csv" else frame.write_parquet
-    write(stream)
+    write = {".csv": frame.write_csv, ".arrow": frame.write_ipc, ".jsonl": frame.write_ndjson}
+    write.get(suffix, frame.write_parquet)(stream)
     return stream.getvalue()
 
 

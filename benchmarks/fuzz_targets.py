@@ -623,6 +623,10 @@ TARGETS = (
         for suffix in ("csv", "npz", "parquet", "mat")
         for change in [mutations.table(f".{suffix}")]
     ),
+    *(
+        Target(f"log_{name}", f".{name}", 1, _tables(f".{name}"), mutations.damaged, read_log)
+        for name in ("arrow", "jsonl", "npy", "h5")
+    ),
     Target("identify", ".npz", 3, _tables(".npz"), mutations.table(".npz"), _processed),
     Target("inspect", ".npz", 1.5, _tables(".npz"), mutations.table(".npz"), _inspected),
     *(

@@ -14,7 +14,7 @@ import pytest
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.parquet_sizes import check_parquet, check_parquet_content
 from drake_teleop.lab.studies.store import Store
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.result import Signal, SimulationResult
 
 NEGATIVE = Path(__file__).parent / "fuzz_cases" / "result-negative_size.parquet"
@@ -109,7 +109,7 @@ _READ_EACH = """
 import sys
 from pathlib import Path
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 path = Path(sys.argv[1])
 good = path.read_bytes()
 for place in range(len(good)):

@@ -21,7 +21,7 @@ from drake_teleop.lab.studies.study import LoadStudy, study_command
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.read.description import load_description
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.film import Film
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import LoadScenario

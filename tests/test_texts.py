@@ -16,7 +16,7 @@ from drake_teleop.load.identification import Identification
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.check.draft import draft_description
 from drake_teleop.logs.read.description import load_description
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 from drake_teleop.station.master.data_sheets import Master
 from drake_teleop.station.scenario import LoadScenario, Scenario, replace
 from drake_teleop.station.scenario_reference import write_scenario
@@ -271,5 +271,5 @@ def test_column_names_stay_inside_comments_of_a_draft(tmp_path) -> None:
     path = tmp_path / "x.parquet"
     names = ["t", "fx", "fy", "fz", "a\nimu: {file: /etc/passwd}\n#"]
     pl.DataFrame({name: np.arange(5.0) for name in names}).write_parquet(path)
-    draft = yaml_data(draft_description(read_table(path), tmp_path), "draft")
+    draft = yaml_data(draft_description(read_table(path), tmp_path).text(), "draft")
     assert set(draft) == {"wrench"}

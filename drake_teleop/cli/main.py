@@ -223,6 +223,21 @@ def identify(log: Path, out: Path, **options: Any) -> None:
     "--eta", type=option.Number(0, 1), help="Share of a gripped object's wrench that is kept."
 )
 @click.option(
+    "--offsets",
+    type=click.Choice(["record", "load"]),
+    default="record",
+    show_default=True,
+    help="Sensor offsets: estimated from LOG, or those of the load file.",
+)
+@click.option(
+    "--untouched",
+    "untouched_s",
+    type=option.Number(0, 36000),
+    nargs=2,
+    metavar="START STOP",
+    help="Seconds of LOG without contact, which determine the offsets.  [default: all]",
+)
+@click.option(
     "--causal",
     type=click.Choice(["delayed", "predicted"]),
     help="Also eliminate causally: with the lag of the low-pass, or extrapolated over it.",
@@ -278,17 +293,19 @@ def detect(log: Path, out: Path, **options: Any) -> None:
 
 @cli.command()
 @click.argument("log", type=option.PATH)
+@click.argument("others", type=option.PATH, nargs=-1)
 @option.out("inspect")
 @option.quiet
-def inspect(log: Path, out: Path, quiet: bool) -> None:
+def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None:
     """List the contents and suspicious parts of a log.
 
     LOG is a canonical log, a log description (.yaml), or a table of any columns, for which a draft
-    description is written. Reports rates, gaps, noise, saturation and errors of convention.
+    description is written; OTHERS are further tables of the same recording. Reports rates, gaps,
+    noise, saturation and errors of convention.
     """
     from drake_teleop.logs.inspection import inspect_command
 
-    inspect_command(log, out, quiet=quiet)
+    inspect_command(log, out, others=others, quiet=quiet)
 
 
 @cli.command()

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from drake_teleop.common.texts import yaml_data
 from drake_teleop.logs.causes.cause import CHANNELS, Cause
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import NO_YAML, UNITS, Description
-from drake_teleop.logs.read.tables import FORMATS
+from drake_teleop.logs.read.description import NO_YAML, Description
+from drake_teleop.logs.read.description_fields import UNITS
+from drake_teleop.logs.read.table_files import FORMATS
 
 Fields = dict[str, Any]
 """Values of the correctable fields, by their names in a description."""
@@ -24,7 +26,9 @@ _MAX_MASS_KG = 1000.0
 _SIGN, _FRAME, _WEIGHT, _GRAVITY = "wrench.sign", "wrench.frame", "wrench.weight", "gravity"
 _FORCE, _TORQUE = "wrench.force.scale", "wrench.torque.scale"
 _FORCE_UNIT, _TORQUE_UNIT = "wrench.force.unit", "wrench.torque.unit"
-_FORCE_UNITS, _TORQUE_UNITS = ("N", "lbf"), ("N m", "N mm", "lbf in")
+# Not units such as daN, whose ratio to another unit is a power of ten, as that of raw counts.
+_FORCE_UNITS = ("N", "kgf", "lbf")
+_TORQUE_UNITS = ("N m", "N cm", "N mm", "kgf cm", "lbf in", "lbf ft")
 _SAME_RATIO = 1e-3
 _POSITIONS = ("pose.position_in_sensor", "imu.position")
 _ROTATIONS = ("pose.rotation_in_sensor", "pose.frame", "imu.frame")
@@ -41,10 +45,10 @@ def with_lines(causes: Sequence[Cause], log: Log, *, by_pose: bool) -> tuple[Cau
 
     `by_pose` is True if the acceleration is from poses, not from an IMU.
     """
-    texts = _correct_fields(causes, log, by_pose)[1]
+    _, texts, corrected = _correct_fields(causes, log, by_pose)
     return tuple(
-        replace(cause, message=f"{cause.message}; {text}") if text else cause
-        for cause, text in zip(causes, texts, strict=True)
+        replace(cause, message=f"{cause.message}; {text}", fields=fields) if text else cause
+        for cause, text, fields in zip(causes, texts, corrected, strict=True)
     )
 
 
@@ -63,7 +67,10 @@ def implausible_mass_message(mass: float, causes: Sequence[Cause], log: Log) -> 
     )
 
 
-def _correct_fields(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[Fields, list[str]]:
+def _correct_fields(
+    causes: Sequence[Cause], log: Log, by_pose: bool
+) -> tuple[Fields, list[str], list[Fields]]:
+    """Return all corrected fields, and the remedy and the corrected fields of each cause."""
     assert log.described is not None
     fields = _fields(log.described, by_pose)
     column = _columns(fields[_FRAME])
@@ -75,12 +82,13 @@ def _correct_fields(causes: Sequence[Cause], log: Log, by_pose: bool) -> tuple[F
         elif cause.name in _CORRECTIONS:
             _CORRECTIONS[cause.name](fields, cause.values)
         touched.append([k for k, x in before.items() if _yaml_value(k, fields[k]) != x])
-    texts = []
+    texts, corrected = [], []
     for cause, names in zip(causes, touched, strict=True):
+        corrected.append({name: yaml_data(_yaml_value(name, fields[name]), name) for name in names})
         lines = " and ".join(f"{name}: {_yaml_value(name, fields[name])}" for name in names)
         otherwise = _OTHER_REMEDIES.get(cause.name, "")
         texts.append(f"set {lines}{_no_yaml_note(log)}" if lines else otherwise)
-    return fields, texts
+    return fields, texts, corrected
 
 
 def _no_yaml_note(log: Log) -> str:

@@ -16,20 +16,23 @@ from drake_teleop.common.files import make_folder, output_folder, write_json, wr
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.check.conventions import check_conventions
 from drake_teleop.logs.check.corrections import Finding
-from drake_teleop.logs.check.draft import draft_description
+from drake_teleop.logs.check.draft import Draft, draft_description, join_drafts
 from drake_teleop.logs.check.load_fit import white_noise
 from drake_teleop.logs.processing import check_log
 from drake_teleop.logs.read.bags import draft_of_bag, is_bag, read_stream, topics_of
 from drake_teleop.logs.read.canonical import describe_canonical
-from drake_teleop.logs.read.clocks import shortest_gap
+from drake_teleop.logs.read.clocks import seconds, shortest_gap
 from drake_teleop.logs.read.description import Description, load_description
-from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import Table
 
 BANDWIDTH_HZ = 30.0
 """Bandwidth of interest, which determines the length of a gap [Hz]."""
 MIN_REPEATED_SHARE = 0.05
 """Smallest reported share of repeated rows, apart from blocks of `MIN_REPEATED_BLOCK` rows."""
 MIN_REPEATED_BLOCK = 5
+_MAX_CORRECTIONS = 5
+"""Largest number of corrections of a draft by its data."""
 _QUANTITIES = (
     "force",
     "torque",
@@ -42,10 +45,19 @@ _QUANTITIES = (
 )
 
 
-def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, Any]:
-    """Inspect a canonical log, a log description, any table or a bag; return the summary.
+def inspect_command(
+    log: Path, out: Path, *, others: Sequence[Path] = (), quiet: bool = False
+) -> dict[str, Any]:
+    """Inspect a canonical log, a log description, any table or a bag.
 
-    Writes summary.json, and draft.yaml for an unknown table or a bag, into the folder `out`.
+    Write summary.json into the folder `out`, and draft.yaml for unknown tables and bags: a
+    description of all of them, in which signs, axes and units are those that fit the data.
+
+    Args:
+        others: further tables or bags of the same recording.
+
+    Returns:
+        the summary.
 
     Raises:
         DrakeTeleopError: if the log cannot be read.
@@ -62,45 +74,54 @@ def inspect_command(log: Path, out: Path, *, quiet: bool = False) -> dict[str, A
         "draft": None,
     }
     make_folder(out)
-    description: Description | None = None
-    draft = ""
-    if is_bag(log):
-        topics = topics_of(log)
-        draft = draft_of_bag(log, topics, out)
-        summary["kind"] = "bag"
-        summary["topics"] = {
-            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
-            for topic in topics
-        }
-    elif log.suffix.lower() in (".yaml", ".yml"):
-        description = load_description(log)
-        tables = {}
+    if not others and log.suffix.lower() in (".yaml", ".yml"):
+        _inspect(load_description(log), str(log), {}, summary)
+    elif not others and not is_bag(log) and _is_canonical(table := read_table(log)):
+        summary["kind"] = "canonical"
+        _inspect(_describe_canonical(log, table), str(log), {log: table}, summary)
     else:
-        table = read_table(log)
-        try:
-            description = describe_canonical(log, table)
-            summary["kind"] = "canonical"
-        except DrakeTeleopError:
-            known = "f_x" in table.columns and "tau_x" in table.columns
-            if known:
-                # A canonical log with NaN or a missing column gets the specific message.
-                description = describe_canonical(log, _finite(table, list(table.columns)))
-                summary["kind"] = "canonical"
-        tables = {log: table}
-        if description is None:
-            header = not _are_numbers(list(table.columns))
-            table = table if header else read_table(log, header=False)
-            draft = draft_description(table, out, header=header)
-            summary["kind"] = "unknown"
-    if description is not None:
-        _inspect(description, str(log), tables, summary)
+        drafts = [_draft(path, out, summary) for path in (log, *others)]
+        with output_folder(out):
+            _write_draft(join_drafts(drafts), out / "draft.yaml", summary)
     with output_folder(out):
-        if description is None:
-            _write_draft(draft, out / "draft.yaml", summary)
         write_json(out / "summary.json", summary)
     if not quiet:
         _print(summary)
     return summary
+
+
+def _is_canonical(table: Table) -> bool:
+    return "f_x" in table.columns and "tau_x" in table.columns
+
+
+def _describe_canonical(log: Path, table: Table) -> Description:
+    try:
+        return describe_canonical(log, table)
+    except DrakeTeleopError:
+        # A canonical log with NaN or a missing column gets the specific message.
+        return describe_canonical(log, _finite(table, list(table.columns)))
+
+
+def _draft(path: Path, out: Path, summary: dict[str, Any]) -> Draft:
+    if is_bag(path):
+        topics = topics_of(path)
+        summary["kind"] = "bag"
+        summary["topics"] |= {
+            topic.name: {"type": topic.type, "messages": topic.messages, "rate_hz": topic.rate_hz}
+            for topic in topics
+        }
+        return Draft(*draft_of_bag(path, topics, out))
+    if path.suffix.lower() in (".yaml", ".yml"):
+        raise DrakeTeleopError(
+            "is a description, which contains all files of a recording",
+            where=str(path),
+            remedy="inspect it alone, or give only tables and bags",
+        )
+    summary["kind"] = "unknown"
+    table = read_table(path)
+    header = not _are_numbers(list(table.columns))
+    table = table if header else read_table(path, header=False)
+    return draft_description(table, out, header=header)
 
 
 def _are_numbers(names: Sequence[str]) -> bool:
@@ -111,40 +132,59 @@ def _are_numbers(names: Sequence[str]) -> bool:
     return False
 
 
-def _write_draft(draft: str, path: Path, summary: dict[str, Any]) -> None:
-    write_text(path, draft)
+def _write_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> None:
+    """Write a draft; correct it by the data, and add what is missing as comments and findings."""
+    write_text(path, draft.text())
     summary["draft"] = str(path)
-    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft else []
+    lacking = ["places that were not recognized: FILL IN"] if "FILL IN" in draft.text() else []
     try:
         load_description(path)
     except DrakeTeleopError as error:
         lacking.append(str(error).removeprefix(f"{path}: "))
+    if not lacking:
+        write_text(path, _fitted_draft(draft, path, summary).text())
+        return
+    text = draft.text()
     for message in lacking:
         summary["findings"].append({"name": "incomplete", "message": f"the draft has {message}"})
-        draft += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
-    write_text(path, draft)
+        text += f"# {one_line(f'INCOMPLETE, this has {message}')}\n"
+    write_text(path, text)
+
+
+def _fitted_draft(draft: Draft, path: Path, summary: dict[str, Any]) -> Draft:
+    """Return the draft with the corrections that its data require, and inspect it.
+
+    Each round applies the first finding that names the right values of fields.
+    """
+    tables: dict[Path, Table] = {}
+    for _ in range(_MAX_CORRECTIONS):
+        found = _inspect(load_description(path), str(path), dict(tables), summary)
+        finding = next((finding for finding in found if finding.fields), None)
+        if finding is None:
+            break
+        draft = draft.corrected(finding)
+        write_text(path, draft.text())
+    return draft
 
 
 def _inspect(
     description: Description, source: str, tables: dict[Path, Table], summary: dict[str, Any]
-) -> None:
+) -> list[Finding]:
+    """Write figures and findings to the summary, and return the findings."""
     findings: list[Finding] = []
-    needed: dict[Path, list[str]] = {}
+    bad: dict[Path, list[NDArray[np.intp]]] = {}
     for name in ("wrench", "imu", "pose", "static"):
         stream = getattr(description, name)
         if stream is None:
             continue
         if stream.source not in tables:
             tables[stream.source] = read_stream(stream)
-        figures, more, columns = _stream(name, stream, tables[stream.source], description, source)
+        table = tables[stream.source].filled(stream.columns)
+        figures, more, rows = _stream(name, stream, table, description, source)
         summary["streams"][name] = figures
         findings += more
-        needed.setdefault(stream.source, []).extend(columns)
-    clean = {path: _finite(tables[path], columns) for path, columns in needed.items()}
-    for name in ("wrench", "imu", "pose"):
-        stream = getattr(description, name)
-        if stream is not None and stream.time.column is not None:
-            clean[stream.source] = _increasing(clean[stream.source], str(stream.time.column))
+        bad.setdefault(stream.source, []).append(rows)
+    clean = {path: _without(tables[path], np.concatenate(rows)) for path, rows in bad.items()}
     try:
         found = check_log(Path(source), check_conventions(description, source, clean))
     except DrakeTeleopError as error:
@@ -163,11 +203,13 @@ def _inspect(
                 "unexplained": found.mounting.unexplained,
             }
     summary["findings"] = [{"name": f.name, "message": f.message} for f in findings]
+    return findings
 
 
 def _stream(
     name: str, stream: Any, table: Table, description: Description, source: str
-) -> tuple[dict[str, Any], list[Finding], list[str]]:
+) -> tuple[dict[str, Any], list[Finding], NDArray[np.intp]]:
+    """Return figures and findings of a stream, and the rows of its file that cannot be used."""
     columns = [
         str(column)
         for field in _QUANTITIES
@@ -180,10 +222,11 @@ def _stream(
     at = f"{name} ({table.path.name})"
     time = getattr(stream, "time", None)
     if time is not None:
-        findings += _clock(at, time, table, description, len(values), figures)
+        more, usable = _clock(at, time, table, len(values), figures)
+        findings += more
     figures["nan_rows"], figures["nan_longest"] = int((~good).sum()), _longest(~good)
     if not good.all():
-        first = int(np.argmin(good)) + table.first_row
+        first = table.line(int(np.argmin(good)))
         findings.append(
             Finding(
                 "nan",
@@ -218,8 +261,8 @@ def _stream(
                     f" {finite.max():.4g}) for {saturated} samples; cut them or move slower",
                 )
             )
-    used = columns if time is None or time.column is None else [*columns, str(time.column)]
-    return figures, findings, used
+    rows = np.flatnonzero(~(good & usable if time is not None else good))
+    return figures, findings, rows if table.kept is None else table.kept[rows]
 
 
 def _repeated(
@@ -248,13 +291,17 @@ def _repeated(
 
 
 def _clock(
-    at: str, time: Any, table: Table, description: Description, rows: int, figures: dict[str, Any]
-) -> list[Finding]:
+    at: str, time: Any, table: Table, rows: int, figures: dict[str, Any]
+) -> tuple[list[Finding], NDArray[np.bool_]]:
+    """Return findings of the clock, and (N,) booleans: True for rows with increasing stamps."""
     if time.column is None:
         figures |= {"rate_hz": time.rate, "duration_s": (rows - 1) / time.rate}
-        return []
-    t = table.single(time.column, at) * description.scale(time.unit)
-    t = t[np.isfinite(t)]
+        return [], np.ones(rows, bool)
+    stamps, figures["episodes"] = seconds(time, table, at)
+    highest = np.fmax.accumulate(stamps)
+    usable = np.isfinite(stamps)
+    usable[1:] &= stamps[1:] > highest[:-1]
+    t = stamps[np.isfinite(stamps)]
     steps = np.diff(t)
     forward = steps[steps > 0]
     if not len(forward):
@@ -262,7 +309,9 @@ def _clock(
             "the time stamps never increase", where=at, remedy="name another column, or time.rate"
         )
     median = float(np.median(forward))
-    gaps, back = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()), int((steps <= 0).sum())
+    between = figures["episodes"] - 1
+    gaps = int((steps > shortest_gap(median, BANDWIDTH_HZ)).sum()) - between
+    back = int((steps <= 0).sum())
     figures |= {
         "rate_hz": 1 / median,
         "duration_s": float(t[-1] - t[0]),
@@ -281,7 +330,7 @@ def _clock(
             )
         )
     if back:
-        row = int(np.argmax(steps <= 0)) + 1 + table.first_row
+        row = table.line(np.flatnonzero(np.isfinite(stamps))[int(np.argmax(steps <= 0)) + 1])
         findings.append(
             Finding(
                 "clock jump",
@@ -290,7 +339,7 @@ def _clock(
                 " stamps is refused: cut it there, or give time.rate",
             )
         )
-    return findings
+    return findings, usable
 
 
 def _labels(columns: Sequence[str], table: Table) -> list[str]:
@@ -325,14 +374,13 @@ def _finite(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=kept)
 
 
-def _increasing(table: Table, column: str) -> Table:
-    t = table.single(column, column)
-    later = np.ones(len(t), bool)
-    later[1:] = t[1:] > np.maximum.accumulate(t)[:-1]
-    if later.all():
+def _without(table: Table, rows: NDArray[np.intp]) -> Table:
+    """Return the table without some rows."""
+    if not len(rows):
         return table
-    kept = {n: x[later] if len(x) == len(t) else x for n, x in table.columns.items()}
-    return replace(table, columns=kept)
+    kept = np.setdiff1d(np.arange(table.rows), rows)
+    whole = {n: x[kept] if len(x) == table.rows else x for n, x in table.columns.items()}
+    return replace(table, columns=whole)
 
 
 def _print(summary: dict[str, Any]) -> None:

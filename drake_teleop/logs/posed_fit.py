@@ -20,7 +20,7 @@ from drake_teleop.logs.pose_motion.estimate import PoseEstimate
 from drake_teleop.logs.read.alignment import low_pass, low_passed, measured, widened
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import NO_YAML
-from drake_teleop.logs.read.tables import FORMATS
+from drake_teleop.logs.read.table_files import FORMATS
 from drake_teleop.logs.spline_motion import clock_note, motion_and_load, use_spline_motion
 
 ROBUST = ("robust", "consistent")

@@ -213,7 +213,7 @@ def _identified(
     log = replace(log, notes=(*log.notes, *([note] if note else [])))
     predicted = result.offsets + non_contact_wrench(*log.motion, result.phi)
     known_delay = None if source == "undetermined" else delay_s
-    findings = tuple(Finding(cause.name, cause.message) for cause in causes)
+    findings = tuple(Finding(cause.name, cause.message, cause.fields) for cause in causes)
     if errors:
         findings = errors
     elif not causes and not raw.free:
@@ -270,7 +270,9 @@ def check_log(path: Path, checks: Conventions | None = None) -> Conventions:
     findings, delay = checks.findings, checks.delay_s
     deviation, own_delay = identified.delay_deviation_s, identified.identification.delay_s
     if identified.causes and all(finding.name in EFFECTS for finding in findings):
-        causes = tuple(Finding(cause.name, cause.message) for cause in identified.causes)
+        causes = tuple(
+            Finding(cause.name, cause.message, cause.fields) for cause in identified.causes
+        )
         return replace(
             checks, findings=causes, delay_s=own_delay if np.isfinite(deviation) else delay
         )
@@ -298,6 +300,7 @@ def eliminate_log(
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     tare: bool = True,
+    untouched_s: tuple[float, float] | None = None,
     causal: str | None = None,
     causal_tare_s: float | None = None,
     free: str | Path | None = None,
@@ -316,7 +319,9 @@ def eliminate_log(
         eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
             is removed.
         cutoff_hz: zero-phase low-pass on all outputs; None for no filter.
-        tare: estimate the offsets from this record, not from `load`.
+        tare: estimate the offsets from this record (`robust_offsets`), not from `load`.
+        untouched_s: start and end of a time span without contact, which determines the offsets
+            [s]; None: the whole record does, in which contact counts as outliers.
         causal: "delayed" or "predicted": also return `EliminatedLog.causal`.
         causal_tare_s: contact-free start that determines the offsets of `causal` [s]; None: those
             of `load`.
@@ -345,7 +350,13 @@ def eliminate_log(
         delay=delay,
         tare=tare,
     )
-    found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s)
+    if untouched_s is not None and not tare:
+        raise DrakeTeleopError(
+            "determines the offsets, which are taken from the load file",
+            where="untouched",
+            remedy="leave one of the two out",
+        )
+    found = eliminated(path, causal=causal, causal_tare_s=causal_tare_s, untouched_s=untouched_s)
     free_motion = None if free is None else eliminated(free)
     if free_motion is not None and (found.log.static or free_motion.log.static):
         source = (free_motion if free_motion.log.static else found).log.source
@@ -382,6 +393,7 @@ def _eliminated(
     cutoff_hz: float | None,
     delay: str | float,
     tare: bool,
+    untouched_s: tuple[float, float] | None = None,
     causal: str | None = None,
     causal_tare_s: float | None = None,
 ) -> EliminatedLog:
@@ -411,10 +423,15 @@ def _eliminated(
     def smooth(wrench: Array) -> Array:
         return wrench if log.static else low_pass(wrench, log.dt, cutoff_hz)[known]
 
-    offsets, fraction = identification.offsets, 1.0
-    if tare:
-        residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
-        offsets, fraction = robust_offsets(smooth(residual))
+    span = slice(None) if untouched_s is None else _rows_between(log.only(known), *untouched_s)
+
+    def offsets_of(residual: Array) -> tuple[Array, float]:
+        if untouched_s is not None:
+            return residual[span].mean(axis=0), 1.0
+        return robust_offsets(residual) if tare else (identification.offsets, 1.0)
+
+    residual = contact_wrench(log.wrench, np.zeros(6), *log.motion, phi)
+    offsets, fraction = offsets_of(smooth(residual))
     motion = log.motion
     gravity_only = None
     if log.gravity is not None:
@@ -423,7 +440,7 @@ def _eliminated(
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = smooth(weightless)
-        gravity_only = weightless - (robust_offsets(weightless)[0] if tare else offsets)
+        gravity_only = weightless - offsets_of(weightless)[0]
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
     scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
     causal_wrench = None
@@ -465,6 +482,19 @@ def _eliminated(
         edge=edge,
         findings=_suspected_errors(Path(path), log.wrench - offsets, contact, identification),
     )
+
+
+def _rows_between(log: Log, start_s: float, stop_s: float) -> NDArray[np.bool_]:
+    rows = (log.t - log.t[0] >= start_s) & (log.t - log.t[0] <= stop_s)
+    if log.static or rows.sum() < _MIN_TARE_SAMPLES:
+        what = "poses at rest have no time" if log.static else f"has {rows.sum()} samples"
+        raise DrakeTeleopError(
+            f"the span from {start_s:g} to {stop_s:g} s {what}",
+            where="untouched",
+            remedy=f"give a span without contact of {_MIN_TARE_SAMPLES} samples or more, in"
+            f" seconds after the first sample; the record has {log.t[-1] - log.t[0]:.4g} s",
+        )
+    return rows
 
 
 def _start_samples(log: Log, length_s: float, wrench: Array) -> Array:

@@ -18,7 +18,7 @@ from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.load.trajectory import FourierTrajectory
 from drake_teleop.logs.figures import plain
-from drake_teleop.logs.read.description import STANDARD_GRAVITY, UNITS
+from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY, UNITS
 
 MASS, COM = 0.95, np.array([0.004, -0.011, 0.058])
 INERTIA_COM = np.array([[1.4e-3, 5e-5, 0.0], [5e-5, 1.9e-3, -8e-5], [0.0, -8e-5, 9e-4]])

@@ -16,7 +16,7 @@ from drake_teleop.logs.inspection import inspect_command
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 
 COLUMNS = (
     *("t", "f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z", "s_x", "s_y", "s_z"),

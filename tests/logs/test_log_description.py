@@ -46,7 +46,7 @@ BASE = yaml.safe_load(THREE_INSTRUMENTS)
     [
         (("wrench", "forse"), {}, ["wrench.forse", "unknown field", "did you mean 'force'"]),
         (("zzz",), {}, ["zzz: unknown field", "the fields are gravity, wrench"]),
-        (("wrench", "force", "unit"), "kgf", ["wrench.force.unit", "'N' or 'lbf'", "'kgf'"]),
+        (("wrench", "force", "unit"), "kilo", ["wrench.force.unit", "'N'", "'lbf'", "'kilo'"]),
         (("wrench", "time", "unit"), "hours", ["wrench.time.unit", "'hours'"]),
         (("wrench", "time", "rate"), 100.0, ["wrench.time", "either column or rate"]),
         (("wrench", "sign"), 2, ["wrench.sign", "1 or -1"]),
@@ -59,7 +59,7 @@ BASE = yaml.safe_load(THREE_INSTRUMENTS)
         (("wrench", "frame"), "auto", ["wrench.frame", "3x3 rotation matrix"]),
         (("imu", "specific_force"), None, ["imu", "give specific_force"]),
         (("pose", "frame"), "base", ["pose", "must be sensor"]),
-        (("pose", "orientation", "form"), "euler", ["pose.orientation.form", "'matrix'"]),
+        (("pose", "orientation", "form"), "angles", ["pose.orientation.form", "'matrix'"]),
         (("gravity",), "down", ["gravity"]),
         (("wrench",), None, ["no wrench"]),
         (("pose",), None, ["the angular velocity is missing", "imu.angular_velocity"]),

@@ -21,7 +21,7 @@ from drake_teleop.logs.processing import IdentifiedLog, identify_log
 from drake_teleop.logs.read.description import load_description
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.read.rotations import rotation_matrices
-from drake_teleop.logs.read.tables import read_table
+from drake_teleop.logs.read.table_files import read_table
 
 WRENCH, POSE = ("fx", "fy", "fz", "tx", "ty", "tz"), ("qw", "qx", "qy", "qz", "x", "y", "z")
 
@@ -129,7 +129,7 @@ def test_gain_errors_prevent_identification_unless_they_are_stated(folder):
 
 
 LIMITS = {
-    "read.tables._MAX_CELLS_IN_MEMORY": 100,
+    "read.table_files._MAX_CELLS_IN_MEMORY": 100,
     "read.reading._CHUNK_ROWS": 300,
     "read.alignment._CHUNK_ROWS": 170,
     "pose_motion.splines._CHUNK_ROWS": 260,

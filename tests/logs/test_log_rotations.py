@@ -62,10 +62,11 @@ def test_orientations_of_some_rows_in_any_form_and_inverse(form: str, inverse: b
         "quaternion_wxyz": turns.as_quat()[:, [3, 0, 1, 2]],
         "quaternion_xyzw": turns.as_quat(),
         "rotation_vector": np.degrees(turns.as_rotvec()),
+        "euler": turns.as_euler("ZYX", degrees=True),
     }[form]
     orientations = Orientations(
         SimpleNamespace(scale=lambda unit: np.radians(1.0)),
-        SimpleNamespace(columns=[], form=form, unit="deg", inverse=inverse),
+        SimpleNamespace(columns=[], form=form, axes="ZYX", unit="deg", inverse=inverse),
         SimpleNamespace(numbers=lambda *_: columns.copy()),
         5,
         "log.yaml:pose.orientation",

@@ -26,7 +26,7 @@ from drake_teleop.logs.processing import EliminatedLog, eliminate_log, identify_
 from drake_teleop.logs.read.alignment import low_pass, undelayed
 from drake_teleop.logs.read.canonical import ORIENTATION, POSITION
 from drake_teleop.logs.read.canonical import WRENCH as CANONICAL
-from drake_teleop.logs.read.description import UNITS
+from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.logs.read.reading import read_log
 from drake_teleop.logs.sample import CLOCK_S, sample_log_command
 from drake_teleop.logs.sample import NOISE as SAMPLE_NOISE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,9 @@ class Cause:
             "zero change", "load change", "drift", "gain", "pose frame", "sensor rotation",
             "contact", "cable" or "no load".
         message: cause, value with its interval, and remedy.
-        start_s, stop_s: time span in the record [s]; None: unlimited.
-        values: figures by name [SI].
+        start_s, stop_s: time span since the start of the record [s]; None: unlimited.
+        values: figures by name, in SI.
+        fields: fields of the description and their corrected values, as in YAML.
     """
 
     name: str
@@ -39,6 +41,7 @@ class Cause:
     start_s: float | None = None
     stop_s: float | None = None
     values: dict[str, object] = field(default_factory=dict)
+    fields: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,8 @@ def against_load(description: Description, data: LogData) -> tuple[list[Finding]
         return lag_finding(description, shift), shift
     others = {f.name: f.message for f, _ in reversed(equals[1:]) if f and f.name != finding.name}
     message = "; just as possible: ".join([finding.message, *others.values()])
-    return [Finding(finding.name, message), *lag_finding(description, delay)], delay
+    first = Finding(finding.name, message, finding.fields)
+    return [first, *lag_finding(description, delay)], delay
 
 
 def _is_delay_significant(log: Log, delay: float | None) -> bool:

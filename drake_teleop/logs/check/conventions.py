@@ -30,7 +30,8 @@ from drake_teleop.logs.check.pose_checks import position_finding
 from drake_teleop.logs.read.canonical import Log, describe_canonical
 from drake_teleop.logs.read.description import NO_YAML, Description, load_description
 from drake_teleop.logs.read.mounting import Mounting
-from drake_teleop.logs.read.tables import FORMATS, Table, read_table
+from drake_teleop.logs.read.table_files import FORMATS, read_table
+from drake_teleop.logs.read.tables import Table
 
 _REST_RMS = 0.3, 0.1
 """Rms of specific force [m/s^2] and angular velocity [rad/s] of a record at rest."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.logs.read.canonical import Log
 from drake_teleop.logs.read.description import Description
-from drake_teleop.logs.read.rotations import right_angled_rotations
+from drake_teleop.logs.read.rotations import EULER_AXES, right_angled_rotations
 
 EFFECTS = ("lag", "units", "payload")
 """Findings that may be the effect of a cause, such as drift."""
@@ -27,33 +27,41 @@ MIN_CLOCK_ERROR_S = 0.05
 
 @dataclass(frozen=True)
 class Finding:
-    """Suspicious property of a log: category such as "units", and message with a remedy."""
+    """Suspicious property of a log.
+
+    Args:
+        name: category for programs: "sign", "units" ...
+        message: observation and remedy.
+        fields: fields of the description and their corrected values, as in YAML.
+    """
 
     name: str
     message: str
+    fields: dict[str, Any] = field(default_factory=dict)
 
 
 def _gravity_field(description: Description) -> str | None:
     if description.imu is not None and description.imu.specific_force is not None:
         return "imu.specific_force"
-    for field in ("gravity", "specific_force"):
-        if getattr(description.static, field, None) is not None:
-            return f"static.{field}"
+    for name in ("gravity", "specific_force"):
+        if getattr(description.static, name, None) is not None:
+            return f"static.{name}"
     return None
 
 
 def correct_gravity_unit(description: Description, log: Log) -> tuple[list[Finding], Description]:
     """Return a finding for an accelerometer in a wrong unit, and the corrected description."""
-    field = _gravity_field(description)
-    unit = None if field is None else _right_unit(description, log, field)
-    if field is None or unit is None:
+    path = _gravity_field(description)
+    unit = None if path is None else _right_unit(description, log, path)
+    if path is None or unit is None:
         return [], description
     finding = Finding(
         "units",
         f"the accelerometer reads {_over_gravity(description, log):.3g} times gravity: it is not in"
-        f" {_field(description, field).unit}; set {field}.unit: {unit}",
+        f" {_field(description, path).unit}; set {path}.unit: {unit}",
+        {f"{path}.unit": unit},
     )
-    return [finding], edit_field(description, f"{field}.unit", unit)
+    return [finding], edit_field(description, f"{path}.unit", unit)
 
 
 def _over_gravity(description: Description, log: Log) -> float:
@@ -92,7 +100,7 @@ Edit = tuple[Finding, Description]
 
 def _edit(description: Description, name: str, text: str, path: str, value: Any) -> Edit:
     shown = str(value).lower() if isinstance(value, bool) else value
-    finding = Finding(name, f"{text}; set {path}: {shown}")
+    finding = Finding(name, f"{text}; set {path}: {shown}", {path: value})
     return finding, edit_field(description, path, value)
 
 
@@ -106,10 +114,11 @@ def pose_edits(description: Description) -> Iterator[Edit]:
                 "reversed gravity",
                 "the accelerometer reads g - a: gravity is reversed;"
                 f" set imu.sign: {-imu.sign} (or turn the vector `gravity` if z points down)",
+                {"imu.sign": -imu.sign},
             ),
             edit_field(description, "imu.sign", -imu.sign),
         )
-    field = "static.orientation" if description.static else "pose.orientation"
+    where = "static.orientation" if description.static else "pose.orientation"
     orientation = pose.orientation if pose else getattr(description.static, "orientation", None)
     if orientation is None:
         return
@@ -119,21 +128,27 @@ def pose_edits(description: Description) -> Iterator[Edit]:
             Finding(
                 "reversed gravity",
                 f"gravity is reversed; set gravity: {list(turned)}, a vector in the world",
+                {"gravity": list(turned)},
             ),
             edit_field(description, "gravity", turned),
         )
     text = "the orientation is that of the world in S, R_SW, not R_WS"
-    path = f"{field}.inverse"
+    path = f"{where}.inverse"
     yield _edit(description, "inverted orientation", text, path, not orientation.inverse)
     forms = {"quaternion_wxyz": "quaternion_xyzw", "quaternion_xyzw": "quaternion_wxyz"}
     if orientation.form in forms:
         text = f"the quaternions are not {orientation.form}"
         other = forms[orientation.form]
-        yield _edit(description, "quaternion order", text, f"{field}.form", other)
-    if orientation.form == "rotation_vector":
-        text = f"the rotation vectors are not in {orientation.unit}"
+        yield _edit(description, "quaternion order", text, f"{where}.form", other)
+    if orientation.form == "euler":
+        for axes in EULER_AXES:
+            if axes != orientation.axes:
+                text = f"the Euler angles do not turn about {orientation.axes}"
+                yield _edit(description, "Euler axes", text, f"{where}.axes", axes)
+    if orientation.form in ("rotation_vector", "euler"):
+        text = f"the angles are not in {orientation.unit}"
         unit = "deg" if orientation.unit == "rad" else "rad"
-        yield _edit(description, "degrees", text, f"{field}.unit", unit)
+        yield _edit(description, "degrees", text, f"{where}.unit", unit)
 
 
 def try_edit(function: Callable[[Description], Any], edited: Description) -> Any:
@@ -180,6 +195,10 @@ def _axis_edits(description: Description, stream: str, sensor: Any) -> Iterator[
                     "swapped axes",
                     f"axes of the wrench are exchanged; set {stream}.force.columns: {list(force)}"
                     f" and {stream}.torque.columns: {list(torque)}",
+                    {
+                        f"{stream}.force.columns": list(force),
+                        f"{stream}.torque.columns": list(torque),
+                    },
                 ),
                 edit_field(edited, f"{stream}.torque.columns", torque),
             )
@@ -187,6 +206,10 @@ def _axis_edits(description: Description, stream: str, sensor: Any) -> Iterator[
     for R in right_angled_rotations()[1:] if sensor.frame != "base" else ():
         frame = (R @ old).tolist()
         yield (
-            Finding("swapped axes", f"the wrench is in other axes; set {stream}.frame: {frame}"),
+            Finding(
+                "swapped axes",
+                f"the wrench is in other axes; set {stream}.frame: {frame}",
+                {f"{stream}.frame": frame},
+            ),
             edit_field(description, f"{stream}.frame", tuple(map(tuple, frame))),
         )

@@ -1,17 +1,25 @@
-"""Draft of a log description for an unknown table."""
+"""Draft of a log description for unknown tables, from the names and magnitudes of columns."""
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from drake_teleop.common.texts import yaml_text
-from drake_teleop.logs.read.description import UNITS
+from drake_teleop.logs.check.corrections import Finding
+from drake_teleop.logs.read.description_fields import (
+    FORCE_UNITS,
+    POSITION_UNITS,
+    TORQUE_UNITS,
+    UNITS,
+)
 from drake_teleop.logs.read.tables import Table
 
 _TIME = r"(^|_)(t|time|timestamp|stamp|time_?stamp|secs?)(_?(s|ms|us|ns))?$"
@@ -22,11 +30,18 @@ _VECTORS = {
     "specific_force": "a|s|acc|accel|(?<!angular_)acceleration",
     "angular_velocity": "w|g|omega|gyro|gyr|angular_velocity",
     "orientation": "q|quat|quaternion|orientation",
-    "position": "p|pos|position|translation",
+    "position": "p|pos|position|translation|tcp|ee|eef",
+}
+# Names of three angles, without their unit, and the axes about which they turn.
+_EULER = {
+    ("roll", "pitch", "yaw"): "xyz",
+    ("yaw", "pitch", "roll"): "ZYX",
+    ("a", "b", "c"): "ZYX",  # of KUKA
+    ("w", "p", "r"): "xyz",  # of Fanuc
 }
 # Names of numbered columns, and positions of the components of a vector.
 _NUMBERED: dict[str, dict[str, tuple[int, ...]]] = {
-    r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)(f|ft)$": {
+    r"tcp_force$|f_ext|wrench$|force_torque$|(^|_)f$|(^|_)ft(_[a-z]+)?$": {
         "force": (0, 1, 2),
         "torque": (3, 4, 5),
     },
@@ -53,16 +68,69 @@ _UNIT_NAMES = {
     "n.m": "N m",
 }
 _UNITS = {
-    "force": ("N", "lbf"),
-    "torque": ("N m", "N mm", "lbf in"),
+    "force": FORCE_UNITS,
+    "torque": TORQUE_UNITS,
     "specific_force": ("m/s^2", "mm/s^2", "g"),
     "angular_velocity": ("rad/s", "deg/s"),
     "rotation_vector": ("rad", "deg"),
-    "position": ("m", "mm"),
+    "position": POSITION_UNITS,
+    "euler": ("rad", "deg"),
     "time": ("s", "ms", "us", "ns"),
 }
+_POSE_VECTOR = r"(state|pose|tcp|eef?|cartesian)(_[a-z]+)*_\d+$"
+_POSE_WIDTHS = (7, 8)
+_QUATERNION_TOLERANCE = 0.01  # of the length
+_MAX_STATIC_ROWS = 200  # a table without time and with more rows has a constant rate
+_MIN_COUNTS = 2000.0  # median of integers that are raw counts
 _FILL_IN = "FILL IN"
+_TIME_FIELDS = ("column", "nanoseconds")
+_NANOSECONDS = ("nanosec", "nanosecs", "nanoseconds", "nsec", "nsecs", "ns")
+_COUNTS = (
+    "Force and torque are raw counts. scale is the value of one count in N and N m, from the"
+    " manual of the sensor: 1e-6 for 1000000 counts per N. The data contain only the ratio of both."
+)
 _WITHOUT_TIME = "No column of time was recognized; where there is none, time: {rate: 500}, in Hz."
+
+
+class Draft(NamedTuple):
+    """Streams of a log description, and comment lines about them."""
+
+    streams: dict[str, Any]
+    head: list[str]
+
+    def text(self) -> str:
+        """Return the description as YAML."""
+        return yaml_text(self.streams, head=self.head)
+
+    def corrected(self, finding: Finding) -> Draft:
+        """Return the draft with the fields of a finding, which follow from the data."""
+        streams = copy.deepcopy(self.streams)
+        for path, value in finding.fields.items():
+            *outer, last = path.split(".")
+            place = streams
+            for name in outer:
+                place = place.setdefault(name, {})
+            place[last] = value
+        return Draft(streams, [*self.head, f"Corrected by the data: {finding.message}."])
+
+
+def join_drafts(drafts: Sequence[Draft]) -> Draft:
+    """Return one draft; each stream is that of the first draft that contains it."""
+    streams: dict[str, Any] = {}
+    for draft in drafts:
+        whole = {name: stream for name, stream in draft.streams.items() if not _is_template(stream)}
+        streams = whole | streams
+    streams = streams or drafts[0].streams
+    lines = dict.fromkeys(line for draft in drafts for line in draft.head)
+    return Draft(
+        {n: streams[n] for n in ("wrench", "imu", "pose", "static") if n in streams}, list(lines)
+    )
+
+
+def _is_template(stream: dict[str, Any]) -> bool:
+    groups = [group for group in stream.values() if isinstance(group, dict)]
+    columns = [column for group in groups for column in group.get("columns", ())]
+    return bool(columns) and set(columns) == {_FILL_IN}
 
 
 class _Columns(NamedTuple):
@@ -73,13 +141,15 @@ class _Columns(NamedTuple):
 _NOTHING = _Columns([], "")
 
 
-def draft_description(table: Table, folder: Path, *, header: bool = True) -> str:
-    """Return a draft of a log description (YAML), guessed from names and magnitudes of columns.
+def draft_description(table: Table, folder: Path, *, header: bool = True) -> Draft:
+    """Return a log description guessed from names and magnitudes of a table's columns.
 
     `folder` is that of the draft, to which the path to the table is relative.
     """
     plain = {name: _normalized(name) for name in table.columns}
-    found = _vectors(plain) | _numbered(plain) | _arrays(table, plain)
+    found = _pose_vectors(table, plain) | _vectors(plain) | _euler_angles(plain)
+    found |= _numbered(plain) | _arrays(table, plain)
+    _resolve_translation(found, plain)
     file = {"file": os.path.relpath(table.path, folder)} | ({} if header else {"header": False})
 
     def stream(**groups: Any) -> dict[str, Any]:
@@ -112,8 +182,10 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     used = {
         name for group in groups if isinstance(group, dict) for name in group.get("columns", ())
     }
-    times = {stream["time"]["column"] for stream in draft.values()}
-    used |= times
+    if _FILL_IN in str(draft.get("wrench", {}).get("time")) and table.rows <= _MAX_STATIC_ROWS:
+        draft = _static(draft)
+    times = {stream.get("time", {}).get(name) for stream in draft.values() for name in _TIME_FIELDS}
+    used |= times - {None}
     arrays = _array_names(table)
     used |= {name.partition("[")[0] for name in used}
     parts = {
@@ -122,12 +194,22 @@ def draft_description(table: Table, folder: Path, *, header: bool = True) -> str
     unused = [name for name in table.columns if name not in used | parts]
     head = [
         "DRAFT, guessed from names and magnitudes by `drake-teleop inspect`: check every line,",
-        "above all wrench.sign, units and frames, and inspect it.",
+        "above all wrench.sign, units and frames.",
         f"Columns without a guess: {', '.join(unused) or 'none'}.",
         *([_WITHOUT_TIME] if _FILL_IN in times else []),
+        *([_COUNTS] if f"'scale': '{_FILL_IN}'" in str(draft) else []),
         *(text for what, text in _ROBOT_NOTES.items() for n in forces if re.search(what, n)),
     ]
-    return yaml_text(draft, head=head)
+    return Draft(draft, head)
+
+
+def _static(draft: dict[str, Any]) -> dict[str, Any]:
+    """Return the draft of a table of poses at rest, if it has wrench and orientation."""
+    pose, wrench = draft.get("pose"), draft.get("wrench")
+    if pose is None or wrench is None or _is_template(wrench):
+        return draft
+    kept = {name: value for name, value in wrench.items() if name != "time"}
+    return {"static": {**kept, "orientation": pose["orientation"]}}
 
 
 def _normalized(name: str) -> tuple[str, str]:
@@ -156,6 +238,44 @@ def _vectors(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
             columns = [group[axis] for axis in axes if axis in group]
             found[kind] = _Columns(columns, plain[columns[0]][1])
     return found
+
+
+def _euler_angles(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    """Return three angles that have the names of `_EULER` behind a common prefix."""
+    ends: dict[str, dict[str, str]] = {}
+    for name, (words, _) in plain.items():
+        prefix, _, end = words.rpartition("_")
+        ends.setdefault(prefix, {}).setdefault(end, name)
+    for names, axes in _EULER.items():
+        for group in ends.values():
+            if all(name in group for name in names):
+                columns = [group[name] for name in names]
+                return {axes: _Columns(columns, plain[columns[0]][1])}
+    return {}
+
+
+def _resolve_translation(found: dict[str, _Columns], plain: dict[str, tuple[str, str]]) -> None:
+    """Replace a torque tx, ty, tz without a force by a position, as in trajectories of TUM."""
+    torque = found.get("torque", _NOTHING).columns
+    bare = [plain[name][0].rpartition("_")[2] for name in torque] == ["tx", "ty", "tz"]
+    if bare and "force" not in found and "position" not in found:
+        found["position"] = found.pop("torque")
+
+
+def _pose_vectors(table: Table, plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
+    """Return position and quaternion of a numbered vector, which may end with a gripper's width."""
+    groups: dict[str, list[str]] = {}
+    for name, (words, _) in plain.items():
+        if re.search(_POSE_VECTOR, words):
+            groups.setdefault(_without_number(words), []).append(name)
+    for columns in (group for group in groups.values() if len(group) in _POSE_WIDTHS):
+        for first, kind in ((3, "quaternion_xyzw"), (0, "orientation")):
+            quaternion = columns[first : first + 4]
+            length = np.linalg.norm(table.all_raw(quaternion, ""), axis=1)
+            if np.nanmax(np.abs(length - 1.0)) < _QUATERNION_TOLERANCE:
+                position = columns[:3] if first else columns[4:7]
+                return {kind: _Columns(quaternion, ""), "position": _Columns(position, "")}
+    return {}
 
 
 def _numbered(plain: dict[str, tuple[str, str]]) -> dict[str, _Columns]:
@@ -204,6 +324,8 @@ def _width(table: Table, found: _Columns) -> int:
 
 def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
     group: dict[str, Any] = {"columns": list(found.columns)}
+    if kind in ("force", "torque") and _are_counts(table, found.columns):
+        group["scale"] = _FILL_IN
     if found.unit:
         unit = _UNIT_NAMES.get(re.sub(r"[ ^]", "", found.unit).lower(), "")
         group["unit"] = unit if unit in _UNITS[kind] else _FILL_IN
@@ -215,17 +337,33 @@ def _group(table: Table, kind: str, found: _Columns) -> dict[str, Any]:
         "specific_force": ("m/s^2", "g" if float(np.nanmedian(size)) < 3 else ""),
         "angular_velocity": ("rad/s", "deg/s" if float(np.nanmax(size)) > 15 else ""),
         "rotation_vector": ("rad", "deg" if float(np.nanmax(size)) > 15 else ""),
+        "euler": ("rad", "deg" if float(np.nanmax(size)) > 15 else ""),
         "position": ("m", "mm" if float(np.nanmax(size)) > 20 else ""),
     }[kind]
     group["unit"] = other or usual
     return group
 
 
+def _are_counts(table: Table, columns: list[str]) -> bool:
+    """Return whether columns have integers that are too large for a force in N."""
+    if _FILL_IN in columns:
+        return False
+    first = table.raw(columns[0], columns[0])
+    if not np.nanmedian(np.abs(first)) > _MIN_COUNTS:
+        return False
+    return bool((np.nan_to_num(first) % 1.0 == 0.0).all())
+
+
 def _pose(table: Table, found: dict[str, _Columns]) -> dict[str, Any]:
     if _width(table, found.get("orientation", _NOTHING)) == 4:
         orientation = {"columns": found["orientation"].columns, "form": "quaternion_wxyz"}
+    elif "quaternion_xyzw" in found:
+        orientation = {"columns": found["quaternion_xyzw"].columns, "form": "quaternion_xyzw"}
     elif "matrix" in found:
         orientation = {"columns": found["matrix"].columns, "form": "matrix"}
+    elif (euler := next((name for name in found if name in _EULER.values()), None)) is not None:
+        orientation = _group(table, "euler", found[euler])
+        orientation |= {"form": "euler", "axes": euler}
     elif "rotation_vector" in found:
         orientation = _group(table, "rotation_vector", found["rotation_vector"])
         orientation["form"] = "rotation_vector"
@@ -252,6 +390,11 @@ def _time(table: Table, plain: dict[str, tuple[str, str]], beside: str) -> dict[
             )
         )
     unit = _UNIT_NAMES.get(plain[named[0]][1].lower(), "")
+    start = plain[named[0]][0].removesuffix("s").removesuffix("sec")
+    parts = {words: name for name, (words, _) in plain.items() if words.startswith(start)}
+    for end in _NANOSECONDS if start != plain[named[0]][0] else ():
+        if start + end in parts:
+            return {"column": named[0], "nanoseconds": parts[start + end]}
     return {
         "column": named[0],
         "unit": unit if unit in _UNITS["time"] else _time_unit(table, named[0]),

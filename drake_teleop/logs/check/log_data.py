@@ -8,18 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drake_teleop.common.numeric import Array
 from drake_teleop.logs.read.bags import read_stream
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.clocks import spread
+from drake_teleop.logs.read.clocks import seconds, spread
 from drake_teleop.logs.read.description import Description, Time
 from drake_teleop.logs.read.reading import read_description
 from drake_teleop.logs.read.streams import MINIMUM_SAMPLES
 from drake_teleop.logs.read.tables import Table
 
 _RATE_HZ = 100.0
-_TIME_COLUMN = "time stamps of a stream without"
+_TIME_COLUMN = "thinned time stamps of"
 
 
 class LogData:
@@ -30,32 +31,30 @@ class LogData:
         self.tables = tables
         self._thinned: dict[Path, Table] = {}
         steps: dict[Path, list[int]] = {}
-        for stream in _streams(description):
+        streams = _streams(description)
+        for stream in streams.values():
             if stream.source not in tables:
                 tables[stream.source] = read_stream(stream)
-            steps.setdefault(stream.source, []).append(self._stride(description, stream))
-        for stream in _streams(description):
+            steps.setdefault(stream.source, []).append(self._stride(stream))
+        for name, stream in streams.items():
             thin = self._thinned.setdefault(
                 stream.source,
                 replace(tables[stream.source], columns=dict(tables[stream.source].columns)),
             )
-            self._thin(stream, thin, min(steps[stream.source]))
+            self._thin(name, stream, thin, min(steps[stream.source]))
 
     def read(self, description: Description) -> Log:
         """Return the whole log, as a description defines it."""
         return read_description(description, self._source, tables=self.tables)
 
     def thin(self, description: Description) -> Log:
-        """Return the log at about 100 Hz, as a description defines it."""
-        stamped = {
-            name: stream.model_copy(
-                update={
-                    "time": stream.time.model_copy(update={"column": _TIME_COLUMN, "rate": None})
-                }
-            )
-            for name in ("wrench", "imu", "pose")
-            if (stream := getattr(description, name)) and stream.time.column is None
-        }
+        """Return the log at about 100 Hz, read with a description."""
+        stamped = {}
+        for name, stream in _streams(description).items():
+            if (time := getattr(stream, "time", None)) is not None:
+                column = {"column": f"{_TIME_COLUMN} {name}", "unit": "s"}
+                time = time.model_copy(update={**column, "nanoseconds": None, "rate": None})
+                stamped[name] = stream.model_copy(update={"time": time})
         description = description.model_copy(update=stamped)
         return read_description(description, self._source, tables=self._thinned)
 
@@ -63,48 +62,52 @@ class LogData:
         """Return the time of a stream's first row on the common clock [s]."""
         if stream.time.column is None:
             return float(stream.time.offset)
-        t = self.tables[stream.source].single(stream.time.column, "time")
-        return float(t[0]) * description.scale(stream.time.unit) + stream.time.offset
+        return float(self._stamps(stream)[0][0]) + float(stream.time.offset)
 
-    def _stride(self, description: Description, stream: Any) -> int:
+    def _stride(self, stream: Any) -> int:
         time: Time | None = getattr(stream, "time", None)
         if time is None:
             return 1
-        if time.rate is not None:
-            rate = time.rate
-        else:
-            t = self._stamps(stream)
-            if len(t) < 2:  # read_log raises the error
-                return 1
-            rate = 1 / max(1e-12, float(np.median(np.diff(t))) * description.scale(time.unit))
+        t, _ = self._stamps(stream)
+        if len(t) < 2:  # read_log raises the error
+            return 1
+        rate = 1 / max(1e-12, float(np.median(np.diff(t))))
         # A short record keeps enough samples.
-        most = min(rate / _RATE_HZ, self.tables[stream.source].rows / MINIMUM_SAMPLES)
+        most = min(rate / _RATE_HZ, len(t) / MINIMUM_SAMPLES)
         return max(1, math.floor((most - 1) / 2) * 2 + 1)
 
-    def _stamps(self, stream: Any) -> Array:
-        t = self.tables[stream.source].single(str(stream.time.column), "time")
+    def _table(self, stream: Any) -> Table:
+        return self.tables[stream.source].filled(stream.columns)
+
+    def _stamps(self, stream: Any) -> tuple[Array, NDArray[np.intp]]:
+        """Return the finite time stamps of a stream [s], and their rows."""
+        if stream.time.column is None:
+            rows = np.arange(self._table(stream).rows)
+            return rows / stream.time.rate, rows
+        t, _ = seconds(stream.time, self._table(stream), "time")
+        rows = np.flatnonzero(np.isfinite(t))
+        t = t[rows]
         steps = np.diff(t)
         shared = bool((steps == 0.0).any() and (steps >= 0.0).all() and t[0] < t[-1])
-        return spread(t) if shared else t
+        return (spread(t) if shared else t), rows
 
-    def _thin(self, stream: Any, thin: Table, k: int) -> None:
-        table = self.tables[stream.source]
+    def _thin(self, name: str, stream: Any, thin: Table, k: int) -> None:
+        table, rows = self._table(stream), None
+        if getattr(stream, "time", None) is not None:
+            t, rows = self._stamps(stream)
+            thin.columns[f"{_TIME_COLUMN} {name}"] = _means(t[:, None], k)
         for field in type(stream).model_fields:
             quantity = getattr(stream, field)
             for column in map(str, getattr(quantity, "columns", ())):
                 x = table.raw(column, field)
+                x = x[rows] if rows is not None and len(rows) < len(x) == table.rows else x
                 taken = x[k // 2 :: k][: len(x) // k]
                 thin.columns[column] = taken if field == "orientation" else _means(x, k)
-        time: Time | None = getattr(stream, "time", None)
-        if time is not None and time.column is not None:
-            thin.columns[str(time.column)] = _means(self._stamps(stream)[:, None], k)
-        elif time is not None and time.rate is not None:
-            thin.columns[_TIME_COLUMN] = _means(np.arange(table.rows)[:, None] / time.rate, k)
 
 
-def _streams(description: Description) -> list[Any]:
-    streams = (getattr(description, name) for name in ("wrench", "imu", "pose", "static"))
-    return [stream for stream in streams if stream is not None]
+def _streams(description: Description) -> dict[str, Any]:
+    streams = {name: getattr(description, name) for name in ("wrench", "imu", "pose", "static")}
+    return {name: stream for name, stream in streams.items() if stream is not None}
 
 
 def _means(x: Array, k: int) -> Array:

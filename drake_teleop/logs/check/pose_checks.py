@@ -14,7 +14,8 @@ from drake_teleop.logs.check.log_data import LogData
 from drake_teleop.logs.pose_motion.poses import Posed
 from drake_teleop.logs.read.alignment import low_pass, resample
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import UNITS, Description
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description_fields import POSITION_UNITS, UNITS
 
 if TYPE_CHECKING:
     from drake_teleop.logs.pose_motion.estimate import PoseEstimate
@@ -23,7 +24,6 @@ _CUTOFF_HZ = 3.0
 _WORST_CONDITION = 1e8
 _SMALLEST_SHIFT, _LARGEST_DEVIATION = 0.02, 0.01  # m
 _SIGNIFICANT = 5.0  # standard deviations
-_POSITION_UNITS = {"mm": 1e-3, "m": 1e3}
 _UNIT_RANGE, _UNIT_ERROR = (0.7, 1.43), 0.15
 _UNKNOWN_UNIT = 50.0
 SHORTEST_S = 4.0
@@ -92,14 +92,15 @@ def _position_unit(now: str, kappa: float, deviation: float) -> Finding | None:
     if not abs(kappa) > _SIGNIFICANT * deviation:
         return None
     text = f"the acceleration of the positions is {1.0 / kappa:.3g} times the measured one:"
-    for unit, ratio in _POSITION_UNITS.items():
+    for unit in POSITION_UNITS:
+        ratio = UNITS[unit] / UNITS[now]
         if unit != now and _UNIT_RANGE[0] < kappa / ratio < _UNIT_RANGE[1]:
             return Finding("units", f"{text} they are not in {now}; set pose.position.unit: {unit}")
     if 1.0 / _UNKNOWN_UNIT < abs(kappa) < _UNKNOWN_UNIT:  # noise or another error
         return None
     return Finding(
         "units",
-        f"{text} they are neither in mm nor in m; multiply pose.position.scale (1 by default) by"
+        f"{text} their unit is not known; multiply pose.position.scale (1 by default) by"
         f" {kappa:.4g}",
     )
 

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError, install_extra
-from drake_teleop.common.texts import yaml_text
 from drake_teleop.logs.read.description import Imu, Pose, Static, Wrench
-from drake_teleop.logs.read.tables import Table, read_table
+from drake_teleop.logs.read.table_files import read_table
+from drake_teleop.logs.read.tables import Table
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -142,8 +142,8 @@ def read_stream(stream: Wrench | Imu | Pose | Static) -> Table:
     return read_table(stream.file, header=stream.header)
 
 
-def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
-    """Return a draft description (YAML) of a bag, with paths relative to `folder`."""
+def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> tuple[dict[str, Any], list]:
+    """Return the draft of a description, and its head, with paths relative to `folder`."""
     draft: dict[str, Any] = {}
     others: list[str] = []
     file = os.path.relpath(path, folder)
@@ -159,10 +159,10 @@ def draft_of_bag(path: Path, topics: Sequence[Topic], folder: Path) -> str:
         draft["wrench"] = {"file": file, "topic": "FILL IN"} | draft.get("wrench", {}) | {"sign": 1}
     head = [
         "DRAFT, guessed from the types of topics by `drake-teleop inspect`: check every line,",
-        "above all wrench.sign and the frames, and inspect it.",
+        "above all wrench.sign and the frames.",
         f"Other topics that would do: {', '.join(others) or 'none'}.",
     ]
-    return yaml_text(draft, head=head)
+    return draft, head
 
 
 def topic_missing(path: Path) -> DrakeTeleopError:

@@ -8,6 +8,7 @@ repeated, rows identical    repetitions are removed, with a note
 repeated, rows differ       rows are spaced evenly, see `spread`, with a note
 decreasing or too uneven    error that names the row
 implausible rate            error that proposes a unit
+starting again              episodes follow each other after gaps, see `join_episodes`
 gaps                        samples in them are not used, see `gaps`
 =========================== ======================================================================
 """
@@ -23,14 +24,20 @@ from numpy.typing import NDArray
 
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.logs.read.description import UNITS, Time
+from drake_teleop.logs.read.description import Time
+from drake_teleop.logs.read.description_fields import UNITS
 from drake_teleop.logs.read.tables import Table
 
+EPISODE_GAP_S = 1.0
+"""Least time between two episodes of a file [s]."""
 MIN_GAP_STEPS = 4.0
 """Least length of a gap in median steps."""
 MIN_RATE_HZ, MAX_RATE_HZ = 5.0, 1e5
 """Range of plausible rates [Hz]; other rates indicate a wrong unit."""
 _MAX_STEP_RATIO = 4.0
+# Of an episode: largest distance of its start from that of the first, largest of its first steps,
+# and least number of rows.
+_MAX_START_STEPS, _MAX_FIRST_STEPS, _MIN_EPISODE_ROWS = 2.0, 10.0, 16
 _WINDOW = 50
 
 
@@ -40,14 +47,16 @@ class Clock:
 
     Attributes:
         rows: (N,) row of the table for each time.
-        total: number of rows of the table.
-        notes: corrections of the time stamps.
+        total: number of stamps before removal.
+        notes: corrections.
+        episodes: number of times at which the clock starts.
     """
 
     t: Array
     rows: NDArray[np.intp]
     total: int
     notes: tuple[str, ...] = ()
+    episodes: int = 1
 
     def select(self, x: Array) -> Array:
         """Return those rows of x (total, ...) that have a time."""
@@ -66,17 +75,8 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         assert time.rate is not None
         rows = np.arange(table.rows)
         return Clock(_to_common_clock(rows / time.rate, time), rows, table.rows)
-    stamps = table.raw(time.column, f"{where}.column")
-    if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
-        table.numbers([time.column], 1, f"{where}.column")
-    if time.unit != "s" and table.columns[str(time.column)].dtype.kind in "mM":
-        raise DrakeTeleopError(
-            "the column holds dates or times of day, which have no unit",
-            where=f"{where}.unit",
-            remedy="leave it out",
-        )
-    t = stamps[:, 0] * UNITS[time.unit]
-    rows = np.flatnonzero(np.isfinite(t))
+    t, episodes = seconds(time, table, where)
+    total, rows = len(t), np.flatnonzero(np.isfinite(t))
     notes = []
     if len(rows) < len(t):
         notes.append(f"{len(t) - len(rows)} rows without a time stamp are removed")
@@ -101,7 +101,76 @@ def read_clock(time: Time, table: Table, columns: Sequence[str | int], where: st
         t = even
     _check_rate(t, time, where)
     _check_even(t, rows, table, where)
-    return Clock(_to_common_clock(t, time), rows, len(stamps), tuple(notes))
+    return Clock(_to_common_clock(t, time), rows, total, tuple(notes), episodes)
+
+
+def seconds(time: Time, table: Table, where: str) -> tuple[Array, int]:
+    """Return the time stamps (N,) of a table's rows [s], NaN if absent, and the number of episodes.
+
+    Episodes are joined in the whole table, so that all its streams keep one clock.
+    """
+    assert time.column is not None
+    whole = table.whole or table
+    names = [time.column] + ([] if time.nanoseconds is None else [time.nanoseconds])
+    for name in names:
+        stamps = whole.raw(name, f"{where}.column")
+        if stamps.shape[1] != 1 or not np.isfinite(stamps).any():
+            whole.numbers([name], 1, f"{where}.column")
+    if time.unit != "s" and whole.columns[str(time.column)].dtype.kind in "mM":
+        raise DrakeTeleopError(
+            "the column holds dates or times of day, which have no unit",
+            where=f"{where}.unit",
+            remedy="leave it out",
+        )
+    columns = whole.all_raw(names, f"{where}.column")
+    t = columns[:, 0] * UNITS[time.unit]
+    if time.nanoseconds is not None:
+        t = t + columns[:, 1] * UNITS["ns"]
+    t, episodes = join_episodes(t)
+    return (t if table.kept is None else t[table.kept]), episodes
+
+
+def episodes_note(clock: Clock, num_files: int, where: str) -> list[str]:
+    """Return a note about the episodes of a wrench's clock; raise an error for several files."""
+    if num_files > 1:
+        raise DrakeTeleopError(
+            f"the clock starts {clock.episodes} times, and the streams are in several files",
+            where=where,
+            remedy="write all streams into one table, or each episode into files of its own",
+        )
+    if not where.endswith("wrench.time"):
+        return []
+    return [
+        f"the clock starts {clock.episodes} times: the episodes follow each other, 1 s or more"
+        " apart; samples near their ends are not used"
+    ]
+
+
+def join_episodes(t: Array) -> tuple[Array, int]:
+    """Return increasing times (N,) for a clock that starts again, and the number of its starts.
+
+    A new start is a step back to within two median steps of the first stamp, from which the clock
+    runs on. Other steps back are not changed. NaN stays NaN.
+    """
+    finite = np.isfinite(t)
+    known = t[finite]
+    steps = np.diff(known)
+    back = np.flatnonzero(steps < 0.0) + 1
+    if not len(back) or not (steps > 0.0).any():
+        return t, 1
+    step = float(np.median(steps[steps > 0.0]))
+    again = np.abs(known[back] - known[0]) <= _MAX_START_STEPS * step
+    if not again.all() or np.diff([0, *back, len(known)]).min() < _MIN_EPISODE_ROWS:
+        return t, 1
+    after = steps[back[:, None] + np.arange(_MIN_EPISODE_ROWS - 1)]
+    if (after > _MAX_FIRST_STEPS * step).any():  # one wrong stamp
+        return t, 1
+    joined = known.copy()
+    for start in back:
+        joined[start:] += joined[start - 1] + max(EPISODE_GAP_S, 10.0 * step) - joined[start]
+    result = t.copy()
+    result[finite] = joined
+    return result, len(back) + 1
 
 
 def _to_common_clock(t: Array, time: Time) -> Array:
@@ -169,7 +238,7 @@ def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -
         first = int(np.argmax(steps < 0))
         raise DrakeTeleopError(
             f"{int((steps < 0).sum())} time stamps decrease, the first in row"
-            f" {rows[first + 1] + table.first_row} of {table.path.name}, by {-steps[first]:.3g} s",
+            f" {table.line(rows[first + 1])} of {table.path.name}, by {-steps[first]:.3g} s",
             where=where,
             remedy="cut the log there, sort the rows, or use another clock: time.column, time.rate",
         )
@@ -184,7 +253,7 @@ def _check_forward(t: Array, rows: NDArray[np.intp], table: Table, where: str) -
 def _check_increasing(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> None:
     steps = np.diff(t)
     if (steps <= 0).any():
-        row = rows[int(np.argmax(steps <= 0))] + table.first_row
+        row = table.line(rows[int(np.argmax(steps <= 0))])
         raise DrakeTeleopError(
             f"the time stamps do not increase around row {row} of {table.path.name}",
             where=where,
@@ -216,7 +285,7 @@ def _check_even(t: Array, rows: NDArray[np.intp], table: Table, where: str) -> N
     if len(t) < 3 or t[-1] - t[0] <= _MAX_STEP_RATIO * len(t) * np.median(steps):
         return
     longest = int(np.argmax(steps))
-    row = rows[longest + 1] + table.first_row
+    row = table.line(rows[longest + 1])
     raise DrakeTeleopError(
         f"the time stamps are too uneven: median step {np.median(steps):.3g} s, mean"
         f" {steps.mean():.3g} s, longest {steps[longest]:.3g} s to row {row} of {table.path.name}",

@@ -24,6 +24,8 @@ from drake_teleop.common.numeric import Array
 from drake_teleop.common.texts import read_yaml
 from drake_teleop.logs.pose_motion.poses import Inertial, Posed, Poses
 from drake_teleop.logs.read.description_fields import (
+    STANDARD_GRAVITY,
+    UNITS,
     Acceleration,
     AngularAcceleration,
     AngularVelocity,
@@ -41,33 +43,10 @@ from drake_teleop.logs.read.description_fields import (
     Torque,
     Weight,
 )
+from drake_teleop.logs.read.rotations import EULER_AXES
 
-STANDARD_GRAVITY = 9.80665
 NO_YAML = "in a description of this table, see docs/logs.md; the canonical form has no such line"
 _MAX_GRAVITY = 100.0
-
-UNITS = {
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "N": 1.0,
-    "lbf": 4.4482216152605,
-    "N m": 1.0,
-    "N mm": 1e-3,
-    "lbf in": 0.1129848290276167,
-    "m/s^2": 1.0,
-    "rad": 1.0,
-    "deg": np.pi / 180,
-    "rad/s": 1.0,
-    "deg/s": np.pi / 180,
-    "rad/s^2": 1.0,
-    "deg/s^2": np.pi / 180,
-    "m": 1.0,
-    "mm": 1e-3,
-    "mm/s^2": 1e-3,
-}
-"""SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
 class Time(Strict):
@@ -75,6 +54,9 @@ class Time(Strict):
 
     column: Column | None = None
     unit: Literal["s", "ms", "us", "ns"] = "s"
+    nanoseconds: Column | None = Field(
+        default=None, description="column of nanoseconds, added to the seconds of `column`"
+    )
     rate: Number | None = Field(
         default=None, ge=1e-3, le=1e6, description="Hz, if there is no column"
     )
@@ -90,6 +72,8 @@ class Time(Strict):
     def _check_alternatives(self) -> Time:
         if (self.column is None) == (self.rate is None):
             raise ValueError("give either column or rate")
+        if self.nanoseconds is not None and (self.column is None or self.unit != "s"):
+            raise ValueError("nanoseconds are added to a column of seconds: give column, unit s")
         return self
 
 
@@ -97,9 +81,27 @@ class Orientation(Strict):
     """Orientation R_WS of S, or of the stream's frame if `frame` is a rotation."""
 
     columns: tuple[Column, ...]
-    form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector"]
-    unit: Literal["rad", "deg"] = "rad"
+    form: Literal["matrix", "quaternion_wxyz", "quaternion_xyzw", "rotation_vector", "euler"]
+    unit: Literal["rad", "deg"] = Field(default="rad", description="of rotation_vector and euler")
+    axes: str | None = Field(
+        default=None,
+        description="axes of the Euler angles, in the order of the columns: small letters for"
+        " fixed axes, such as xyz (roll, pitch, yaw), capitals for moving ones, such as ZYX",
+    )
     inverse: bool = Field(default=False, description="the columns hold R_SW, the world in S")
+
+    @model_validator(mode="after")
+    def _check_axes(self) -> Orientation:
+        if (self.axes is not None) != (self.form == "euler"):
+            raise ValueError(
+                "form: euler needs axes, such as xyz (fixed) or ZYX (moving); other forms have none"
+            )
+        if self.axes is not None and self.axes not in EULER_AXES:
+            raise ValueError(
+                f"axes {self.axes!r} are not known: give three letters, xyz for fixed and XYZ for"
+                " moving axes, none twice in a row"
+            )
+        return self
 
 
 def _axis_columns(group: str, axes: str = "xyz") -> list[str]:
@@ -124,6 +126,12 @@ class _Stream(Strict):
     def source(self) -> Path:
         """Path that identifies the table: the file, in a bag with the topic."""
         return self.file
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of all quantities of the stream, without those of the time."""
+        quantities = (getattr(self, field) for field in type(self).model_fields)
+        return tuple(c for quantity in quantities for c in getattr(quantity, "columns", ()))
 
 
 class _Recorded(_Stream):

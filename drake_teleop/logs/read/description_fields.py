@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema, field_validator
@@ -12,6 +12,46 @@ from drake_teleop.logs.read.rotations import nearest_rotation, rotation_error
 ROTATION_TOLERANCE = 0.01
 """Largest deviation of entries of R^T R from the identity."""
 _MIN_SCALE = 1e-12
+STANDARD_GRAVITY = 9.80665
+UNITS = {
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+    "N": 1.0,
+    "mN": 1e-3,
+    "kN": 1e3,
+    "daN": 10.0,
+    "gf": 1e-3 * STANDARD_GRAVITY,
+    "kgf": STANDARD_GRAVITY,
+    "ozf": 0.27801385095378125,
+    "lbf": 4.4482216152605,
+    "N m": 1.0,
+    "mN m": 1e-3,
+    "kN m": 1e3,
+    "daN m": 10.0,
+    "N cm": 1e-2,
+    "N mm": 1e-3,
+    "gf cm": 1e-5 * STANDARD_GRAVITY,
+    "kgf cm": 1e-2 * STANDARD_GRAVITY,
+    "kgf m": STANDARD_GRAVITY,
+    "ozf in": 0.007061551814228644,
+    "lbf in": 0.1129848290276167,
+    "lbf ft": 1.3558179483314004,
+    "m/s^2": 1.0,
+    "rad": 1.0,
+    "deg": np.pi / 180,
+    "rad/s": 1.0,
+    "deg/s": np.pi / 180,
+    "rad/s^2": 1.0,
+    "deg/s^2": np.pi / 180,
+    "m": 1.0,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "in": 0.0254,
+    "mm/s^2": 1e-3,
+}
+"""SI value of each unit, except "g", the magnitude of the described gravity."""
 
 
 def _parse_frame(value: Any) -> Any:
@@ -137,13 +177,26 @@ class _Quantity(Strict):
 class Force(_Quantity):
     """Columns of a force and their unit."""
 
-    unit: Literal["N", "lbf"] = "N"
+    unit: Literal["N", "mN", "kN", "daN", "gf", "kgf", "ozf", "lbf"] = "N"
 
 
 class Torque(_Quantity):
     """Columns of a torque and their unit."""
 
-    unit: Literal["N m", "N mm", "lbf in"] = "N m"
+    unit: Literal[
+        "N m",
+        "mN m",
+        "kN m",
+        "daN m",
+        "N cm",
+        "N mm",
+        "gf cm",
+        "kgf cm",
+        "kgf m",
+        "ozf in",
+        "lbf in",
+        "lbf ft",
+    ] = "N m"
 
 
 class Acceleration(_Quantity):
@@ -170,4 +223,9 @@ class AngularAcceleration(_Quantity):
 class Position(_Quantity):
     """Columns of a position and their unit."""
 
-    unit: Literal["m", "mm"] = "m"
+    unit: Literal["m", "cm", "mm", "in"] = "m"
+
+
+FORCE_UNITS, TORQUE_UNITS, POSITION_UNITS = (
+    get_args(quantity.model_fields["unit"].annotation) for quantity in (Force, Torque, Position)
+)

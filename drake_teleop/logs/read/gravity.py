@@ -13,7 +13,8 @@ from drake_teleop.logs.causes.explain import explain
 from drake_teleop.logs.causes.instants import Instants, free_delay, instants
 from drake_teleop.logs.read.alignment import resample, undelayed
 from drake_teleop.logs.read.canonical import Log
-from drake_teleop.logs.read.description import STANDARD_GRAVITY, Description
+from drake_teleop.logs.read.description import Description
+from drake_teleop.logs.read.description_fields import STANDARD_GRAVITY
 
 
 def log_instants(log: Log) -> Instants:

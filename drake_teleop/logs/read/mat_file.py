@@ -1,6 +1,7 @@
-"""Numeric arrays of MATLAB files up to version 7 (MathWorks, MAT-File Format).
+"""Numeric arrays of MATLAB files, with fields of structures.
 
-They are parsed here, because invalid files can crash SciPy's reader.
+Version 7.3 is HDF5. Versions 5 to 7 are parsed here (MathWorks, MAT-File Format), because invalid
+files can crash SciPy's reader. Other types are ignored.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from drake_teleop.logs.read.array_files import read_hdf5
 
 _HEADER, _MATRIX, _COMPRESSED, _STRUCTURE, _COMPLEX, _MAX_DEPTH = 128, 14, 15, 2, 1 << 11, 20
 _NUMERIC_CLASSES = range(6, 16)  # numeric classes
@@ -41,11 +44,12 @@ def read_mat(path: Path) -> dict[str, NDArray]:
     from scipy.io import loadmat
     from scipy.io.matlab import matfile_version
 
-    version = matfile_version(path)[0]
+    version, found = matfile_version(path)[0], dict[str, NDArray]()
     if version == 2:
-        raise ValueError("version 7.3 is not supported; save it by save(..., '-v7')")
-    found: dict[str, NDArray] = {}
-    if version == 1:
+        for name, value in read_hdf5(path, transpose=True).items():
+            if not name.startswith("#refs#"):
+                _add_array(name, value, found)
+    elif version == 1:
         data = path.read_bytes()
         order = "<" if data[126:128] == b"IM" else ">"
         for kind, content in _iterate_elements(memoryview(data)[_HEADER:], order):

@@ -25,7 +25,7 @@ from drake_teleop.logs.read.alignment import (
 from drake_teleop.logs.read.auto_frames import describe_mounting, describe_pose_frame
 from drake_teleop.logs.read.bags import is_bag, read_stream, topic_missing
 from drake_teleop.logs.read.canonical import Log, describe_canonical
-from drake_teleop.logs.read.clocks import Clock, gaps, read_clock
+from drake_teleop.logs.read.clocks import Clock, episodes_note, gaps, read_clock
 from drake_teleop.logs.read.description import (
     NO_YAML,
     Description,
@@ -48,7 +48,8 @@ from drake_teleop.logs.read.streams import (
     on_clock,
     wrench_in_S,
 )
-from drake_teleop.logs.read.tables import FORMATS, Table, decimal_step, read_table
+from drake_teleop.logs.read.table_files import FORMATS, read_table
+from drake_teleop.logs.read.tables import Table, decimal_step
 
 MINIMUM_POSES = 3
 _MIN_BANDWIDTH_HZ = 1e-3
@@ -177,7 +178,8 @@ class _Reader:
     def _table(self, stream: Wrench | Imu | Pose | Static) -> Table:
         if stream.source not in self._tables:
             self._tables[stream.source] = read_stream(stream)
-        return self._tables[stream.source]
+        table = self._tables[stream.source]
+        return table if isinstance(stream, Static) else table.filled(stream.columns)
 
     def _forces(self, name: str, stream: Wrench | Static, table: Table, rows: int) -> Array:
         both = [
@@ -354,12 +356,8 @@ class _Reader:
         return force, torque
 
     def _clock(self, name: str, stream: Wrench | Imu | Pose, table: Table) -> Clock:
-        columns = [
-            column
-            for field in type(stream).model_fields
-            for column in getattr(getattr(stream, field), "columns", ())
-        ]
-        clock = read_clock(stream.time, table, columns, f"{self._source}:{name}.time")
+        """Return the times of a stream; record notes and gaps of the stream."""
+        clock = read_clock(stream.time, table, stream.columns, f"{self._source}:{name}.time")
         t = clock.t
         if len(t) < MINIMUM_SAMPLES or len(uniform_times(t)) < MINIMUM_SAMPLES:
             raise DrakeTeleopError(
@@ -373,12 +371,17 @@ class _Reader:
                 f"{name}: {stream.topic} has no header.stamp; the times of reception are used"
             )
         found_gaps = gaps(t, self._bandwidth_hz)
-        if len(found_gaps):
+        if clock.episodes > 1:
+            described = (self._description.wrench, self._description.imu, self._description.pose)
+            files = len({stream.source for stream in described if stream is not None})
+            self._notes += episodes_note(clock, files, f"{self._source}:{name}.time")
+        elif len(found_gaps):
             start, stop = found_gaps[int(np.argmax(found_gaps[:, 1] - found_gaps[:, 0]))]
             self._notes.append(
                 f"{name}: {len(found_gaps)} gaps, the longest of {stop - start:.3g} s at"
                 f" {start - t[0]:.3g} s; samples in and near them are not used"
             )
+        if len(found_gaps):
             half_window = self._half_window(float(np.median(np.diff(t))))
             self._gaps.append(found_gaps + np.array([-half_window, half_window]))
         return clock

@@ -1,4 +1,4 @@
-"""Conversions between rotation matrices, quaternions and rotation vectors."""
+"""Conversions between rotation matrices, quaternions, rotation vectors and Euler angles."""
 
 from __future__ import annotations
 
@@ -9,14 +9,29 @@ import numpy as np
 from drake_teleop.common.numeric import Array
 
 WIDTHS = {"matrix": 9, "quaternion_wxyz": 4, "quaternion_xyzw": 4, "rotation_vector": 3}
+WIDTHS |= {"euler": 3}
 """Number of columns of each form."""
 
 
-def rotation_matrices(columns: Array, form: str) -> Array:
-    """Return rotation matrices (N, 3, 3) from columns (N, 3, 4 or 9) of a `form`, not normalized.
+EULER_AXES = tuple(
+    axes
+    for letters in ("xyz", "XYZ")
+    for axes in map("".join, product(letters, repeat=3))
+    if axes[0] != axes[1] != axes[2]
+)
+"""Orders of Euler angles as in SciPy: small letters for fixed axes, capitals for moving ones."""
 
-    Matrices are row-major, rotation vectors in [rad]; see `WIDTHS` for the forms.
+
+def rotation_matrices(columns: Array, form: str, axes: str | None = None) -> Array:
+    """Return rotation matrices (N, 3, 3) from columns (N, WIDTHS[form]), without normalization.
+
+    Matrices are row-major, rotation vectors and Euler angles about `axes` in [rad].
     """
+    if form == "euler":
+        from scipy.spatial.transform import Rotation
+
+        assert axes is not None
+        return np.asarray(Rotation.from_euler(axes, columns).as_matrix())
     if form == "matrix":
         return columns.reshape(-1, 3, 3)
     if form == "rotation_vector":

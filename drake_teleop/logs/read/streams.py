@@ -110,18 +110,15 @@ class Orientations:
         self._orientation, self._table, self._where = orientation, table, where
         width = WIDTHS[orientation.form]
         self._columns = table.numbers(orientation.columns, width, f"{where}.columns", rows)
-        if orientation.form == "rotation_vector":
+        if orientation.form in ("rotation_vector", "euler"):
             self._columns *= description.scale(orientation.unit)
 
     def rotations(self, rows: NDArray[np.intp]) -> Array:
-        """Return R_WS (n, 3, 3) of the given n rows.
-
-        Raises:
-            DrakeTeleopError: for a row that is not a rotation.
-        """
-        R = rotation_matrices(self._columns[rows], self._orientation.form)
+        """Return R_WS (n, 3, 3) of n rows; raise an error for matrices that are not rotations."""
+        orientation = self._orientation
+        R = rotation_matrices(self._columns[rows], orientation.form, orientation.axes)
         self._check_errors(rotation_error(R), rows)
-        return nearest_rotation(np.swapaxes(R, 1, 2) if self._orientation.inverse else R)
+        return nearest_rotation(np.swapaxes(R, 1, 2) if orientation.inverse else R)
 
     def quaternions(self, rows: NDArray[np.intp]) -> Array:
         """Return R_WS of the given n rows as quaternions (n, 4) [w, x, y, z].
@@ -144,7 +141,7 @@ class Orientations:
     def _check_errors(self, errors: Array, rows: NDArray[np.intp]) -> None:
         worst = int(np.argmax(errors))
         if errors[worst] > ROTATION_TOLERANCE:
-            row = rows[worst] + self._table.first_row
+            row = self._table.line(rows[worst])
             raise DrakeTeleopError(
                 f"row {row} of {self._table.path.name} is not a rotation",
                 where=self._where,

@@ -1,28 +1,23 @@
-"""Tables of numbers from text, Parquet, NPZ and MAT files; errors name file, column and row."""
+"""Table of numbers from one file; errors name file, column and row."""
 
 from __future__ import annotations
 
 import difflib
 import math
-import os
-import zipfile
 from collections import UserDict
 from collections.abc import Callable, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
-from drake_teleop.common.parquet_sizes import check_parquet
-from drake_teleop.logs.read.csv_text import read_csv
-from drake_teleop.logs.read.mat_file import read_mat
 
 if TYPE_CHECKING:
-    import polars as pl
+    pass
 
 _TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
 FORMATS = (*_TEXT, ".parquet", ".npz", ".mat")
@@ -45,16 +40,42 @@ class Table:
             row-major.
         first_row: number of the first data row in the file.
         absent: names of column groups that the file marks as not provided.
+        whole: table of all rows, if these are a part of them.
+        kept: numbers of these rows in `whole`, counted from 0; None: all rows.
     """
 
     path: Path
     columns: MutableMapping[str, NDArray]
     first_row: int = 1
     absent: tuple[str, ...] = ()
+    whole: Table | None = None
+    kept: NDArray[np.intp] | None = None
+
+    def line(self, row: int) -> int:
+        """Return the number in the file of a row of this table, for messages."""
+        return self.first_row + int(row if self.kept is None else self.kept[row])
+
+    def filled(self, names: Sequence[str | int]) -> Table:
+        """Return the rows in which at least one of the named columns has a number.
+
+        Recorders of several topics write one table, and leave the cells of other topics empty.
+        """
+        names = [str(name) for name in names if str(name) in self.columns]
+        if not names or np.isfinite(self.raw(names[0], "")).all():
+            return self
+        columns = [self.raw(name, "") for name in names]
+        if len({len(column) for column in columns}) > 1:
+            return self
+        rows = np.flatnonzero(np.isfinite(np.hstack(columns)).any(axis=1))
+        if not 0 < len(rows) < self.rows:
+            return self
+        return replace(self, columns=_SelectedRows(self.columns, rows), whole=self, kept=rows)
 
     @property
     def rows(self) -> int:
         """Number of rows of the longest column."""
+        if self.kept is not None:
+            return len(self.kept)
         return max(len(column) for column in self.columns.values())
 
     def numbers(
@@ -139,7 +160,7 @@ class Table:
             first = int(np.argmax(bad))
             worst = values[first][np.argmax(np.abs(values[first]))]
             raise DrakeTeleopError(
-                f"{worst:g} {unit}".rstrip() + f" in row {first + self.first_row} of"
+                f"{worst:g} {unit}".rstrip() + f" in row {self.line(first)} of"
                 f" {self.path.name} is outside {-largest:g} to {largest:g}",
                 where=where,
                 remedy=remedy,
@@ -165,8 +186,7 @@ class Table:
         if bad.any():
             first = int(np.argmax(bad))
             raise DrakeTeleopError(
-                f"no finite number in {int(bad.sum())} rows, the first is row"
-                f" {first + self.first_row}",
+                f"no finite number in {int(bad.sum())} rows, the first is row {self.line(first)}",
                 where=f"{self.path}:{name}",
                 remedy="cut the log before it or repair the rows",
             )
@@ -179,7 +199,7 @@ class Table:
 
     def _cell_error(self, name: str, row: int, cell: object) -> DrakeTeleopError:
         return DrakeTeleopError(
-            f"{cell!r} in row {row + self.first_row} is not a number",
+            f"{cell!r} in row {self.line(row)} is not a number",
             where=f"{self.path}:{name}",
             remedy="correct the cell or delete the row"
             + (", if it holds units: the log description has them" if row == 0 else ""),
@@ -195,111 +215,16 @@ def decimal_step(values: Array) -> float:
     return 0.0
 
 
-def read_table(path: Path, *, header: bool = True) -> Table:
-    """Read a file with one of the suffixes `FORMATS`.
+class _SelectedRows(UserDict[str, Any]):
+    """Columns of another table, reduced to some of its rows on access."""
 
-    Without a header the columns of a text file are named from "0" on.
-
-    Raises:
-        DrakeTeleopError: if the file is invalid.
-    """
-    if path.suffix.lower() not in FORMATS:
-        raise DrakeTeleopError(
-            f"format {path.suffix!r} is not known",
-            where=str(path),
-            remedy=f"convert it to one of {', '.join(FORMATS)}",
-        )
-    if not os.path.isfile(path):
-        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
-    refuse_fork()
-    with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
-        arrays = {".npz": _read_npz, ".mat": read_mat}.get(path.suffix.lower())
-        table = (
-            _read_frame(path, header) if arrays is None else _table_from_arrays(path, arrays(path))
-        )
-    if not table.columns or not all(len(c) for c in table.columns.values()):
-        raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
-    return table
-
-
-def _read_frame(path: Path, header: bool) -> Table:
-    import polars as pl
-
-    if path.suffix.lower() == ".parquet":
-        check_parquet(path)
-        names = list(pl.read_parquet_schema(path))
-        lazy = _ParquetColumns(
-            path, _with_canonical(dict(zip(_strip_names(names), names, strict=True)))
-        )
-        small = (
-            len(names) * pl.scan_parquet(path).select(pl.len()).collect().item()
-            <= _MAX_CELLS_IN_MEMORY
-        )
-        return Table(path, dict(lazy) if small else lazy)
-    frame, first_row = read_csv(path, header)
-    names = [name if header else str(i) for i, name in enumerate(frame.columns)]
-    found = [_frame_column(series) for series in frame.get_columns()]
-    columns = dict(zip(_strip_names(names), found, strict=True))
-    return Table(path, _with_canonical(columns), first_row)
-
-
-def _strip_names(names: list[str]) -> list[str]:
-    stripped = [name.strip() for name in names]
-    if len(set(stripped)) < len(names):
-        raise ValueError("two column names differ only in spaces")
-    return stripped
-
-
-def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
-    small = {name.lower(): column for name, column in columns.items()}
-    canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
-    return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
-
-
-class _ParquetColumns(UserDict[str, Any]):
-    """Columns of a Parquet file, each read on access to limit memory."""
-
-    def __init__(self, path: Path, names: dict[str, str]) -> None:
-        super().__init__(names)
-        self._path = path
+    def __init__(self, columns: MutableMapping[str, NDArray], rows: NDArray[np.intp]) -> None:
+        super().__init__(dict.fromkeys(columns))
+        self._columns, self._rows = columns, rows
 
     def __getitem__(self, key: str) -> NDArray:
-        import polars as pl
-
-        name = self.data[key]
-        return _frame_column(pl.read_parquet(self._path, columns=[name]).to_series())
-
-
-def _frame_column(series: pl.Series) -> NDArray:
-    import polars as pl
-
-    if series.dtype == pl.Time:
-        series = series.cast(pl.Duration("ns"))
-    if series.dtype in (pl.Datetime, pl.Duration):
-        return series.to_numpy()
-    if series.dtype == pl.Int128:  # not supported by NumPy
-        series = series.cast(pl.Float64)
-    # Empty cells become NaN, which is reported with its row later.
-    return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
-
-
-def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
-    arrays = {name: array for name, array in arrays.items() if len(array)}
-    parts = {
-        f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
-        for name, array in arrays.items()
-        for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
-        if k < _MAX_ELEMENT_COLUMNS
-    }
-    return Table(path, parts | arrays)
-
-
-def _read_npz(path: Path) -> dict[str, NDArray]:
-    if not zipfile.is_zipfile(path):
-        raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
-    with np.load(path, allow_pickle=False) as archive:
-        columns = {key: archive[key] for key in archive.files}
-    return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
+        column = self._columns[key]
+        return column[self._rows] if self._rows[-1] < len(column) else column
 
 
 def _as_numbers(column: NDArray, bad: Callable[[int, object], DrakeTeleopError]) -> Array:

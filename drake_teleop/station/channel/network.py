@@ -174,7 +174,7 @@ def longest_delay(config: NetworkConfig) -> float:
 def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     """Return a trace file's delays (N,) [steps], one packet a period; -1 for a lost packet."""
     # The table reader starts slowly and is needed only for a trace.
-    from drake_teleop.logs.read.tables import read_table
+    from drake_teleop.logs.read.table_files import read_table
 
     table = read_table(path)
     time = table.numbers(["time"], 1, str(path))[:, 0]
@@ -190,7 +190,7 @@ def _read_trace(path: Path, period: float) -> NDArray[np.float64]:
     ):
         if bad.any():
             raise DrakeTeleopError(
-                f"row {int(np.argmax(bad)) + table.first_row} {what}",
+                f"row {table.line(int(np.argmax(bad)))} {what}",
                 where=f"{path}:{column}",
                 remedy="give seconds, sorted by time; an empty delay is a lost packet",
             )

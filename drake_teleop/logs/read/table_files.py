@@ -1,0 +1,212 @@
+"""Reading of tables from text, Excel, Parquet, Arrow, JSON lines, NumPy, MATLAB, HDF5 and Zarr.
+
+Nested columns become several: `name.field` for the fields of a structure, and `name[k]` for the
+elements of a list or array of constant length, besides the whole as `name`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from collections import UserDict
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError, refuse_fork, wrap_read_errors
+from drake_teleop.common.parquet_sizes import check_parquet
+from drake_teleop.logs.read.csv_text import read_csv
+from drake_teleop.logs.read.mat_file import read_mat
+from drake_teleop.logs.read.tables import Table
+
+if TYPE_CHECKING:
+    import polars as pl
+
+_TEXT = (".csv", ".tsv", ".txt", ".dat", ".log")
+_FRAMES = (".parquet", ".arrow", ".feather", ".jsonl", ".ndjson", ".xlsx")
+_ARRAYS = (".npz", ".npy", ".mat", ".h5", ".hdf5", ".zarr")
+FORMATS = (*_TEXT, *_FRAMES, *_ARRAYS)
+"""Suffixes of files that `read_table` reads."""
+_CANONICAL = {"f_x", "f_y", "f_z", "tau_x", "tau_y", "tau_z"}
+_Column = TypeVar("_Column")
+_MAX_ELEMENT_COLUMNS = 16  # elements of an array with their own columns: up to a homogeneous matrix
+_MAX_CELLS_IN_MEMORY = 2**24
+"""Number of cells above which columns of a Parquet file are read on access."""
+
+
+def read_table(path: Path, *, header: bool = True) -> Table:
+    """Read a file with one of the suffixes `FORMATS`; raise an error if it is invalid.
+
+    Without a header the columns of a text file are named from "0" on.
+    """
+    kind = path.suffix.lower()
+    if kind not in FORMATS:
+        raise DrakeTeleopError(
+            f"format {path.suffix!r} is not known",
+            where=str(path),
+            remedy=f"convert it to one of {', '.join(FORMATS)}",
+        )
+    if not (os.path.isdir if kind == ".zarr" else os.path.isfile)(path):
+        raise DrakeTeleopError("no such file", where=str(path), remedy="check the path")
+    refuse_fork()
+    with wrap_read_errors(path, f"check that it is a valid {path.suffix} file"):
+        if kind in _ARRAYS:
+            table = _table_from_arrays(path, _read_arrays(path))
+        elif kind in _FRAMES:
+            table = Table(path, _frame_columns(path))
+        else:
+            table = _read_text(path, header)
+    if not table.columns or not all(len(c) for c in table.columns.values()):
+        raise DrakeTeleopError("holds no rows", where=str(path), remedy="record it again")
+    return table
+
+
+def _read_text(path: Path, header: bool) -> Table:
+    frame, first_row = read_csv(path, header)
+    names = [name if header else str(i) for i, name in enumerate(frame.columns)]
+    found = [_to_numpy(series) for series in frame.get_columns()]
+    columns = dict(zip(_strip_names(names), found, strict=True))
+    return Table(path, _with_canonical(columns), first_row)
+
+
+def _strip_names(names: list[str]) -> list[str]:
+    stripped = [name.strip() for name in names]
+    if len(set(stripped)) < len(names):
+        raise ValueError("two column names differ only in spaces")
+    return stripped
+
+
+def _with_canonical(columns: dict[str, _Column]) -> dict[str, _Column]:
+    """Add lower-case column names if the table is a canonical log."""
+    small = {name.lower(): column for name, column in columns.items()}
+    canonical = len(small) == len(columns) and _CANONICAL.issubset(small)
+    return small | columns if canonical and not _CANONICAL.issubset(columns) else columns
+
+
+def _frame_columns(path: Path) -> dict[str, NDArray] | _LazyColumns:
+    """Return the columns of a file that polars reads; a large Parquet file is read on access."""
+    import polars as pl
+
+    kind = path.suffix.lower()
+    if kind == ".parquet":
+        check_parquet(path)
+        frame = pl.scan_parquet(path)
+    elif kind == ".xlsx":
+        frame = pl.read_excel(path).lazy()
+    else:
+        read = pl.read_ipc if kind in (".arrow", ".feather") else pl.read_ndjson
+        frame = read(path.read_bytes()).lazy()
+    columns: dict[str, pl.Expr] = {}
+    for name, dtype in frame.collect_schema().items():
+        columns |= _expand(name.strip(), pl.col(name), dtype, frame)
+    _strip_names(list(frame.collect_schema()))
+    columns = _with_canonical(columns)
+    rows = frame.select(pl.len()).collect().item()
+    if kind == ".parquet" and len(columns) * rows > _MAX_CELLS_IN_MEMORY:
+        return _LazyColumns(frame, columns)
+    whole = frame.select(column.alias(name) for name, column in columns.items()).collect()
+    return {series.name: _to_numpy(series) for series in whole.get_columns()}
+
+
+def _expand(
+    label: str,
+    column: pl.Expr,
+    dtype: pl.DataType | pl.datatypes.DataTypeClass,
+    frame: pl.LazyFrame,
+) -> dict[str, pl.Expr]:
+    """Return the numeric parts of a column by name."""
+    import polars as pl
+
+    if isinstance(dtype, pl.Struct):
+        parts: dict[str, pl.Expr] = {}
+        for field in dtype.fields:
+            of_field = column.struct.field(field.name)
+            parts |= _expand(f"{label}.{field.name}", of_field, field.dtype, frame)
+        return parts
+    if isinstance(dtype, pl.List):
+        lengths = frame.select(column.list.len().drop_nulls().unique()).collect().to_series()
+        if not dtype.inner.is_numeric() or len(lengths) != 1 or not lengths[0]:
+            return {}
+        column, length = column.list.to_array(lengths[0]), int(lengths[0])
+    elif isinstance(dtype, pl.Array):
+        if not (dtype.inner.is_numeric() or isinstance(dtype.inner, pl.Array)):
+            return {}
+        length = dtype.shape[0] if len(dtype.shape) == 1 else 0
+    else:
+        return {} if isinstance(dtype, (pl.Binary, pl.Object)) else {label: column}
+    length = min(length, _MAX_ELEMENT_COLUMNS)
+    elements = {f"{label}[{k}]": column.arr.get(k) for k in range(length)}
+    return {**elements, label: column}
+
+
+class _LazyColumns(UserDict[str, Any]):
+    """Columns of a frame, each read on access to limit memory."""
+
+    def __init__(self, frame: pl.LazyFrame, columns: dict[str, pl.Expr]) -> None:
+        super().__init__(columns)
+        self._frame = frame
+
+    def __getitem__(self, key: str) -> NDArray:
+        return _to_numpy(self._frame.select(self.data[key].alias("x")).collect().to_series())
+
+
+def _to_numpy(series: pl.Series) -> NDArray:
+    import polars as pl
+
+    if series.dtype == pl.Time:
+        series = series.cast(pl.Duration("ns"))
+    if series.dtype in (pl.Datetime, pl.Duration):
+        return series.to_numpy()
+    if series.dtype == pl.Int128:  # not supported by NumPy
+        series = series.cast(pl.Float64)
+    if isinstance(series.dtype, pl.Array):
+        if not series.null_count():
+            return series.to_numpy()
+        empty = [math.nan] * series.dtype.shape[0]
+        return np.array([empty if row is None else row for row in series.to_list()], dtype=float)
+    # Empty cells become NaN, which is reported with its row later.
+    return series.to_numpy() if series.dtype.is_numeric() else series.cast(pl.String).to_numpy()
+
+
+def _table_from_arrays(path: Path, arrays: dict[str, NDArray]) -> Table:
+    arrays = {name: array for name, array in arrays.items() if len(array)}
+    parts = {
+        f"{name}[{k}]": array.reshape(len(array), -1)[:, k]
+        for name, array in arrays.items()
+        for k in range(math.prod(array.shape[1:]) if 1 < array.ndim <= 3 else 0)
+        if k < _MAX_ELEMENT_COLUMNS
+    }
+    return Table(path, parts | arrays)
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray]:
+    from drake_teleop.logs.read.array_files import read_hdf5, read_zarr
+
+    readers: dict[str, Callable[[Path], dict[str, NDArray]]] = {
+        ".npz": _read_npz,
+        ".npy": _read_npy,
+        ".mat": read_mat,
+        ".zarr": read_zarr,
+    }
+    return readers.get(path.suffix.lower(), read_hdf5)(path)
+
+
+def _read_npz(path: Path) -> dict[str, NDArray]:
+    if not zipfile.is_zipfile(path):
+        raise ValueError("it is not a complete NPZ archive; numpy.savez writes one")
+    with np.load(path, allow_pickle=False) as archive:
+        columns = {key: archive[key] for key in archive.files}
+    return {key: x for key, x in columns.items() if isinstance(x, np.ndarray) and x.ndim}
+
+
+def _read_npy(path: Path) -> dict[str, NDArray]:
+    array = np.load(path, allow_pickle=False)
+    if array.dtype.names is not None:
+        return {name: array[name] for name in array.dtype.names}
+    if array.ndim != 2:
+        raise ValueError(f"it has {array.ndim} axes; give an array of rows and columns")
+    return {str(k): array[:, k] for k in range(array.shape[1])}

@@ -1,0 +1,437 @@
+"""Tables as recorders, robots and data sets write them: conventions, clocks, formats, drafts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from known_motion import quaternions
+from planted import PHI, good
+from scipy.spatial.transform import Rotation
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.logs.inspection import inspect_command
+from drake_teleop.logs.processing import eliminate_log, identify_log
+from drake_teleop.logs.read.clocks import join_episodes
+from drake_teleop.logs.read.reading import read_log
+from drake_teleop.logs.read.rotations import EULER_AXES, rotation_matrices
+from drake_teleop.logs.read.table_files import read_table
+
+FORCE, TORQUE = ["f0", "f1", "f2"], ["m0", "m1", "m2"]
+TUM_POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+POSITION, QUATERNION = ["p0", "p1", "p2"], ["q0", "q1", "q2", "q3"]
+
+
+def table(sign: float = 1.0, start: float = 0.0) -> pl.DataFrame:
+    """A wrench and its pose in one table, 4 s at 500 Hz."""
+    c = good(start=start)
+    groups = {"f": sign * c["force"], "m": sign * c["torque"]}
+    groups |= {"p": c["p"], "q": quaternions(c["R"])}
+    columns = {f"{name}{k}": x[:, k] for name, x in groups.items() for k in range(x.shape[1])}
+    return pl.DataFrame({"t": c["t"]} | columns)
+
+
+def described(folder: Path, frame: pl.DataFrame, **changes: Any) -> Path:
+    """Write table and description; `changes` replace fields such as wrench__force__unit."""
+    frame.write_parquet(folder / "table.parquet")
+    file = {"file": "table.parquet", "time": {"column": "t"}}
+    data: dict[str, Any] = {
+        "wrench": {**file, "force": {"columns": FORCE}, "torque": {"columns": TORQUE}},
+        "pose": {
+            **file,
+            "orientation": {"columns": QUATERNION, "form": "quaternion_wxyz"},
+            "position": {"columns": POSITION},
+        },
+    }
+    data = yaml.safe_load(yaml.safe_dump(data))  # no shared dictionaries
+    for path, value in changes.items():
+        *outer, last = path.split("__")
+        place = data
+        for name in outer:
+            place = place[name]
+        place[last] = value
+    (folder / "log.yaml").write_text(yaml.safe_dump(data))
+    return folder / "log.yaml"
+
+
+@pytest.mark.parametrize(
+    ("force", "torque", "newton", "newton_metre"),
+    [
+        ("kgf", "kgf cm", 9.80665, 0.0980665),
+        ("daN", "daN m", 10.0, 10.0),
+        ("mN", "mN m", 1e-3, 1e-3),
+        ("lbf", "lbf ft", 4.4482216152605, 1.3558179483314004),
+        ("ozf", "ozf in", 4.4482216152605 / 16, 4.4482216152605 / 16 * 0.0254),
+        ("gf", "gf cm", 9.80665e-3, 9.80665e-5),
+        ("kN", "N cm", 1e3, 1e-2),
+    ],
+)
+def test_units_of_the_trade_become_si(
+    tmp_path: Path, force: str, torque: str, newton: float, newton_metre: float
+) -> None:
+    units = {"wrench__force__unit": force, "wrench__torque__unit": torque}
+    whole = read_log(described(tmp_path, table()))
+    scaled = table().with_columns(pl.col(FORCE) / newton, pl.col(TORQUE) / newton_metre)
+    log = read_log(described(tmp_path, scaled, **units))
+    np.testing.assert_allclose(log.wrench, whole.wrench, rtol=1e-12, atol=1e-12)
+
+
+def test_one_reversed_channel_of_counts_is_described_by_factors(tmp_path: Path) -> None:
+    whole = read_log(described(tmp_path, table()))
+    counts = table().with_columns(pl.col(FORCE) * 1e6, pl.col(TORQUE) * 1e5)
+    counts = counts.with_columns(f1=-pl.col("f1"))
+    scales = {"wrench__force__scale": [1e-6, -1e-6, 1e-6], "wrench__torque__scale": 1e-5}
+    log = read_log(described(tmp_path, counts, **scales))
+    np.testing.assert_allclose(log.wrench, whole.wrench, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+@pytest.mark.parametrize("axes", ["xyz", "ZYX", "zyz", "XYZ"])
+def test_euler_angles_give_the_orientation_of_the_quaternion(
+    tmp_path: Path, axes: str, unit: str
+) -> None:
+    quaternion = table().select(QUATERNION).to_numpy()[:, [1, 2, 3, 0]]
+    angles = Rotation.from_quat(quaternion).as_euler(axes, degrees=unit == "deg")
+    named = {f"e{k}": angles[:, k] for k in range(3)}
+    orientation = {"columns": list(named), "form": "euler", "axes": axes, "unit": unit}
+    path = described(tmp_path, table().with_columns(**named), pose__orientation=orientation)
+    expected = read_log(described(tmp_path, table()))
+    (tmp_path / "euler").mkdir()
+    path = described(
+        tmp_path / "euler", table().with_columns(**named), pose__orientation=orientation
+    )
+    np.testing.assert_allclose(read_log(path).R_WS, expected.R_WS, atol=1e-9)
+
+
+@given(st.sampled_from(EULER_AXES), st.tuples(*[st.floats(-1.4, 1.4)] * 3))
+def test_euler_matrices_are_products_of_rotations_about_the_axes(
+    axes: str, angles: tuple[float, float, float]
+) -> None:
+    single = [
+        rotation_matrices(np.array([angle * np.eye(3)["xyz".index(axis)]]), "rotation_vector")[0]
+        for axis, angle in zip(axes.lower(), angles, strict=True)
+    ]
+    if axes.islower():  # fixed axes: later rotations from the left
+        single = single[::-1]
+    R = rotation_matrices(np.array([angles]), "euler", axes)[0]
+    np.testing.assert_allclose(R, single[0] @ single[1] @ single[2], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "words"),
+    [
+        ({"form": "euler"}, "needs axes"),
+        ({"form": "euler", "axes": "xxz"}, "are not known"),
+        ({"form": "euler", "axes": "xYz"}, "are not known"),
+        ({"form": "rotation_vector", "axes": "xyz"}, "other forms have none"),
+    ],
+)
+def test_euler_axes_are_checked(tmp_path: Path, orientation: dict[str, str], words: str) -> None:
+    columns = {"columns": ["q0", "q1", "q2"]}
+    path = described(tmp_path, table(), pose__orientation=columns | orientation)
+    with pytest.raises(DrakeTeleopError, match=words):
+        read_log(path)
+
+
+def test_seconds_and_nanoseconds_are_one_clock(tmp_path: Path) -> None:
+    t = table()["t"].to_numpy()
+    frame = table().with_columns(
+        t=np.floor(t + 0.5 + 1.7e9), ns=np.round((t + 0.5) % 1.0 * 1e9).astype(np.int64)
+    )
+    time = {"column": "t", "nanoseconds": "ns"}
+    log = read_log(described(tmp_path, frame, wrench__time=time, pose__time=time))
+    whole = read_log(described(tmp_path, table()))
+    np.testing.assert_allclose(log.t, whole.t, atol=1e-6)
+    np.testing.assert_allclose(log.wrench, whole.wrench, atol=2e-3)
+    wrong = {"column": "t", "nanoseconds": "ns", "unit": "ms"}
+    with pytest.raises(DrakeTeleopError, match="column of seconds"):
+        read_log(described(tmp_path, frame, wrench__time=wrong))
+
+
+@pytest.mark.parametrize("decimated", [1, 3])
+def test_rows_of_a_stream_are_those_in_which_its_columns_are_filled(
+    tmp_path: Path, decimated: int
+) -> None:
+    """As PlotJuggler, Foxglove and pandas.concat write several topics."""
+    wrench = table().select("t", *FORCE, *TORQUE)
+    pose = table().select("t", *POSITION, *QUATERNION).gather_every(decimated)
+    pose = pose.with_columns(pl.col("t") + 3e-4)
+    both = pl.concat([wrench, pose], how="diagonal").sort("t")
+    mixed = read_log(described(tmp_path, both))
+    apart = read_log(
+        described(tmp_path, both, pose__time={"column": "t", "offset": 0.0})
+    )  # the same clock, described explicitly
+    np.testing.assert_array_equal(mixed.wrench, apart.wrench)
+    found = identify_log(tmp_path / "log.yaml").identification
+    assert found.mass == pytest.approx(PHI[0], abs=0.01)
+    assert len(mixed) > 1900
+
+
+def test_a_partly_filled_row_is_still_an_error(tmp_path: Path) -> None:
+    frame = table().with_columns(f1=pl.when(pl.col("t") == 1.0).then(None).otherwise(pl.col("f1")))
+    with pytest.raises(DrakeTeleopError, match="no finite number in 1 rows, the first is row 501"):
+        read_log(described(tmp_path, frame))
+
+
+def test_row_numbers_in_messages_are_those_of_the_file(tmp_path: Path) -> None:
+    """Also for a stream with rows of its own."""
+    wrench = table().select("t", *FORCE, *TORQUE)
+    pose = table().select("t", *POSITION, *QUATERNION)
+    pose = pose.with_columns(q0=pl.when(pl.col("t") == 1.0).then(7.0).otherwise(pl.col("q0")))
+    both = pl.concat([wrench, pose], how="diagonal")
+    with pytest.raises(DrakeTeleopError, match=r"row 2501 of table\.parquet is not a rotation"):
+        read_log(described(tmp_path, both))
+
+
+def test_episodes_follow_each_other_on_one_clock(tmp_path: Path) -> None:
+    """Each starts at zero; differences across their boundaries are not used."""
+    parts = [table(start=0.0), table(start=11.0), table(start=25.0)]
+    path = described(tmp_path, pl.concat(parts))
+    log = read_log(path)
+    assert log.t[-1] == pytest.approx(3 * 3.998 + 2 * 1.0, abs=1e-6)
+    assert any("starts 3 times" in note for note in log.notes)
+    assert log.bridged is not None and log.bridged[np.searchsorted(log.t, 4.5)]
+    found = identify_log(path)
+    assert found.causes == ()
+    assert found.identification.mass == pytest.approx(PHI[0], abs=5e-3)
+
+
+@pytest.mark.filterwarnings("error")
+def test_rows_without_a_finite_stamp_do_not_shorten_the_checks(tmp_path: Path) -> None:
+    t = pl.col("t")
+    frame = (
+        table()
+        .gather_every(5)[:80]
+        .with_columns(t=pl.when(t.is_between(0.5, 0.525)).then(np.inf).otherwise(t))
+    )
+    summary = inspect_command(described(tmp_path, frame), tmp_path / "out", quiet=True)
+    assert "unusable" not in [finding["name"] for finding in summary["findings"]]
+    assert summary["fit"]["unexplained"] < 0.05
+
+
+def test_episodes_in_several_files_are_refused(tmp_path: Path) -> None:
+    path = described(tmp_path, pl.concat([table(), table(start=11.0)]))
+    (tmp_path / "other.parquet").write_bytes((tmp_path / "table.parquet").read_bytes())
+    text = yaml.safe_load(path.read_text())
+    text["pose"]["file"] = "other.parquet"
+    path.write_text(yaml.safe_dump(text))
+    with pytest.raises(DrakeTeleopError, match="starts 2 times, and the streams are in several"):
+        read_log(path)
+
+
+@pytest.mark.parametrize(
+    ("t", "joined", "episodes"),
+    [
+        ([0, 1, 2, 3] * 8, 1, 1),  # too short to be episodes
+        ([*range(40), *range(40)], 79 + 9, 2),
+        ([*range(40), *range(1, 41)], 79 + 9, 2),
+        ([*range(40), *range(20, 60)], 0, 1),  # a step back into the middle
+        ([*range(20), 0, *range(21, 60)], 0, 1),  # one wrong stamp
+    ],
+)
+def test_a_clock_starts_again_only_at_its_start(t: list[int], joined: float, episodes: int) -> None:
+    result, found = join_episodes(np.array(t, float))
+    assert found == episodes
+    if episodes > 1:
+        assert result[-1] == joined and (np.diff(result) > 0).all()
+    else:
+        np.testing.assert_array_equal(result, t)
+
+
+@pytest.mark.parametrize("suffix", [".parquet", ".arrow", ".jsonl", ".npz", ".npy", ".h5", ".zarr"])
+def test_formats_hold_the_same_columns(tmp_path: Path, suffix: str) -> None:
+    t, w = np.arange(20) * 0.01, np.arange(120.0).reshape(20, 6)
+    path = tmp_path / f"table{suffix}"
+    frame = pl.DataFrame({"t": t, "w": w.tolist()})
+    if suffix == ".h5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            file["t"], file["w"], file["a/b"] = t, w, t
+            file["image"] = np.zeros((20, 8, 8, 3), np.uint8)
+    elif suffix == ".zarr":
+        zarr = pytest.importorskip("zarr")
+        group = zarr.open_group(path, mode="w")
+        for name, data in (("t", t), ("w", w), ("a/b", t)):
+            group.create_array(name, data=data)
+    elif suffix == ".npz":
+        np.savez(path, t=t, w=w)
+    elif suffix == ".npy":
+        np.save(path, np.column_stack([t, w]))
+    else:
+        write = {".parquet": frame.write_parquet, ".arrow": frame.write_ipc}
+        write.get(suffix, frame.write_ndjson)(path)
+    found = read_table(path)
+    names = (
+        ["0", *map(str, range(1, 7))] if suffix == ".npy" else ["t", *(f"w[{k}]" for k in range(6))]
+    )
+    np.testing.assert_array_equal(found.numbers(names[:1], 1, "")[:, 0], t)
+    np.testing.assert_array_equal(found.numbers(names[1:], 6, ""), w)
+    if suffix in (".h5", ".zarr"):
+        np.testing.assert_array_equal(found.numbers(["a.b"], 1, "")[:, 0], t)
+        assert "image" not in found.columns
+
+
+def test_structures_become_columns_and_other_columns_are_left_out(tmp_path: Path) -> None:
+    frame = pl.DataFrame(
+        {
+            "wrench": [{"force": {"x": float(k)}, "note": "a"} for k in range(20)],
+            "image": [{"bytes": b"\xff\xd8", "path": None}] * 20,
+            "ragged": [[1.0] * (k % 3) for k in range(20)],
+            "holed": [[float(k), 1.0] if k % 5 else None for k in range(20)],
+        }
+    )
+    frame.write_parquet(tmp_path / "table.parquet")
+    found = read_table(tmp_path / "table.parquet")
+    np.testing.assert_array_equal(found.numbers(["wrench.force.x"], 1, "")[:, 0], np.arange(20.0))
+    assert "ragged" not in found.columns and "image.bytes" not in found.columns
+    assert np.isnan(found.raw("holed[0]", "")[0, 0]) and found.raw("holed[0]", "")[1, 0] == 1.0
+
+
+def test_hdf5_data_in_other_files_are_not_read(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    secret = tmp_path / "secret.bin"
+    secret.write_bytes(b"\0" * 160)
+    with h5py.File(tmp_path / "table.h5", "w") as file:
+        file["t"] = np.arange(20.0)
+        file.create_dataset("x", (20,), "f8", external=[(str(secret), 0, 160)])
+    with pytest.raises(DrakeTeleopError, match="is in another file"):
+        read_table(tmp_path / "table.h5")
+
+
+def drafted(*tables: Path) -> tuple[dict[str, Any], list[str]]:
+    """The draft of tables, and the names of the findings that remain."""
+    out = tables[0].parent / "out"
+    summary = inspect_command(tables[0], out, others=tables[1:], quiet=True)
+    draft = yaml.safe_load((out / "draft.yaml").read_text())
+    return draft, [finding["name"] for finding in summary["findings"]]
+
+
+def renamed(frame: pl.DataFrame, names: dict[str, str]) -> pl.DataFrame:
+    return frame.select([pl.col(old).alias(new) for old, new in names.items()])
+
+
+def test_two_tables_give_one_draft_with_the_sign_of_the_data(tmp_path: Path) -> None:
+    """A trajectory of TUM has a position tx ty tz, which is no torque."""
+    frame = table(sign=-1.0)
+    ft = {
+        "t": "timestamp",
+        **dict(zip([*FORCE, *TORQUE], ["fx", "fy", "fz", "tx", "ty", "tz"], strict=True)),
+    }
+    order = [*POSITION, *QUATERNION[1:], QUATERNION[0]]
+    pose = {
+        "t": "timestamp",
+        **dict(zip(order, TUM_POSE, strict=True)),
+    }
+    renamed(frame, ft).write_csv(tmp_path / "ft.csv")
+    renamed(frame, pose).write_csv(tmp_path / "pose.csv")
+    for first, second in (("ft", "pose"), ("pose", "ft")):
+        draft, left = drafted(tmp_path / f"{first}.csv", tmp_path / f"{second}.csv")
+        assert draft["pose"]["position"]["columns"] == ["tx", "ty", "tz"]
+        assert draft["wrench"]["torque"]["columns"] == ["tx", "ty", "tz"]
+        assert draft["wrench"]["file"].endswith("ft.csv") and draft["wrench"]["sign"] == -1
+        assert left == []
+    found = identify_log(tmp_path / "out" / "draft.yaml").identification
+    assert found.mass == pytest.approx(PHI[0], abs=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("names", "axes", "guessed", "unit"),
+    [
+        (("roll", "pitch", "yaw"), "xyz", "xyz", "deg"),
+        (("A", "B", "C"), "ZYX", "ZYX", "deg"),
+        (("tool_roll", "tool_pitch", "tool_yaw"), "XYZ", "xyz", "rad"),  # corrected by the data
+    ],
+)
+def test_the_order_of_euler_angles_is_that_of_the_data(
+    tmp_path: Path, names: tuple[str, ...], axes: str, guessed: str, unit: str
+) -> None:
+    frame = table()
+    quaternion = frame.select(QUATERNION).to_numpy()[:, [1, 2, 3, 0]]
+    angles = Rotation.from_quat(quaternion).as_euler(axes, degrees=unit == "deg")
+    columns = {
+        "t": "time",
+        **dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True)),
+    }
+    written = renamed(frame, columns | dict(zip(POSITION, "xyz", strict=True)))
+    written = written.with_columns(**{name: angles[:, k] for k, name in enumerate(names)})
+    written.write_csv(tmp_path / "table.csv")
+    draft, left = drafted(tmp_path / "table.csv")
+    orientation = draft["pose"]["orientation"]
+    assert orientation["columns"] == list(names) and orientation["unit"] == unit
+    assert orientation["axes"] == axes and left == []
+    text = (tmp_path / "out" / "draft.yaml").read_text()
+    assert ("Corrected by the data: the Euler angles" in text) == (axes != guessed)
+
+
+def test_a_robot_learning_table_is_drafted(tmp_path: Path) -> None:
+    frame = table()
+    pose = frame.select(*POSITION, "q1", "q2", "q3", "q0").to_numpy()
+    pl.DataFrame(
+        {
+            "observation.state": pose.tolist(),
+            "observation.wrench": frame.select(*FORCE, *TORQUE).to_numpy().tolist(),
+            "timestamp": frame["t"],
+            "episode_index": np.zeros(len(frame), np.int64),
+        }
+    ).write_parquet(tmp_path / "table.parquet")
+    draft, left = drafted(tmp_path / "table.parquet")
+    assert draft["pose"]["orientation"]["form"] == "quaternion_xyzw" and left == []
+    assert draft["pose"]["position"]["columns"][2] == "observation.state[2]"
+    assert draft["wrench"]["torque"]["columns"][0] == "observation.wrench[3]"
+    found = identify_log(tmp_path / "out" / "draft.yaml").identification
+    assert found.mass == pytest.approx(PHI[0], abs=5e-3)
+
+
+def test_raw_counts_leave_the_scale_open(tmp_path: Path) -> None:
+    names = dict(zip([*FORCE, *TORQUE], ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"], strict=True))
+    frame = renamed(
+        table(), {"t": "t", **names, **dict(zip(QUATERNION, ["qw", "qx", "qy", "qz"], strict=True))}
+    )
+    counts = frame.with_columns((pl.col(*names.values()) * 1e6).round().cast(pl.Int64))
+    counts.write_csv(tmp_path / "table.csv")
+    draft, left = drafted(tmp_path / "table.csv")
+    assert draft["wrench"]["force"]["scale"] == draft["wrench"]["torque"]["scale"] == "FILL IN"
+    assert "incomplete" in left
+    assert "1e-6 for 1000000 counts per N" in (tmp_path / "out" / "draft.yaml").read_text()
+
+
+def test_a_short_table_without_time_has_poses_at_rest(tmp_path: Path) -> None:
+    rest = table().gather_every(200)
+    names = dict(zip([*FORCE, *TORQUE], ["fx", "fy", "fz", "tx", "ty", "tz"], strict=True))
+    renamed(
+        rest, {**names, **dict(zip(QUATERNION, ["qw", "qx", "qy", "qz"], strict=True))}
+    ).write_csv(tmp_path / "poses.csv")
+    draft, _ = drafted(tmp_path / "poses.csv")
+    assert list(draft) == ["static"] and "time" not in draft["static"]
+    assert draft["static"]["orientation"]["columns"] == ["qw", "qx", "qy", "qz"]
+
+
+def test_offsets_come_from_the_untouched_time_or_the_load_file(tmp_path: Path) -> None:
+    path = described(tmp_path, table())
+    load = identify_log(path).identification
+    t = pl.col("t")
+    pushed = pl.when(t > 1.0).then(pl.col("f2") + 5.0).otherwise(pl.col("f2"))
+    path = described(tmp_path, table().with_columns(f2=pushed + 0.7))  # contact in most of it
+    contact = {
+        name: eliminate_log(path, load, **options).contact[:, 2]
+        for name, options in (
+            ("record", {}),
+            ("untouched", {"untouched_s": (0.2, 0.9)}),
+            ("load", {"tare": False}),
+        )
+    }
+    late = slice(-1000, -100)
+    assert contact["untouched"][late].mean() == pytest.approx(5.0, abs=0.1)
+    assert contact["load"][late].mean() == pytest.approx(5.7, abs=0.1)
+    assert abs(contact["record"][late].mean()) < 1.0  # most of the record decides
+    for span, words in (((5.0, 9.0), "has 0 samples"), ((1.0, 1.001), "samples")):
+        with pytest.raises(DrakeTeleopError, match=words):
+            eliminate_log(path, load, untouched_s=span)
+    with pytest.raises(DrakeTeleopError, match="leave one of the two out"):
+        eliminate_log(path, load, untouched_s=(0.2, 0.9), tare=False)
