@@ -143,7 +143,7 @@ class Leader:
         if self.home:
             return self._per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
-        return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
+        return np.where(within, 0.0, arm.middle)
 
     def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         """Return values (n,) from a list field with one value per joint, one for all, or none."""

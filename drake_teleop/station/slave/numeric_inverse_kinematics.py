@@ -186,7 +186,8 @@ def follow_pose(
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
-        posture: (n,) joint positions that a redundant arm approaches.
+        posture: (n,) joint positions that a redundant arm approaches; of an endless joint, the
+            nearest turn. The last joint is free if it is endless.
         pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number of steps.
@@ -207,7 +208,10 @@ def follow_pose(
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
     if towards_posture:
         for i in range(n):
-            q[i] = min(max(q[i] + pull * (posture[i] - q[i]), low[i]), high[i])
+            distance = posture[i] - q[i]
+            if upper[i] - lower[i] == np.inf:  # to the nearest turn; the last one moves no link
+                distance = np.sin(distance) if i < n - 1 else 0.0
+            q[i] = min(max(q[i] + pull * distance, low[i]), high[i])
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
@@ -300,9 +304,9 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     joints take the full rotation nearest to the reference. Without a solution, the nearest
     positions are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
     """
-    n = arm.num_joints
-    lower = np.where(np.isfinite(arm.lower), arm.lower, reference - np.pi)
-    upper = np.where(np.isfinite(arm.upper), arm.upper, reference + np.pi)
+    n, lower, upper = arm.num_joints, arm.lower, arm.upper
+    first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
+    width = np.where(np.isfinite(upper), upper, reference + np.pi) - first
     far, q, nearest = np.full(n, np.inf), np.empty(n), np.empty(n)
     # Quasi-random starts (Roberts's R sequence).
     ratio = 2.0
@@ -326,7 +330,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
                 status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
-        start = lower + part * (upper - lower)
+        start = first + part * width
     return nearest, IkStatus(status)
 
 
