@@ -165,6 +165,16 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
+def _line_step(J, e, i):
+    """Return the displacement of joint i alone that reduces the error e (6,) most."""
+    slope, square = 0.0, 0.0
+    for k in range(6):
+        slope += J[k, i] * e[k]
+        square += J[k, i] * J[k, i]
+    return slope / square
+
+
+@njit(cache=True)
 def _singularity_status(L, J):
     """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
@@ -187,7 +197,7 @@ def follow_pose(
         lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
         posture: (n,) joint positions that a redundant arm approaches; of an endless joint, the
-            nearest turn. The last joint is free if it is endless.
+            nearest turn. An endless last joint turns the tool instead.
         pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number of steps.
@@ -206,13 +216,15 @@ def follow_pose(
             q[i] = q[i] if sound(reference) else np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
-    if towards_posture:
-        for i in range(n):
-            distance = posture[i] - q[i]
-            if upper[i] - lower[i] == np.inf:  # to the nearest turn; the last one moves no link
-                distance = np.sin(distance) if i < n - 1 else 0.0
-            q[i] = min(max(q[i] + pull * distance, low[i]), high[i])
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
+    if towards_posture:
+        _jacobian_and_error(table, L, pose, q, x, J, e)
+        for i in range(n):
+            step = pull * (posture[i] - q[i])
+            if upper[i] - lower[i] == np.inf:
+                # An endless last joint turns the tool without the links; others take no full turn.
+                step = pull * np.sin(posture[i] - q[i]) if i < n - 1 else _line_step(J, e, i)
+            q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
     squared = _jacobian_and_error(table, L, pose, q, x, J, e)
