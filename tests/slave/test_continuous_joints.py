@@ -18,8 +18,12 @@ from drake_teleop.common.vectors import multiply
 from drake_teleop.lab.excitation.check import check
 from drake_teleop.lab.excitation.excite import excite
 from drake_teleop.lab.excitation.robot import RobotFromModel
-from drake_teleop.lab.run import run_command
+from drake_teleop.lab.run import run_scenario
+from drake_teleop.lab.run_summary import summarise
+from drake_teleop.live.cockpit import Cockpit
+from drake_teleop.live.inputs import Inputs
 from drake_teleop.station.master.leader_model import Leader
+from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
@@ -267,17 +271,21 @@ def test_leader_has_no_stops_at_endless_joints(tmp_path):
     assert device.at_an_end(q[np.newaxis]).all()
 
 
-def test_summary_of_a_run_is_plain_json(tmp_path):
+def test_summary_of_a_run_and_frame_of_a_page_are_plain_json(tmp_path):
     (tmp_path / "arm.urdf").write_text(urdf(SEVEN))
     scenario = tmp_path / "station.yaml"
     scenario.write_text(
-        "simulation: {duration: 0.1, settle: 0.02}\nload_estimator: {enabled: true}\n"
+        "simulation: {duration: 0.05, settle: 0.02}\nload_estimator: {enabled: true}\n"
+        "operator: {intent: [!Sine {duration: 9, frequency: 3, translation: [0.01, 0, 0]}]}\n"
         f"slave: {{model: arm.urdf, sensor_frame: ft, home: {POSTURES[SEVEN]}}}\n"
     )
-    run_command(scenario, tmp_path / "out", quiet=True)
-    text = (tmp_path / "out" / "summary.json").read_text()
-    summary = json.loads(text, parse_constant=pytest.fail)
+    setup = LoadScenario(scenario)
+    run = run_scenario(setup, progress=False)
+    summary = summarise(run)
+    json.dumps(summary, allow_nan=False)
     assert "turns without end for j1, j3, j5, j7" in summary["assumed"]
+    rows = {name: run.result[name] for name in run.result.signals} | {"t": run.result.t}
+    json.dumps(Cockpit(setup).frame(rows, Inputs.of(setup)), allow_nan=False)
 
 
 def test_one_finite_limit_keeps_the_middle_finite():
