@@ -217,7 +217,7 @@ def with_all_limits(
     n, assumptions = arm.num_joints, []
     slides = arm.table[:-1, SLIDES] != 0.0
     unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
-    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as for revolute joints
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_range`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -230,10 +230,12 @@ def with_all_limits(
     reach, speed = _DEFAULT_PRISMATIC
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
-    half_limited = np.isfinite(lower) != np.isfinite(upper)
+    half_limited = np.isinf(lower) != np.isinf(upper)
     width = np.where(slides, 2 * reach, 2 * np.pi)
-    lower = np.where(half_limited & np.isfinite(upper), upper - width, lower)
-    upper = np.where(half_limited & np.isfinite(arm.lower), lower + width, upper)
+    lower, upper = (
+        np.where(half_limited & np.isinf(lower), upper - width, lower),
+        np.where(half_limited & np.isinf(upper), lower + width, upper),
+    )
     speed = np.where(slides, speed, _DEFAULT_SPEED_RAD_S)
     velocity = np.where(_is_specified(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_specified(arm.effort_limit), arm.effort_limit, np.inf)
