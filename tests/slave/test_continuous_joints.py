@@ -28,7 +28,7 @@ from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant, with_all_limits
 from drake_teleop.station.slave.home import tool_down
-from drake_teleop.station.slave.inverse_kinematics import InverseKinematics, IkStatus
+from drake_teleop.station.slave.inverse_kinematics import IkStatus, InverseKinematics
 from drake_teleop.station.slave.joint_commands import JointFollower, SlaveMonitor
 from drake_teleop.station.slave.numeric_inverse_kinematics import (
     NumericInverseKinematics,
@@ -187,6 +187,8 @@ LIMIT = 'lower="-2.2" upper="2.2"'
         ("revolute", 'lower="-1.5" upper="2"', (-1.5, 2.0), ""),
         ("revolute", "", (-np.inf, np.inf), "turns without end for"),
         ("revolute", 'lower="0" upper="0"', (-np.inf, np.inf), "turns without end for"),
+        ("revolute", 'lower="-1e16" upper="1e16"', (-np.inf, np.inf), "turns without end for"),
+        ("revolute", 'lower="-1e3" upper="1e3"', (-1e3, 1e3), "limits in rad, though"),
         ("revolute", 'lower="-1"', (-1.0, 2 * np.pi - 1), "one turn from the only"),
         ("revolute", 'upper="1"', (1 - 2 * np.pi, 1.0), "one turn from the only"),
         ("continuous", "", (-np.inf, np.inf), "turns without end for"),

@@ -39,6 +39,8 @@ from drake_teleop.station.slave.arm import (
 _DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
+# Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
+_MAX_LIMIT = 1e4
 # Default time to full speed [s].
 _TIME_TO_FULL_SPEED_S = 0.4
 
@@ -117,11 +119,12 @@ def _per_joint(values: list[float]) -> Array:
 
 
 def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
-    """Return the joint limits; a revolute joint without limits turns without end."""
+    """Return the joint limits, -inf or inf for none; a revolute joint then turns without end."""
     lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
     # Exporters write 0 to 0 for unknown limits.
-    endless = isinstance(joint, RevoluteJoint) and lower == upper == 0.0
-    return (-np.inf, np.inf) if endless else (lower, upper)
+    if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
+        return -np.inf, np.inf
+    return -np.inf if lower < -_MAX_LIMIT else lower, np.inf if upper > _MAX_LIMIT else upper
 
 
 def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
@@ -227,7 +230,7 @@ def with_all_limits(
             where=where,
             remedy="correct the limits, or make the joint a fixed one",
         )
-    reach, speed = _DEFAULT_PRISMATIC
+    reach, slide_speed = _DEFAULT_PRISMATIC
     lower = np.where(unlimited & slides, -reach, arm.lower)
     upper = np.where(unlimited & slides, reach, arm.upper)
     half_limited = np.isinf(lower) != np.isinf(upper)
@@ -236,7 +239,7 @@ def with_all_limits(
         np.where(half_limited & np.isinf(lower), upper - width, lower),
         np.where(half_limited & np.isinf(upper), lower + width, upper),
     )
-    speed = np.where(slides, speed, _DEFAULT_SPEED_RAD_S)
+    speed = np.where(slides, slide_speed, _DEFAULT_SPEED_RAD_S)
     velocity = np.where(_is_specified(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_specified(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit

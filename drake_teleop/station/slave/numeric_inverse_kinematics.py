@@ -315,7 +315,8 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
 
     The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
     joints take the full rotation nearest to the reference. Without a solution, the positions
-    nearest to the pose are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
+    nearest to the pose are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the
+    singularity.
     """
     n, lower, upper = arm.num_joints, arm.lower, arm.upper
     first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
