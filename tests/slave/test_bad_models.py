@@ -218,10 +218,10 @@ ERRORS = {
 }  # fmt: skip
 ASSUMED = {
     "nothing": (arm(), "acceleration limits that reach full speed"),
-    "no limits": (arm().replace(LIMIT, ""), "a range of .* rad for all joints"),
-    "no range": (with_limit("<limit/>"), "a range of .* rad for j3"),
+    "no limits": (arm().replace(LIMIT, ""), "turns without end for all joints"),
+    "no range": (with_limit("<limit/>"), "turns without end for j3"),
     "continuous": (with_limit("").replace('"j3" type="revolute"', '"j3" type="continuous"'),
-                   "a range of .* rad for j3"),
+                   "turns without end for j3"),
     "no speed": (with_limit('<limit velocity="0" effort="200"/>'), "a speed limit of .* for j3"),
     "no strength": (with_limit('<limit velocity="3" effort="0"/>'), "no torque limit for j3"),
     "limits in degrees": (with_limit('<limit lower="-170" upper="170"/>'),

@@ -14,7 +14,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, MultibodyForces, SpatialInertia
 
 from drake_teleop.common.numeric import Array
-from drake_teleop.lab.excitation.limits import LIMITS
 from drake_teleop.lab.excitation.robot import Robot
 from drake_teleop.load.trajectory import FourierTrajectory
 
@@ -85,9 +84,9 @@ def check_motion(
         _largest_use("clearance", motion.clearance[:, np.newaxis], t, ("",)),
     ]
     uses[-1] = replace(uses[-1], what=motion.nearest[int(np.argmax(motion.clearance))])
-    if np.isinf(limits.box_half).all():
-        del uses[LIMITS.index("workspace")]
-    return sorted(uses, key=lambda use: -use.share)
+    without_end = {"position": limits.q_half, "workspace": limits.box_half}
+    missing = [name for name, half in without_end.items() if np.isinf(half).all()]
+    return sorted((use for use in uses if use.limit not in missing), key=lambda use: -use.share)
 
 
 def _largest_use(limit: str, shares: Array, t: Array, names: tuple[str, ...]) -> Use:

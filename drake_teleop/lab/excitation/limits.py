@@ -37,7 +37,7 @@ class Limits(NamedTuple):
     """Limits of an excitation. The use of a limit is a share; a use of 1 reaches the limit.
 
     Attributes:
-        q_middle, q_half: (n,) middle and half of the joint ranges [rad].
+        q_middle, q_half: (n,) middle and half of the joint ranges [rad]; half may be inf.
         velocity, acceleration, effort: (n,) joint limits [rad/s], [rad/s^2], [N m]; may be inf.
         phi: (10,) heaviest expected load about the origin of S.
         sensor: (4,) largest norms of force [N], torque [N m], s [m/s^2], alpha [rad/s^2] at S.
@@ -67,6 +67,11 @@ class Limits(NamedTuple):
     pairs: NDArray[np.int64]
     distances: Array
     clearance: float
+
+
+def sampled_half(q_half: Array) -> Array:
+    """Return the half ranges (n,) for random postures: half a turn without limits."""
+    return np.where(np.isfinite(q_half), q_half, np.pi)
 
 
 @njit(cache=True)

@@ -22,6 +22,7 @@ from drake_teleop.lab.excitation.limits import (
     empty_motions,
     limit_uses,
     motions_of,
+    sampled_half,
     sensor_vectors,
 )
 from drake_teleop.load.trajectory import FourierTrajectory
@@ -104,7 +105,8 @@ class Problem:
         )
         q0 = task.home + 0.1 * rng.standard_normal(len(size))
         if not near_home:
-            q0 = limits.q_middle + 0.6 * limits.q_half * rng.uniform(-1, 1, len(size))
+            half = sampled_half(limits.q_half)
+            q0 = limits.q_middle + 0.6 * half * rng.uniform(-1, 1, len(size))
         return np.concatenate([q0, spread * rng.standard_normal(len(spread))])
 
     def bounds(self, x: Array) -> Bounds | None:

@@ -17,7 +17,7 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array
 from drake_teleop.lab.excitation.collision import CLEARANCE, Parse, Scene
 from drake_teleop.lab.excitation.criteria import Scales, characteristic_length
-from drake_teleop.lab.excitation.limits import Limits
+from drake_teleop.lab.excitation.limits import Limits, sampled_half
 from drake_teleop.lab.excitation.prediction import SensorNoise, sensor_noise
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.station.scenario import Scenario, check_scenario
@@ -200,8 +200,9 @@ def _make_robot(
     Shapes that touch in the `start` posture (n,), if known, may touch.
     """
     arm = scene.arm
-    middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
-    postures = middle + half * np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
+    middle, half = arm.middle, (arm.upper - arm.lower) / 2
+    random = np.random.default_rng(0).uniform(-1, 1, (_NUM_POSTURES, len(half)))
+    postures = middle + sampled_half(half) * random
     candidates, touching = scene.without_neighbours(postures, start)
     if touching:
         assumptions.append(

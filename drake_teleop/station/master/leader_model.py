@@ -144,7 +144,7 @@ class Leader:
         if self.home:
             return self._per_joint("home", arm, 0.0)
         within = (arm.lower <= 0.0) & (arm.upper >= 0.0)
-        return np.where(within, 0.0, 0.5 * (arm.lower + arm.upper))
+        return np.where(within, 0.0, arm.middle)
 
     def _per_joint(self, name: str, arm: ArmModel, otherwise: float | Array) -> Array:
         values, n = getattr(self, name), arm.num_joints

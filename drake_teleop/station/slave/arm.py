@@ -62,8 +62,7 @@ class ArmModel:
             22 rotor inertia [kg m^2]; 23 damping [N m s/rad]; 24 dry friction [N m], for
             `forward_dynamics` only; 25 is 1 for a prismatic joint. Last row, 22-24: gravity
             [m/s^2].
-        lower: (n,) lower joint limits [rad].
-        upper: (n,) upper joint limits [rad].
+        lower, upper: (n,) joint limits [rad], -inf and inf for joints that turn without end.
         velocity_limit: (n,) speed limits [rad/s], inf if unknown.
         acceleration_limit: (n,) acceleration limits [rad/s^2], inf if unknown.
         effort_limit: (n,) torque limits [N m], inf if unknown.
@@ -85,6 +84,15 @@ class ArmModel:
     def num_joints(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
+
+    @property
+    def middle(self) -> Array:
+        """Middles (n,) of the joint ranges; without both limits the position nearest to 0."""
+        bounded = np.isfinite(self.lower) & np.isfinite(self.upper)
+        with np.errstate(invalid="ignore"):  # inf - inf
+            return np.where(
+                bounded, (self.lower + self.upper) / 2, np.clip(0.0, self.lower, self.upper)
+            )
 
     @property
     def phi_load(self) -> Array:

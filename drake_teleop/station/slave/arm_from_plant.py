@@ -35,10 +35,12 @@ from drake_teleop.station.slave.arm import (
     Array,
 )
 
-# Default half range and speed: revolute [rad, rad/s], prismatic [m, m/s].
-_DEFAULT_REVOLUTE, _DEFAULT_PRISMATIC = (np.pi, np.pi), (1.0, 1.0)
+# Default speed of a revolute joint [rad/s]; half range and speed of a prismatic one [m, m/s].
+_DEFAULT_SPEED_RAD_S, _DEFAULT_PRISMATIC = np.pi, (1.0, 1.0)
 # Largest plausible range of a revolute joint [rad]; a larger one may be in degrees.
 _MAX_PLAUSIBLE_RANGE_RAD = 8 * np.pi
+# Numbers above it stand for no limit [rad, m]; SDF specifies 1e16.
+_MAX_LIMIT = 1e4
 # Default time to full speed [s].
 _TIME_TO_FULL_SPEED_S = 0.4
 
@@ -98,11 +100,12 @@ def ArmModelFromPlant(
             X_LB = X_WL[body_row].InvertAndCompose(body.EvalPoseInWorld(context))
             M_B = body.CalcSpatialInertiaInBodyFrame(context)
             table[body_row, PHI:ROTOR] += _phi_of_body(M_B, X_LB)
+    lower, upper = np.array([_range(j) for j in joints]).T.copy()
     return ArmModel(
         joint_names=tuple(joint.name() for joint in joints),
         table=table,
-        lower=_per_joint([j.position_lower_limits()[0] for j in joints]),
-        upper=_per_joint([j.position_upper_limits()[0] for j in joints]),
+        lower=lower,
+        upper=upper,
         velocity_limit=_per_joint([j.velocity_upper_limits()[0] for j in joints]),
         acceleration_limit=_per_joint([j.acceleration_upper_limits()[0] for j in joints]),
         effort_limit=_per_joint([_effort_limit(plant, j) for j in joints]),
@@ -113,6 +116,15 @@ def ArmModelFromPlant(
 
 def _per_joint(values: list[float]) -> Array:
     return np.array(values, dtype=np.float64)
+
+
+def _range(joint: RevoluteJoint | PrismaticJoint) -> tuple[float, float]:
+    """Return the joint limits, -inf or inf for none; a revolute joint then turns without end."""
+    lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+    # Exporters write 0 to 0 for unknown limits.
+    if isinstance(joint, RevoluteJoint) and lower == upper == 0.0:
+        return -np.inf, np.inf
+    return -np.inf if lower < -_MAX_LIMIT else lower, np.inf if upper > _MAX_LIMIT else upper
 
 
 def _axis(joint: RevoluteJoint | PrismaticJoint) -> Array:
@@ -206,11 +218,9 @@ def with_all_limits(
         DrakeTeleopError: for a fixed joint or a wrong number of accelerations.
     """
     n, assumptions = arm.num_joints, []
-    # Exporters write 0 to 0 for unknown limits.
-    unlimited = ~(np.isfinite(arm.lower) & np.isfinite(arm.upper)) | (
-        (arm.lower == 0) & (arm.upper == 0)
-    )
     slides = arm.table[:-1, SLIDES] != 0.0
+    unlimited = (arm.lower == -np.inf) & (arm.upper == np.inf)
+    unlimited |= slides & (arm.lower == 0.0) & (arm.upper == 0.0)  # as in `_range`
     immovable = ~unlimited & (arm.lower == arm.upper)
     if immovable.any():
         unit = "m" if slides[immovable][0] else "rad"
@@ -220,7 +230,16 @@ def with_all_limits(
             where=where,
             remedy="correct the limits, or make the joint a fixed one",
         )
-    reach, speed = (np.where(slides, _DEFAULT_PRISMATIC[k], _DEFAULT_REVOLUTE[k]) for k in range(2))
+    reach, slide_speed = _DEFAULT_PRISMATIC
+    lower = np.where(unlimited & slides, -reach, arm.lower)
+    upper = np.where(unlimited & slides, reach, arm.upper)
+    half_limited = np.isinf(lower) != np.isinf(upper)
+    width = np.where(slides, 2 * reach, 2 * np.pi)
+    lower, upper = (
+        np.where(half_limited & np.isinf(lower), upper - width, lower),
+        np.where(half_limited & np.isinf(upper), lower + width, upper),
+    )
+    speed = np.where(slides, slide_speed, _DEFAULT_SPEED_RAD_S)
     velocity = np.where(_is_specified(arm.velocity_limit), arm.velocity_limit, speed)
     effort = np.where(_is_specified(arm.effort_limit), arm.effort_limit, np.inf)
     specified = arm.acceleration_limit
@@ -234,27 +253,24 @@ def with_all_limits(
         specified = np.broadcast_to(np.array(acceleration), n).copy()
     completed = replace(
         arm,
-        lower=np.where(unlimited, -reach, arm.lower),
-        upper=np.where(unlimited, reach, arm.upper),
+        lower=lower,
+        upper=upper,
         velocity_limit=velocity,
         acceleration_limit=np.where(
             _is_specified(specified), specified, velocity / _TIME_TO_FULL_SPEED_S
         ),
         effort_limit=effort,
     )
-    plausible = slides | unlimited | (arm.upper - arm.lower < _MAX_PLAUSIBLE_RANGE_RAD)
+    plausible = slides | unlimited | (upper - lower < _MAX_PLAUSIBLE_RANGE_RAD)
     acceleration_text = (
         f"acceleration limits that reach full speed in {_TIME_TO_FULL_SPEED_S:g} s{hint}"
     )
     for missing, revolute_text, prismatic_text in (
-        (
-            unlimited,
-            f"a range of +-{_DEFAULT_REVOLUTE[0]:.4g} rad",
-            f"a range of +-{_DEFAULT_PRISMATIC[0]:g} m",
-        ),
+        (unlimited, "turns without end", f"a range of +-{reach:g} m"),
+        (half_limited, "a range of one turn from the only limit", f"a range of {2 * reach:g} m"),
         (
             ~_is_specified(arm.velocity_limit),
-            f"a speed limit of {_DEFAULT_REVOLUTE[1]:.4g} rad/s",
+            f"a speed limit of {_DEFAULT_SPEED_RAD_S:.4g} rad/s",
             f"a speed limit of {_DEFAULT_PRISMATIC[1]:g} m/s",
         ),
         (~_is_specified(specified), acceleration_text, acceleration_text),

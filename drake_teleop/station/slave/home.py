@@ -35,9 +35,10 @@ def tool_down(
     if has_closed_form(arm):
         return nearest_branch(R_WS.matrix(), position, _Q_HOME_REFERENCE, arm.lower, arm.upper)
     pose = np.array([*R_WS.ToQuaternion().wxyz(), *position])
-    middle, half = (arm.lower + arm.upper) / 2, (arm.upper - arm.lower) / 2
+    middle = arm.middle
     for share in _RANGE_SHARES:
-        inside = replace(arm, lower=middle - share * half, upper=middle + share * half)
+        lower, upper = (middle + share * (limit - middle) for limit in (arm.lower, arm.upper))
+        inside = replace(arm, lower=lower, upper=upper)
         q, status = find_posture(inside, pose, middle)
         if status == IkStatus.OK:
             break

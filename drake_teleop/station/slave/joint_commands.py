@@ -152,7 +152,7 @@ class SlaveMonitor(LeafSystem):
             discrete_state.set_value(0, self._status.Eval(context))
         q = self._state.Eval(context)[: self._arm.num_joints]
         # A comparison with NaN is false, so NaN counts as outside.
-        inside = (q >= self._lower) & (q <= self._upper)
+        inside = (q >= self._lower) & (q <= self._upper) & np.isfinite(q)
         if inside.all():
             return
         joint = int(inside.argmin())

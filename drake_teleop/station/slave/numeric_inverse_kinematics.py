@@ -165,6 +165,16 @@ def _damped_step(H, g, damping, q, lower, upper, trial):
 
 
 @njit(cache=True)
+def _step_alone(J, e, i):
+    """Return the displacement of joint i alone that reduces the error e (6,) most."""
+    slope, square = 0.0, 0.0
+    for k in range(6):
+        slope += J[k, i] * e[k]
+        square += J[k, i] * J[k, i]
+    return slope / square
+
+
+@njit(cache=True)
 def _singularity_status(L, J):
     """Return WRIST_SINGULAR if the last three axes are nearly coplanar, else SHOULDER_SINGULAR."""
     n = J.shape[1]
@@ -186,7 +196,8 @@ def follow_pose(
         reference: (n,) joint positions, normally the last command.
         lower, upper: (n,) joint limits.
         max_step: (n,) largest distance from the reference.
-        posture: (n,) joint positions that a redundant arm approaches.
+        posture: (n,) joint positions that a redundant arm approaches; of an endless joint, the
+            nearest turn. An endless last joint turns the tool instead.
         pull: fraction of the distance to the posture.
         singular: singular value below which the motion is damped [m].
         steps: maximum number of steps.
@@ -205,10 +216,16 @@ def follow_pose(
             q[i] = q[i] if sound(reference) else np.nan
         return _BAD_POSE
     start, towards_posture = q.copy(), n > 6 and pull > 0.0
-    if towards_posture:
-        for i in range(n):
-            q[i] = min(max(q[i] + pull * (posture[i] - q[i]), low[i]), high[i])
     x, e, J, H = np.empty(21), np.empty(6), np.empty((6, n)), np.empty((n, n))
+    if towards_posture:
+        if upper[n - 1] - lower[n - 1] == np.inf:
+            _jacobian_and_error(table, L, pose, q, x, J, e)
+        for i in range(n):
+            step = pull * (posture[i] - q[i])
+            if upper[i] - lower[i] == np.inf:
+                # The last joint turns the tool without the links.
+                step = pull * np.sin(posture[i] - q[i]) if i < n - 1 else _step_alone(J, e, i)
+            q[i] = min(max(q[i] + step, low[i]), high[i])
     g, trial, anchor, kept = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     B, u = np.empty((min(n, 6), min(n, 6))), np.empty(min(n, 6))
     squared = _jacobian_and_error(table, L, pose, q, x, J, e)
@@ -297,12 +314,13 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
     """Return joint positions (n,) that meet the pose X_WS (7,), and the `IkStatus`.
 
     The search starts at the reference (n,) and then elsewhere; the first solution wins. Revolute
-    joints take the full rotation nearest to the reference. Without a solution, the nearest
-    positions are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the singularity.
+    joints take the full rotation nearest to the reference. Without a solution, the positions
+    nearest to the pose are returned, with OUT_OF_REACH, JOINT_LIMIT or, within 1 mm, the
+    singularity.
     """
-    n = arm.num_joints
-    lower = np.where(np.isfinite(arm.lower), arm.lower, reference - np.pi)
-    upper = np.where(np.isfinite(arm.upper), arm.upper, reference + np.pi)
+    n, lower, upper = arm.num_joints, arm.lower, arm.upper
+    first = np.where(np.isfinite(lower), lower, reference - np.pi)  # of the other starts
+    width = np.where(np.isfinite(upper), upper, reference + np.pi) - first
     far, q, nearest = np.full(n, np.inf), np.empty(n), np.empty(n)
     # Quasi-random starts (Roberts's R sequence).
     ratio = 2.0
@@ -316,9 +334,7 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             _SEARCH_STEPS, q,
         )  # fmt: skip
         if found in (_OK, _BAD_POSE):
-            turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
-            nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
-            return np.where((lower <= nearer) & (nearer <= upper), nearer, q), IkStatus(found)
+            return _nearest_turns(arm, q, reference), IkStatus(found)
         squared = _jacobian_and_error(arm.table, L, pose, q, x, J, e)
         if squared < smallest:
             smallest, nearest = squared, q.copy()
@@ -326,8 +342,14 @@ def find_posture(arm: ArmModel, pose: Array, reference: Array) -> tuple[Array, I
             if squared < _SEARCH_TOLERANCE_M**2 and np.linalg.svd(J)[1][-1] < SINGULAR:
                 status = _singularity_status(L, J)
         part = (0.5 + (k + 1) * ratio ** -np.arange(1.0, n + 1)) % 1.0
-        start = lower + part * (upper - lower)
-    return nearest, IkStatus(status)
+        start = first + part * width
+    return _nearest_turns(arm, nearest, reference), IkStatus(status)
+
+
+def _nearest_turns(arm: ArmModel, q: Array, reference: Array) -> Array:
+    turns = 2 * np.pi * np.round((reference - q) / (2 * np.pi))
+    nearer = q + np.where(arm.table[:-1, SLIDES] == 0, turns, 0.0)
+    return np.where((arm.lower <= nearer) & (nearer <= arm.upper), nearer, q)
 
 
 def orientation_length(arm: ArmModel) -> float:
