@@ -11,15 +11,13 @@ from rich.table import Table
 
 _HEAD = """# Arms tried
 
-Published arm files, unchanged, each with one command:
+Published arm files, unchanged. Each was tried with one command, with file and frame of its row:
+`drake-teleop new FOLDER --arm FILE --sensor-frame FRAME`.
 
-```sh
-drake-teleop new FOLDER --arm FILE --sensor-frame FRAME
-```
-
-`benchmarks/arms.py` makes this page. It takes the files from packages of the Python Package Index, because
-their licences differ. Their kinematics, masses and limits are compared with an independent reader (MuJoCo for
-MJCF, yourdfpy for URDF). Another version of a package may contain other files.
+`benchmarks/arms.py` makes this page. It takes the files from packages of the Python Package Index;
+their licences differ, so they are not included here. It compares kinematics, masses and limits with
+an independent reader: MuJoCo for MJCF, yourdfpy for URDF. The column "assumed" has what the command
+prints about missing or impossible values.
 
 | file | package | joints | sensor frame | assumed | first run |
 |---|---|---|---|---|---|

@@ -57,9 +57,8 @@ def _overlaps(plant: MultibodyPlant, context: Any) -> list[str]:
         for joint in joints
     }
     for pair in query.ComputePointPairPenetration():
-        bodies = [
-            plant.GetBodyFromFrameId(inspector.GetFrameId(shape)) for shape in (pair.id_A, pair.id_B)
-        ]
+        frames = (inspector.GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
+        bodies = [plant.GetBodyFromFrameId(frame) for frame in frames]
         ends = frozenset(groups[body.index()] for body in bodies)
         if pair.depth > _MIN_DEPTH_M and len(ends) == 2 and ends not in joined:
             text = " and ".join(sorted(body.name() for body in bodies))
