@@ -186,8 +186,10 @@ class Row:
         row: dict[str, Any] = {
             "package": self.file.package, "file": self.file.name, "frame": self.file.frame,
         }  # fmt: skip
-        lines = self._found.read_text(encoding="utf-8").splitlines() if self._found.exists() else []
-        for line in lines:
+        text = self._found.read_text(encoding="utf-8") if self._found.exists() else ""
+        for folder in (str(self.file.path).removesuffix(self.file.name), f"{self._folder.name}/"):
+            text = text.replace(folder, "")  # messages have paths of this machine
+        for line in text.splitlines():
             row |= json.loads(line)
         unfinished = row.pop("stage", None)
         if unfinished is not None:

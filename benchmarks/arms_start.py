@@ -39,7 +39,7 @@ def start_figures(scenario: Scenario) -> dict[str, Any]:
     return {
         "start": [round(float(x), 4) for x in q],
         "overlaps": _overlaps(plant, context),
-        "lowest_shape_m": lowest - plane,
+        **({"lowest_shape_m": lowest - plane} if np.isfinite(lowest) else {}),
         **_elbow(origins, plane),
         "sigma_over_L": _least_singular_value(plant, context, parsed, arm, origins),
         "limit_margin": _limit_margin(arm, q),
