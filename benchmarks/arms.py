@@ -224,8 +224,9 @@ def _run_stages(file: ArmFile, stages: list[str], folder: Path, found: Path) -> 
         return row
 
     if "read" in stages:
-        read = stage("read", lambda: _read_figures(*_read_package(file)))
-        stage("check", _check, file, "error" not in read)
+        arms: list[ArmModel] = []
+        stage("read", _read, file, arms)
+        stage("check", _check, file, arms)
     if "plan" in stages or "run" in stages:
         plan = stage("plan", _plan, file, folder / "station")
         if "run" in stages and "error" not in plan:
@@ -249,15 +250,17 @@ def _read_package(file: ArmFile) -> tuple[ArmModel, list[str]]:
     return arm, [*parsed.assumptions, *assumed]
 
 
-def _read_figures(arm: ArmModel, assumed: list[str]) -> dict[str, Any]:
+def _read(file: ArmFile, arms: list[ArmModel]) -> dict[str, Any]:
+    arm, assumed = _read_package(file)
+    arms.append(arm)
     return {"joints": list(arm.joint_names), "assumed": assumed}
 
 
-def _check(file: ArmFile, is_read: bool) -> dict[str, Any]:
-    """Compare the package's arm with the independent reader's."""
+def _check(file: ArmFile, arms: list[ArmModel]) -> dict[str, Any]:
+    """Compare the package's arm, if it was read, with the independent reader's."""
     reference = read_reference(file.path, file.frame)
     figures: dict[str, Any] = {"reader": reference.reader, "joints": len(reference.joints)}
-    return figures | compare(_read_package(file)[0], reference, file.name) if is_read else figures
+    return figures | compare(arms[0], reference, file.name) if arms else figures
 
 
 def compare(arm: ArmModel, reference: Reference, name: str) -> dict[str, Any]:
@@ -347,10 +350,13 @@ def _plan(file: ArmFile, folder: Path) -> dict[str, Any]:
 
 
 def _run(folder: Path) -> dict[str, Any]:
-    summary = run_command(folder / "station.yaml", folder / "first_run", quiet=True, progress=False)
+    summary = run_command(
+        folder / "station.yaml", folder / "first_run", fresh=True, quiet=True, progress=False
+    )
     keys = ("real_time_factor", "joint_speed_use", "joint_torque_use", "peak_contact_force_N")
-    figures = {key: summary[key] for key in keys}
-    return figures | {key: summary[key] for key in ("warnings", "assumed", "true_contact_s")}
+    figures: dict[str, Any] = {key: summary[key] for key in keys}
+    figures["contacts"] = len(summary["true_contact_s"])
+    return figures | {key: summary.get(key, []) for key in ("warnings", "assumed")}
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -265,3 +266,16 @@ def test_a_process_that_dies_or_hangs_is_a_row(
     assert text in row["check"]["error"]
     page = arms.page_text([row | {"plan": {"error": "link a|b_c: <none>"}}])
     assert "<summary>no start found</summary>link a&#124;b&#95;c: &lt;none&gt;</details> |" in page
+
+
+@pytest.mark.long
+def test_six_published_arms_are_read_and_planned(arms: ModuleType, tmp_path: Path) -> None:
+    robots = importlib.metadata.distribution("example-robot-data").locate_file("")
+    (tmp_path / "example_robot_data").symlink_to(str(robots))
+    names = ("baxter", "panda", "romeo", "tiago_no_hand", "ur5_robot", "ur10_joint_limited_robot")
+    files = [arms.matrix(tmp_path, f"example-robot-data/*/{name}.urdf")[0] for name in names]
+    rows = arms.measure(files, ["read", "plan"], jobs=2)
+    assert [len(row["read"]["joints"]) for row in rows] == [7, 7, 8, 8, 6, 6]
+    assert [row["plan"].get("error") for row in rows] == 6 * [None]
+    if importlib.util.find_spec("yourdfpy") is not None:
+        assert [row["check"]["differs"] for row in rows] == 6 * [[]]
