@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib.metadata
 import importlib.util
 import json
 import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -141,3 +145,137 @@ def test_a_mutant_is_killed_or_named_and_the_sources_stay_as_they_are(tmp_path: 
     assert (figures["load.made"], figures["load.killed"], figures["load.survived"]) == (3, 2, 1)
     assert "load/half.py:3 (removed)\n  - return 0.5 * abs(x)\n  + return 0.5 * (x)\n" in said
     assert {name: (tmp_path / "root" / name).read_text() for name in files} == files
+
+
+# arms.py
+
+ARM_SDF = """<sdf version="1.7"><model name="arm"><link name="base"/>
+<link name="a"><pose>0 0 0.4 0 0 0.5</pose>
+<inertial><mass>3</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial></link>
+<link name="b"><pose>0.1 0 0.9 0.3 0 0</pose>
+<inertial><mass>2</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial></link>
+<link name="tool"><pose>0.1 0 1.2 0 0 0</pose>
+<inertial><mass>0.5</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial></link>
+<joint name="turn" type="revolute"><parent>base</parent><child>a</child><axis><xyz>0 0.6 0.8</xyz>
+<limit><lower>-2</lower><upper>1</upper><effort>30</effort></limit></axis></joint>
+<joint name="slide" type="prismatic"><pose>0 0 0.1 0 0.7 0</pose><parent>a</parent>
+<child>b</child><axis><xyz>1 0 0</xyz>
+<limit><lower>0</lower><upper>0.3</upper><effort>80</effort></limit></axis></joint>
+<joint name="weld" type="fixed"><parent>b</parent><child>tool</child></joint>
+</model></sdf>"""
+ARM_MJCF = """<mujoco model="arm"><worldbody><body name="a" pos="0 0 0.3"><freejoint/>
+<geom size="0.1" mass="4"/><body name="b" pos="0 0 0.2" euler="90 0 0">
+<joint name="turn" axis="0 0 1" ref="30" range="-90 60" actuatorfrcrange="-40 40"/>
+<geom size="0.1" mass="2"/><site name="ft" pos="0 0 0.1" euler="0 90 0"/>
+<body name="c" pos="0.5 0 0"><joint name="slide" type="slide" axis="1 0 0"/>
+<geom size="0.1" mass="1"/><body name="d" pos="0.2 0 0"><geom size="0.1" mass="0.25"/></body></body>
+</body></body></worldbody><actuator>
+<position joint="turn" ctrlrange="-3.14 3.14" forcerange="-5 5" gear="10" kp="9"/>
+<motor joint="slide" ctrlrange="-2 2" gear="50"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def arms() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("arms", FOLDER / "arms.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["arms"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def arm_file(arms: ModuleType, folder: Path) -> Any:
+    path = folder / "arm.sdf"
+    path.write_text(ARM_SDF, encoding="utf-8")
+    return arms.ArmFile("package", "arm.sdf", path, "b")
+
+
+def test_the_matrix_has_72_files_and_a_pattern_selects(arms: ModuleType, tmp_path: Path) -> None:
+    files = arms.matrix(tmp_path)
+    assert len(files) == len(set(files)) == 72
+    (chosen,) = arms.matrix(tmp_path, "rtb-data/*puma*")
+    assert (chosen.package, chosen.frame) == ("rtb-data", "link7")
+    assert chosen.path.is_relative_to(tmp_path / "rtb_data")
+
+
+def test_an_arm_that_is_read_right_differs_in_nothing(arms: ModuleType, tmp_path: Path) -> None:
+    file = arm_file(arms, tmp_path)
+    reference = arms.read_reference(file.path, "b")
+    assert [joint.name for joint in reference.joints] == ["turn", "slide"]
+    assert (reference.mass_beyond, reference.mass_moved) == (0.5, 5.5)
+    figures = arms.compare(arms._read_package(file)[0], reference, "arm.sdf")
+    assert figures["differs"] == []
+    assert figures["position_m"] < 1e-12
+    assert abs(figures["mass_moved_kg"]) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"effort_limit": [30.0, 8.0]}, "effort of slide: 8, file: 80"),
+        ({"upper": [1.1, 0.3]}, "upper of turn: 1.1, file: 1"),
+        ({"lower": [-2.0, -1.0]}, "lower of slide: -1, file: 0"),
+        ({"table": (1, 9, 2e-6)}, "position_m"),  # the slide's origin
+        ({"table": (2, 12, 0.1)}, "mass_beyond_kg 0.1"),
+        ({"joint_names": ("slide", "turn")}, "rotation_rad"),
+        ({"joint_names": ("turn", "other")}, "joints ['turn', 'other'], own SDF:"),
+        ({"table": (0, 9, 0.5)}, ""),  # the base is elsewhere
+    ],
+)
+def test_planted_differences_are_found(
+    arms: ModuleType, tmp_path: Path, change: dict[str, Any], text: str
+) -> None:
+    file = arm_file(arms, tmp_path)
+    arm, reference = arms._read_package(file)[0], arms.read_reference(file.path, "b")
+    for name, value in change.items():
+        if name == "table":
+            row, column, added = value
+            arm.table[row, column] += added
+        else:
+            changed = value if name == "joint_names" else np.array(value)
+            arm = dataclasses.replace(arm, **{name: changed})
+    differs = arms.compare(arm, reference, "arm.sdf")["differs"]
+    assert text in "; ".join(differs)
+    assert bool(differs) == bool(text)
+
+
+def test_mujoco_gives_sites_and_torque_limits(arms: ModuleType, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM_MJCF, encoding="utf-8")
+    at_site, at_body = (arms.read_reference(path, frame) for frame in ("ft", "c"))
+    assert [joint.effort for joint in at_body.joints] == [40.0, 100.0]
+    assert at_body.joints[0].upper == pytest.approx(np.pi / 3)
+    assert [at_site.mass_beyond, at_body.mass_beyond] == [0.0, 0.25]
+    assert (at_site.mass_moved, len(at_site.joints)) == (3.25, 1)
+    # At q = ref the body is as drawn; the site is 0.1 m along the body's z, which is -y_W.
+    X = at_site.pose(np.array([np.pi / 6]))
+    np.testing.assert_allclose(X[:3, 3], [0, -0.1, 0.5], atol=1e-12)
+    np.testing.assert_allclose(X[:3, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("ending", "text"), [("exit", "exit 3"), ("sleep", "longer than")])
+def test_a_process_that_dies_or_hangs_is_a_row(
+    arms: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str, text: str
+) -> None:
+    end = {"exit": lambda *_: os._exit(3), "sleep": lambda *_: time.sleep(60)}[ending]
+    monkeypatch.setattr(arms, "_check", end)
+    monkeypatch.setitem(arms.TIME_LIMITS, "read", 1.5)
+    (row,) = arms.measure([arm_file(arms, tmp_path)], ["read"], jobs=2)
+    assert row["read"]["joints"] == ["turn", "slide"]
+    assert text in row["check"]["error"]
+    page = arms.page_text([row | {"plan": {"error": "link a|b_c: <none>"}}])
+    assert "<summary>no start found</summary>link a&#124;b&#95;c: &lt;none&gt;</details> |" in page
+
+
+@pytest.mark.long
+def test_six_published_arms_are_read_and_planned(arms: ModuleType, tmp_path: Path) -> None:
+    robots = importlib.metadata.distribution("example-robot-data").locate_file("")
+    (tmp_path / "example_robot_data").symlink_to(str(robots))
+    names = ("baxter", "panda", "romeo", "tiago_no_hand", "ur5_robot", "ur10_joint_limited_robot")
+    files = [arms.matrix(tmp_path, f"example-robot-data/*/{name}.urdf")[0] for name in names]
+    rows = arms.measure(files, ["read", "plan"], jobs=2)
+    assert [len(row["read"]["joints"]) for row in rows] == [7, 7, 8, 8, 6, 6]
+    assert [row["plan"].get("error") for row in rows] == 6 * [None]
+    if importlib.util.find_spec("yourdfpy") is not None:
+        assert [row["check"]["differs"] for row in rows] == 6 * [[]]

@@ -7,26 +7,23 @@ import dataclasses
 import numpy as np
 import pytest
 
-from drake_teleop.lab.identification import slave_arm
+from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
+from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
+from drake_teleop.station.oscillation import find_reversals, oscillates
 from drake_teleop.station.passivity.ledger import LedgerConfig
 from drake_teleop.station.passivity.methods import PassivityConfig
 from drake_teleop.station.result import SimulationResult
-from drake_teleop.station.run_warnings import (
-    find_reversals,
-    find_spans,
-    lag_beyond_delay,
-    oscillates,
-    run_warnings,
-)
+from drake_teleop.station.run_warnings import find_spans, lag_beyond_delay, run_warnings
 from drake_teleop.station.scenario import Scenario, Simulation, replace
 from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
 
 T = np.arange(3001) / 1000
@@ -236,6 +233,82 @@ def test_the_longest_delay_is_that_of_the_latest_packet(tmp_path):
     (tmp_path / "trace.csv").write_text("time,delay\n0,0.02\n1,0.07\n2,\n")
     found = longest_delay(NetworkConfig(trace=str(tmp_path / "trace.csv")))
     assert found == pytest.approx(0.07)
+
+
+def touching(rate_hz, start, stop, peak=20.0, rest=0.0):
+    """Return the force (N,) of half sines that fill half of each period, above `rest` [N]."""
+    force = np.where(during(start, stop), peak * np.sin(2 * np.pi * rate_hz * (T - start)), 0.0)
+    return np.maximum(force, rest)
+
+
+@pytest.mark.parametrize("rate_hz", [5.5, 10.0, 40.0, 98.0])
+@pytest.mark.parametrize("rest", [0.0, 1.5])
+def test_chatter_is_reported_with_rate_force_and_time(rate_hz, rest):
+    stop = 0.5 + max(9 / rate_hz, 0.4)
+    (found,) = find_chatter(T, touching(rate_hz, 0.5, stop, rest=rest), np.empty(0))
+    assert found.rate_hz == pytest.approx(rate_hz, rel=0.02)
+    assert found.peak_force == pytest.approx(20.0, rel=0.02)
+    assert found.touches == pytest.approx((stop - 0.5) * rate_hz, abs=1.1)
+    assert (found.start, found.stop) == pytest.approx((0.5, stop), abs=1.05 / rate_hz + 2e-3)
+
+
+@pytest.mark.parametrize(
+    "force",
+    [
+        touching(4.0, 0.5, 2.9),
+        touching(20.0, 0.5, 0.84),  # 7 touches
+        touching(40.0, 0.5, 0.78),  # too short
+        touching(47.0, 0.5, 2.5, rest=4.0),  # contact is kept: friction
+        touching(40.0, 0.5, 2.5, peak=0.3),
+        touching(300.0, 0.5, 2.5),  # one touch-down with small bounces
+        sum(touching(60.0, start, start + 0.05) for start in (0.5, 1.0, 1.5)),
+        0.0 * T,
+    ],
+)
+def test_slow_short_shallow_or_weak_touches_are_no_chatter(force):
+    assert find_chatter(T, force, np.empty(0)) == []
+
+
+def test_touches_that_the_operator_intends_are_no_chatter():
+    contact = {"true_contact_wrench_W": np.column_stack([*np.zeros((2, len(T)))] + 4 * [0 * T])}
+    for rate_hz, tapping in ((6.0, True), (30.0, False)):
+        contact["true_contact_wrench_W"][:, 2] = touching(rate_hz, 0.5, 2.5)
+        result = recorded(intent=(6, 0.01 * np.sin(2 * np.pi * 6.0 * T) * during(0.4, 2.6)))
+        signals = {name: result[name] for name in result.signals} | contact
+        order = [SIGNALS[name] for name in SIGNALS if name in signals]
+        found = run_warnings(SimulationResult(T, signals, order), OVER_NETWORK, ARM)
+        assert any("contact chatter" in warning for warning in found) != tapping
+
+
+DRAWER = """<sdf version="1.9" xmlns:drake="drake.mit.edu"><model name="drawer"><link name="rail"/>
+<link name="drawer"><inertial><mass>0.3</mass>
+<inertia><ixx>0.001</ixx><iyy>0.001</iyy><izz>0.001</izz></inertia></inertial>
+<collision name="front"><geometry><box><size>0.1 0.1 0.04</size></box></geometry>
+<drake:proximity_properties><drake:point_contact_stiffness>2e4</drake:point_contact_stiffness>
+<drake:hunt_crossley_dissipation>0.2</drake:hunt_crossley_dissipation>
+<drake:mu_dynamic>0.3</drake:mu_dynamic></drake:proximity_properties></collision></link>
+<joint name="slide" type="prismatic"><parent>rail</parent><child>drawer</child><axis>
+<xyz>0 0 1</xyz><limit><lower>-0.1</lower><upper>0.1</upper><effort>0</effort></limit><dynamics>
+<damping>DAMPING</damping><spring_stiffness>300</spring_stiffness></dynamics></axis></joint>
+</model></sdf>"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("damping", "chatters"), [(0.2, True), (3.0, False)])
+def test_chatter_on_a_spring_loaded_drawer_is_reported(tmp_path, damping, chatters):
+    (tmp_path / "drawer.sdf").write_text(DRAWER.replace("DAMPING", str(damping)))
+    drawer = Scene(file=str(tmp_path / "drawer.sdf"), position=[0.55, 0.0, 0.2])
+    move = MinimumJerk(t_start=0.3, duration=0.8, translation=[0.0, 0.0, -0.08])
+    scenario = replace(
+        Scenario(),
+        simulation=Simulation(duration=0.8, settle=0.5),
+        operator=OperatorConfig(intent=[move]),
+        environment=[drawer],
+    )
+    station = MakeTeleopStation(scenario, load_estimate=true_load(scenario))
+    found = run_warnings(simulate(station, scenario.simulation), scenario, slave_arm(scenario))
+    assert len(found) == chatters
+    assert all("touches at 3" in x and "damping of its joint" in x for x in found), found
 
 
 @pytest.mark.slow

@@ -10,9 +10,11 @@ safe state     an end of the channel receives no packets for longer than the cha
 behind         a pose or joint lags its command by more than delay and bandwidth explain
 reserve        the hand is faster than the energy reserve of `ledger` allows for the slave
 oscillation    hand, command or joint oscillates (limit cycle) while its command does not
+chatter        the tool loses and regains contact, see `drake_teleop.station.contact_chatter`
 ============== ===================================================================================
 
-The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total).
+The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total;
+`chatter`: 0.3 s).
 """
 
 from __future__ import annotations
@@ -28,8 +30,16 @@ from drake_teleop.common.style import contact_spans
 from drake_teleop.load.regressor import LOST
 from drake_teleop.station.channel.network import FORWARD, longest_delay, newest_packets
 from drake_teleop.station.channel_side import passivity_with_arm_mass, power_scale
+from drake_teleop.station.contact_chatter import find_chatter
 from drake_teleop.station.master.dynamics import HapticDevice
 from drake_teleop.station.master.leader import LeaderDevice
+from drake_teleop.station.oscillation import (
+    REVERSAL_WINDOW_S,
+    oscillates,
+    pose_oscillates,
+    pose_reversals,
+    rotation_near,
+)
 from drake_teleop.station.passivity.ledger import fastest
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
@@ -51,13 +61,8 @@ _MIN_LAG_M, _MIN_LAG_RAD, _MIN_JOINT_LAG_RAD = 2e-3, np.deg2rad(1.0), np.deg2rad
 # Settling time of the command of `ledger` with sufficient energy [s].
 _SETTLING_TIME_S = 0.05
 _DEGREES_PER_RAD = 180 / np.pi
-# Smallest reported amplitude: position [m] and orientation [rad] of hand and command, joint [rad].
-_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
+# Smallest reported amplitude of a joint.
 _MIN_JOINT_AMPLITUDE_RAD = np.deg2rad(0.1)
-_REVERSAL_WINDOW_S = 0.25
-"""Largest time between a reversal of the command and the reversal that it explains [s]."""
-# Smallest number of reversals of an oscillation, and longest time between two of them [s].
-_MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
 # Number of time constants of the position loop until the error is 0.3 %.
 _SETTLING_TIME_CONSTANTS = 6.0
 # Largest number of time spans that a warning lists; further ones are counted.
@@ -78,6 +83,7 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_channel(result, scenario),
         _check_joints(result, scenario, arm),
         _check_hand(result),
+        _check_contact(result),
     )
     return [f"{condition} {_times_text(spans)}" for condition, spans in found if spans]
 
@@ -110,52 +116,6 @@ def lag_beyond_delay(t: Array, command: Array, actual: Array, window: float) -> 
     above = actual - _running_maximum(command, rows)
     below = -_running_maximum(-command, rows) - actual
     return np.linalg.norm(np.maximum(np.maximum(above, below), 0.0), axis=1)
-
-
-def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
-    """Return indices of local extremes of x (N,) that differ by more than `swing` from the last."""
-    slope = np.diff(x)
-    near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
-    found: list[int] = []
-    high = low = 0
-    rising = 0  # 0: unknown
-    for k in [*near, len(x) - 1]:
-        high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
-        if rising >= 0 and x[high] - x[k] > swing:
-            found += [high] if rising else []
-            rising, high, low = -1, k, k
-        elif rising <= 0 and x[k] - x[low] > swing:
-            found += [low] if rising else []
-            rising, high, low = 1, k, k
-    return np.array(found, dtype=np.intp)
-
-
-def oscillates(
-    t: Array, command: Array, actual: Array, swing: float, near: float = _REVERSAL_WINDOW_S
-) -> Flags:
-    """Return (N,) booleans: True while the actual motion oscillates and the command does not.
-
-    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
-    of the command explains one reversal of the motion within the time `near`.
-
-    Args:
-        t: (N,) times [s].
-        command, actual: (N, k) commanded and actual motion in one unit.
-        swing: smallest amplitude, in that unit.
-        near: largest time between the two reversals [s].
-    """
-    asked = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
-    oscillating = np.zeros(len(t), dtype=bool)
-    for x in actual.T:
-        mine = find_reversals(x, swing)
-        for time in asked:
-            if len(mine) and abs(t[mine] - time).min() < near:
-                mine = np.delete(mine, abs(t[mine] - time).argmin())
-        gaps = np.flatnonzero(np.diff(t[mine]) > _MAX_REVERSAL_INTERVAL_S)
-        for series in np.split(mine, gaps + 1):
-            if len(series) >= _MIN_REVERSALS:
-                oscillating[series[0] : series[-1] + 1] = True
-    return oscillating
 
 
 def _check_faults(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
@@ -238,7 +198,7 @@ def _check_channel(result: SimulationResult, scenario: Scenario) -> Iterator[tup
             spans,
         )
     yield from _check_reserve(result, scenario)
-    oscillating = _pose_oscillates(t, sent, received, _REVERSAL_WINDOW_S + window)
+    oscillating = pose_oscillates(t, sent, received, REVERSAL_WINDOW_S + window)
     yield (
         f"the channel ({by}) makes the slave's command oscillate",
         find_spans(t, oscillating, _MIN_DURATION_S),
@@ -278,7 +238,7 @@ def _pose_parts(
     command: Array, actual: Array
 ) -> tuple[tuple[Array, Array, float, str, float], ...]:
     """Return command, motion, smallest lag, display unit and factor, for position and rotation."""
-    rotations = _rotation(command, command), _rotation(actual, command)
+    rotations = rotation_near(command, command), rotation_near(actual, command)
     return (
         (command[:, 4:], actual[:, 4:], _MIN_LAG_M, "mm", 1e3),
         (*rotations, _MIN_LAG_RAD, "degrees", _DEGREES_PER_RAD),
@@ -323,8 +283,8 @@ def _check_joints(
 
 def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
     if "intent" in result and "pose_master" in result:
-        oscillating = _pose_oscillates(
-            result.t, result["intent"], result["pose_master"], _REVERSAL_WINDOW_S
+        oscillating = pose_oscillates(
+            result.t, result["intent"], result["pose_master"], REVERSAL_WINDOW_S
         )
         yield (
             "the hand oscillates while its intent does not,",
@@ -332,19 +292,21 @@ def _check_hand(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
         )
 
 
-def _pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
-    turned, wanted = (_rotation(pose, command) for pose in (actual, command))
-    swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
-    return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
-
-
-def _rotation(pose: Array, reference: Array) -> Array:
-    """Return (N, 4) twice the quaternions of poses: small changes equal the rotation [rad].
-
-    The quaternions take the sign of the first pose of `reference`.
-    """
-    q: Array = pose[:, :4]
-    return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
+def _check_contact(result: SimulationResult) -> Iterator[tuple[str, Spans]]:
+    if "true_contact_wrench_W" not in result:
+        return
+    force = np.linalg.norm(result["true_contact_wrench_W"][:, :3], axis=1)
+    command = next((result[name] for name in ("intent", "pose_command") if name in result), None)
+    reversals = np.empty(0) if command is None else pose_reversals(result.t, command)
+    if found := find_chatter(result.t, force, reversals):
+        worst = max(found, key=lambda chatter: chatter.peak_force)
+        yield (
+            f"contact chatter of the tool: {sum(chatter.touches for chatter in found)} touches at"
+            f" {worst.rate_hz:.2g} Hz with up to {worst.peak_force:.3g} N (damp the touched object:"
+            " dissipation of its surface or damping of its joint; or reduce"
+            " force_scaling.force_scale or kinematic_scaling.translation_scale),",
+            [(chatter.start, chatter.stop) for chatter in found],
+        )
 
 
 def _joint_error(result: SimulationResult) -> Array:

@@ -1,0 +1,68 @@
+"""Lasting contact chatter: the tool loses and regains contact several times a second."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+from drake_teleop.station.oscillation import remove_explained, split_at_gaps
+
+Array = NDArray[np.float64]
+
+# A touch begins where the force exceeds this share of the largest force within the time around it.
+_TOUCH_SHARE, _AROUND_S = 0.1, 0.1
+# Smallest time between two touches [s]; closer ones are bounces of one touch-down.
+_MIN_INTERVAL_S = 0.005
+# Largest time between two touches of a series [s]: 5 Hz.
+_MAX_INTERVAL_S = 0.2
+# Smallest number of touches, duration [s] and force [N] of a series.
+_MIN_TOUCHES, _MIN_DURATION_S, _MIN_FORCE_N = 8, 0.3, 0.5
+# Largest time between a touch and the reversal of the command that explains it [s].
+_EXPLANATION_S = 0.1
+
+
+class Chatter(NamedTuple):
+    """Series of touches: number, mean rate [Hz], largest force [N], start and stop [s]."""
+
+    touches: int
+    rate_hz: float
+    peak_force: float
+    start: float
+    stop: float
+
+
+def find_chatter(t: Array, force: Array, reversals: Array) -> list[Chatter]:
+    """Return each series of touches that the command does not explain.
+
+    A series has at least 8 touches within at least 0.3 s, each within 0.2 s of the previous one.
+    A reversal of the command explains one touch within 0.1 s.
+
+    Args:
+        t: (N,) evenly spaced times [s].
+        force: (N,) magnitude of the contact force [N].
+        reversals: times of the command's reversals [s].
+    """
+    touches = remove_explained(_find_touches(t, force), reversals, _EXPLANATION_S)
+    found = []
+    for series in split_at_gaps(touches, _MAX_INTERVAL_S):
+        if len(series) < _MIN_TOUCHES or series[-1] - series[0] < _MIN_DURATION_S:
+            continue
+        start, stop = float(series[0]), float(series[-1])
+        peak = float(force[(t >= start) & (t <= stop)].max())
+        if peak >= _MIN_FORCE_N:
+            rate = (len(series) - 1) / (stop - start)
+            found.append(Chatter(len(series), rate, peak, start, stop))
+    return found
+
+
+def _find_touches(t: Array, force: Array) -> Array:
+    """Return the start times of touches [s]."""
+    if len(t) < 2:
+        return np.empty(0)
+    rows = 2 * round(_AROUND_S / (t[1] - t[0])) + 1
+    least = _TOUCH_SHARE * maximum_filter1d(force, rows)[1:]
+    starts = t[1:][(force[1:] > least) & (force[:-1] <= least)]
+    return starts[np.diff(starts, prepend=-np.inf) >= _MIN_INTERVAL_S]

@@ -1,0 +1,95 @@
+"""Oscillations that the command does not explain: reversals of signals, and series of events."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Smallest reported amplitude of a pose: position [m] and orientation [rad].
+_MIN_AMPLITUDE_M, _MIN_AMPLITUDE_RAD = 5e-4, np.deg2rad(0.5)
+REVERSAL_WINDOW_S = 0.25
+"""Largest time between a reversal of the command and the reversal that it explains [s]."""
+# Smallest number of reversals of an oscillation, and longest time between two of them [s].
+_MIN_REVERSALS, _MAX_REVERSAL_INTERVAL_S = 4, 0.5
+
+
+def find_reversals(x: Array, swing: float) -> NDArray[np.intp]:
+    """Return indices of local extremes of x (N,) that differ by more than `swing` from the last."""
+    slope = np.diff(x)
+    near = np.flatnonzero(slope[1:] * slope[:-1] <= 0.0) + 1
+    found: list[int] = []
+    high = low = 0
+    rising = 0  # 0: unknown
+    for k in [*near, len(x) - 1]:
+        high, low = (k if x[k] > x[high] else high), (k if x[k] < x[low] else low)
+        if rising >= 0 and x[high] - x[k] > swing:
+            found += [high] if rising else []
+            rising, high, low = -1, k, k
+        elif rising <= 0 and x[k] - x[low] > swing:
+            found += [low] if rising else []
+            rising, high, low = 1, k, k
+    return np.array(found, dtype=np.intp)
+
+
+def oscillates(
+    t: Array, command: Array, actual: Array, swing: float, near: float = REVERSAL_WINDOW_S
+) -> Flags:
+    """Return (N,) booleans: True while the actual motion oscillates and the command does not.
+
+    An oscillation has at least four reversals, each within 0.5 s of the previous one. A reversal
+    of the command explains one reversal of the motion within the time `near`.
+
+    Args:
+        t: (N,) times [s].
+        command, actual: (N, k) commanded and actual motion in one unit.
+        swing: smallest amplitude, in that unit.
+        near: largest time between the two reversals [s].
+    """
+    commanded = np.sort(np.concatenate([t[find_reversals(x, swing)] for x in command.T]))
+    oscillating = np.zeros(len(t), dtype=bool)
+    for x in actual.T:
+        times = remove_explained(t[find_reversals(x, swing)], commanded, near)
+        for series in split_at_gaps(times, _MAX_REVERSAL_INTERVAL_S):
+            if len(series) >= _MIN_REVERSALS:
+                oscillating |= (t >= series[0]) & (t <= series[-1])
+    return oscillating
+
+
+def pose_oscillates(t: Array, command: Array, actual: Array, near: float) -> Flags:
+    """Return `oscillates` of position or orientation, for poses (N, 7)."""
+    turned, wanted = (rotation_near(pose, command) for pose in (actual, command))
+    swaying = oscillates(t, command[:, 4:], actual[:, 4:], _MIN_AMPLITUDE_M, near)
+    return swaying | oscillates(t, wanted, turned, _MIN_AMPLITUDE_RAD, near)
+
+
+def pose_reversals(t: Array, pose: Array) -> Array:
+    """Return the sorted times [s] at which a component of the pose (N, 7) reverses."""
+    rows = [find_reversals(x, _MIN_AMPLITUDE_M) for x in pose[:, 4:].T]
+    rows += [find_reversals(x, _MIN_AMPLITUDE_RAD) for x in rotation_near(pose, pose).T]
+    return np.sort(t[np.concatenate(rows)])
+
+
+def rotation_near(pose: Array, reference: Array) -> Array:
+    """Return (N, 4) twice the quaternions of poses: small changes equal the rotation [rad].
+
+    The quaternions take the sign of the first pose of `reference`.
+    """
+    q: Array = pose[:, :4]
+    return 2 * q * np.sign(q @ reference[0, :4])[:, np.newaxis]
+
+
+def remove_explained(times: Array, causes: Array, near: float) -> Array:
+    """Return the times without one time for each cause: the nearest within `near` [s]."""
+    for cause in causes:
+        distances = np.abs(times - cause)
+        if len(times) and distances.min() < near:
+            times = np.delete(times, distances.argmin())
+    return times
+
+
+def split_at_gaps(times: Array, longest: float) -> list[Array]:
+    """Return series of times in which none is more than `longest` [s] after the previous one."""
+    return np.split(times, np.flatnonzero(np.diff(times) > longest) + 1)
