@@ -22,7 +22,7 @@ def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
         # Drake reports missing files and reads nested includes.
         roots = {file: read_xml(file) for file in added if file.suffix in (".urdf", ".sdf")}
     else:
-        roots = {path: read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
+        roots = {path: read_xml(path)} if kind in (".urdf", ".sdf") else {}
     for file, root in roots.items():
         if any(element.tag.startswith("xacro:") for element in root.iter()):
             raise DrakeTeleopError("is a xacro file", where=str(file), remedy=XACRO)

@@ -149,6 +149,9 @@ class ModelFiles:
             )
         elif kind in (".urdf", ".sdf", ".xml", ".config"):
             root = read_xml(path)
+            if self._model.suffix.lower() == ".xml":  # `MeshLibrary` checks the assets
+                yield from (e.get("file", "") for e in root.iter("include"))
+                return
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
             yield from _addresses_in_xml(
                 root, meshes=path != self._model.resolve() or kind == ".xml"

@@ -32,6 +32,7 @@ from pydrake.multibody.tree import (
 from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
 from drake_teleop.common.texts import read_text
 from drake_teleop.station.slave.meshes import remove_unusable_meshes
+from drake_teleop.station.slave.mjcf_repair import repair_mjcf
 from drake_teleop.station.slave.model_check import WORLD, check_model, check_tree
 from drake_teleop.station.slave.model_files import (
     XACRO,
@@ -43,8 +44,8 @@ from drake_teleop.station.slave.model_files import (
 )
 from drake_teleop.station.slave.model_references import ModelFiles
 
-# Elements that close kinematic loops: Drake's tags in URDF and SDF, and MJCF's.
-_LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy|connect|weld|distance)\b")
+# Elements that close kinematic loops in URDF and SDF.
+_LOOP = re.compile(rb"<(drake:ball_constraint|drake:linear_bushing_rpy)\b")
 # Prefix of assumptions about removed shapes.
 _REMOVED_SHAPES = "shapes are missing of"
 # Expected kind of file, and the remedy for missing packages.
@@ -209,7 +210,8 @@ def _parse(
     converted = TemporaryDirectory(prefix="drake_teleop_")
     forces = plant.num_force_elements()
     roots = read_roots(path, files)
-    _check_no_loop(path, kind)
+    if kind != "xml":
+        _check_no_loop(path, kind)
     with translate_drake_errors(path, expected):
         for file, root in roots.items():
             assumptions += check_model(root, str(file), sensor)
@@ -226,6 +228,13 @@ def _parse(
             text = ElementTree.tostring(root, encoding="unicode")
             with _raise_logged_errors():
                 instances = parser.AddModelsFromString(text, kind)
+        elif kind == "xml":
+            read = repair_mjcf(
+                path, files, sensor, {}, Path(converted.name), is_scene=expected is _SCENE
+            )
+            assumptions += read.assumptions
+            with _raise_logged_errors():
+                instances = parser.AddModelsFromString(read.text, kind)
         else:
             with _raise_logged_errors():
                 instances = parser.AddModels(str(path))

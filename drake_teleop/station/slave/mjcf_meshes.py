@@ -1,0 +1,201 @@
+"""Meshes of an MJCF file: triangles for masses, and .obj files for Drake."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.mjcf_elements import Attributes, Mjcf
+
+# Triangle of a binary STL file.
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_NOT_FOUND = "meshes were not found (--package-path, slave.package_paths)"
+_UNREADABLE = "meshes cannot be read (convert them to .obj or .stl)"
+_Array = NDArray[np.float64]
+
+
+class Triangles(NamedTuple):
+    """Triangle mesh: vertices (n, 3) [m] and rows (m, 3) of vertex indices."""
+
+    vertices: _Array
+    faces: NDArray[np.intp]
+
+
+class Mesh:
+    """Mesh of an `asset` section, with its own scale and reference pose applied."""
+
+    def __init__(self, mjcf: Mjcf, attributes: Attributes, file: Path | None) -> None:
+        self.name = attributes.get("name") or Path(attributes.get("file", "")).stem
+        self.file, self.inertia = file, attributes.get("inertia", "legacy")
+        self._attributes = attributes
+        self._scale = attributes.vector("scale", (1.0, 1.0, 1.0))
+        reference = {"pos": attributes.get("refpos", "0 0 0")}
+        reference["quat"] = attributes.get("refquat", "1 0 0 0")
+        self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
+        self._triangles: Triangles | None = None
+        self._written: Path | None = None
+
+    def triangles(self) -> Triangles:
+        """Return the transformed triangles.
+
+        Raises:
+            ValueError: if the file is damaged or of another kind.
+        """
+        if self._triangles is None:
+            vertices, faces = self._read()
+            if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
+                raise ValueError("no triangles")
+            if not np.isfinite(vertices).all():
+                raise ValueError("vertices that are not finite")
+            moved = self._X_FM.inverse().multiply(vertices.T).T * self._scale
+            if np.prod(self._scale) < 0.0:  # a mirror image turns the triangles inside out
+                faces = faces[:, ::-1]
+            self._triangles = Triangles(moved, faces)
+        return self._triangles
+
+    def obj(self, folder: Path) -> Path:
+        """Return an .obj file for Drake, converted into `folder` if necessary."""
+        plain = self._X_FM.IsExactlyIdentity() and (self._scale == 1.0).all()
+        if self.file is not None and self.file.suffix.lower() == ".obj" and plain:
+            return self.file.resolve()
+        if self._written is None:
+            vertices, faces = self.triangles()
+            vertices, same = np.unique(vertices, axis=0, return_inverse=True)
+            faces = same.reshape(-1)[faces]
+            number = len(list(folder.iterdir()))
+            self._written = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)}.obj"
+            rows = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
+            rows += ["f {} {} {}".format(*(face + 1)) for face in faces]
+            self._written.write_text("\n".join(rows) + "\n")
+        return self._written
+
+    def _read(self) -> Triangles:
+        if self.file is None:
+            return _read_inline(self._attributes)
+        data = self.file.read_bytes()
+        suffix = self.file.suffix.lower()
+        return {".stl": _read_stl, ".obj": _read_obj, ".msh": _read_msh}[suffix](data)
+
+
+class MeshLibrary:
+    """Meshes of a file by name; unused ones are never read."""
+
+    def __init__(self, mjcf: Mjcf) -> None:
+        self._mjcf = mjcf
+        self._meshes: dict[str, Mesh | str] = {}
+        self._outside: list[str] = []
+        for element in mjcf.children("asset"):
+            label = f"{element.tag} {element.get('name') or element.get('file', '')}"
+            attributes = mjcf.attributes(element, "", label)
+            file, fault = self._find(element.tag, attributes)
+            if element.tag == "mesh":
+                mesh = Mesh(mjcf, attributes, file)
+                self._meshes[mesh.name] = fault or mesh
+
+    def refuse_outside(self) -> None:
+        """Add the assets outside the allowed folders to the faults of a file that has others."""
+        for fault in self._outside if self._mjcf.report.causes else ():
+            self._mjcf.report.refuse(fault)
+
+    def find(self, name: str) -> Mesh | str:
+        """Return a mesh, or its fault as text."""
+        mesh = self._meshes.get(name, _NOT_FOUND)
+        if isinstance(mesh, Mesh):
+            try:
+                triangles = mesh.triangles()
+                if mesh.inertia == "convex":
+                    convex_hull(triangles.vertices)
+            except (ValueError, KeyError, OSError, IndexError):
+                self._meshes[name] = mesh = f"{_suffix(mesh.file)}{_UNREADABLE}"
+        return mesh
+
+    def _find(self, tag: str, attributes: Attributes) -> tuple[Path | None, str]:
+        """Return the file of an asset, and its fault as text."""
+        name = attributes.get("file", "")
+        if not name:
+            return None, "" if tag != "mesh" or "vertex" in attributes else _UNREADABLE
+        compiler = self._mjcf.compiler
+        if compiler.get("strippath") == "true":
+            name = re.split(r"[/\\]", name)[-1]
+        own = "meshdir" if tag == "mesh" else "texturedir"
+        folder = self._mjcf.path.resolve().parent / compiler.get(own, compiler.get("assetdir", ""))
+        file = self._mjcf.files.file(name, folder)
+        if file is None or not file.is_file():
+            return None, _NOT_FOUND
+        try:
+            self._mjcf.files.check(file)
+        except DrakeTeleopError as error:
+            self._outside.append(str(error))
+            return None, str(error)
+        return file, ""
+
+
+def _suffix(file: Path | None) -> str:
+    return f"{file.suffix} " if file is not None else ""
+
+
+def _merged(corners: _Array) -> Triangles:
+    vertices, same = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return Triangles(vertices.astype(float), same.reshape(-1, 3))
+
+
+def _read_stl(data: bytes) -> Triangles:
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + count * _TRIANGLE.itemsize:
+        return _merged(np.frombuffer(data, _TRIANGLE, count, 84)["corners"])
+    lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
+    return _merged(np.array(lines, dtype=float).reshape(-1, 3))
+
+
+def _read_obj(data: bytes) -> Triangles:
+    vertices, faces = list[list[float]](), list[tuple[int, int, int]]()
+    for line in data.splitlines():
+        words = line.split()
+        if words[:1] == [b"v"]:
+            vertices.append([float(word) for word in words[1:4]])
+        elif words[:1] == [b"f"]:
+            corners = [int(word.split(b"/")[0]) for word in words[1:]]
+            corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]
+            faces += [(corners[0], *pair) for pair in zip(corners[1:], corners[2:], strict=False)]
+    return Triangles(np.array(vertices).reshape(-1, 3), np.array(faces, np.intp).reshape(-1, 3))
+
+
+def _read_msh(data: bytes) -> Triangles:
+    """Read MuJoCo's binary format: four counts, then vertices, normals, texture and faces."""
+    n, normals, texture, count = (int(k) for k in np.frombuffer(data, "<i4", 4))
+    if min(n, normals, texture, count) < 0:
+        raise ValueError("a negative count")
+    vertices = np.frombuffer(data, "<f4", 3 * n, 16).reshape(-1, 3)
+    start = 16 + 4 * (3 * n + 3 * normals + 2 * texture)
+    faces = np.frombuffer(data, "<i4", 3 * count, start).reshape(-1, 3)
+    return Triangles(vertices.astype(float), faces.astype(np.intp))
+
+
+def _read_inline(attributes: Attributes) -> Triangles:
+    vertices = np.array(attributes["vertex"].split(), dtype=float).reshape(-1, 3)
+    if "face" not in attributes:
+        return convex_hull(vertices)
+    return Triangles(vertices, np.array(attributes["face"].split(), np.intp).reshape(-1, 3))
+
+
+def convex_hull(vertices: _Array) -> Triangles:
+    """Return the convex hull with triangles that face outwards.
+
+    Raises:
+        ValueError: if the points have no volume.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError as error:
+        raise ValueError("no volume") from error
+    faces = hull.simplices.astype(np.intp)
+    inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
+    faces[inwards] = faces[inwards, ::-1]
+    return Triangles(vertices, faces)

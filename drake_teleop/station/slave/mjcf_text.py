@@ -1,0 +1,114 @@
+"""Text of an MJCF file for Drake, with explicit poses, masses and limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from drake_teleop.station.slave.mjcf_bodies import Body, Geom, Joint
+from drake_teleop.station.slave.mjcf_elements import Mjcf
+from drake_teleop.station.slave.mjcf_meshes import Mesh
+
+
+class MjcfText:
+    """Writer of the text; bodies on the world float in that of a tool."""
+
+    def __init__(self, mjcf: Mjcf, folder: Path, *, is_tool: bool) -> None:
+        self._mjcf, self._folder, self._is_tool = mjcf, folder, is_tool
+        name = mjcf.root.get("model") or mjcf.path.stem
+        self._root = Element("mujoco", model=name)
+        SubElement(self._root, "compiler", angle="radian", autolimits="false")
+        self._assets = SubElement(self._root, "asset")
+        self._meshes: dict[int, str] = {}
+        self._colours = {
+            element.get("name", ""): rgba
+            for element in mjcf.children("asset")
+            if element.tag == "material"
+            and (rgba := mjcf.attributes(element, "", "material").get("rgba"))
+        }
+
+    def write(self, world: Body, limits: dict[str, float], moving: list[Joint]) -> str:
+        """Return the text of a world; the joints `moving` get one actuator each."""
+        top = SubElement(self._root, "worldbody")
+        self._write_content(top, world)
+        names = {body.name for body in world.all()}
+        contact = SubElement(self._root, "contact")
+        for each in self._mjcf.children("contact"):
+            ends = {name: each.get(name, "") for name in ("body1", "body2")}
+            if each.tag == "exclude" and names.issuperset(ends.values()):
+                SubElement(contact, "exclude", ends)
+        actuators = SubElement(self._root, "actuator")
+        for joint in moving:
+            motor = SubElement(actuators, "motor", name=joint.name, joint=joint.name)
+            if joint.name in limits:
+                limit = limits[joint.name]
+                motor.attrib |= {"forcelimited": "true", "forcerange": _text([-limit, limit])}
+        return tostring(self._root, encoding="unicode")
+
+    def _write_content(self, element: Element, body: Body) -> None:
+        for joint in body.joints:
+            self._write_joint(element, joint)
+        for geom in body.geoms:
+            if geom.touches or geom.visible:
+                self._write_geom(element, geom)
+        for child in body.children:
+            inner = SubElement(element, "body", {"name": child.name, **_pose(child.X_PB)})
+            if child.inertial is not None and child.inertial.mass > 0.0:
+                mass, centre, inertia = child.inertial
+                entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+                values = {"mass": repr(mass), "fullinertia": _text(entries)}
+                SubElement(inner, "inertial", {"pos": _text(centre), **values})
+            if self._is_tool and body.name == "world":
+                SubElement(inner, "freejoint")
+            self._write_content(inner, child)
+
+    def _write_joint(self, element: Element, joint: Joint) -> None:
+        if joint.kind == "free":
+            SubElement(element, "freejoint", name=joint.name)
+            return
+        values = {"name": joint.name, "type": joint.kind, "pos": _text(joint.anchor)}
+        values |= {"axis": _text(joint.axis), "ref": repr(joint.ref), "limited": "false"}
+        if joint.limits is not None:
+            values |= {"limited": "true", "range": _text(joint.limits)}
+        damping = joint.attributes.number("damping", 0.0)
+        if damping < 0.0:
+            self._mjcf.report.state("no damping, instead of a negative one, of", joint.name)
+        values["damping"] = repr(max(damping, 0.0))
+        values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
+        SubElement(element, "joint", values)
+
+    def _write_geom(self, element: Element, geom: Geom) -> None:
+        given, contact = geom.attributes, "1" if geom.touches else "0"
+        values = {"type": geom.kind, "mass": "0", "contype": contact, "conaffinity": contact}
+        values |= _pose(geom.X_BG)
+        if geom.mesh is None:
+            values["size"] = _text(geom.size)
+        else:
+            values["mesh"] = self._mesh(geom.mesh)
+        if given.get("name"):
+            values["name"] = given["name"]
+        if not geom.visible:
+            values["group"] = "3"
+        if "friction" in given:
+            values["friction"] = repr(given.numbers("friction", (1.0,))[0])
+        if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
+            values["rgba"] = rgba
+        SubElement(element, "geom", values)
+
+    def _mesh(self, mesh: Mesh) -> str:
+        if id(mesh) not in self._meshes:
+            name = self._meshes[id(mesh)] = f"mesh_{len(self._meshes)}"
+            SubElement(self._assets, "mesh", name=name, file=str(mesh.obj(self._folder)))
+        return self._meshes[id(mesh)]
+
+
+def _text(values: object) -> str:
+    return " ".join(repr(float(value)) for value in values)  # type: ignore[attr-defined]
+
+
+def _pose(X: RigidTransform) -> dict[str, str]:
+    quaternion = X.rotation().ToQuaternion().wxyz()
+    return {"pos": _text(X.translation()), "quat": _text(quaternion)}
