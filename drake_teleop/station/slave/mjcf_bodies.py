@@ -223,7 +223,7 @@ class BodyReader:
         body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh or None))
 
     def _inertial(self, body: Body, given: Attributes) -> MassProperties:
-        mass = given.number("mass", 0.0)
+        mass = float(given.vector("mass", (0.0,))[0])
         if mass < 0.0:
             self._mjcf.report.refuse(f"body {body.name}: mass {mass:g} kg is negative")
         moments = given.vector("diaginertia", (0.0, 0.0, 0.0))

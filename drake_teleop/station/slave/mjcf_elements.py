@@ -33,22 +33,25 @@ class Attributes(dict[str, str]):
         super().__init__(values)
         self.label, self._report = label, report
 
-    def numbers(self, name: str, default: tuple[float, ...], *, exact: bool = False) -> list[float]:
+    def numbers(self, name: str, default: tuple[float, ...]) -> list[float]:
         """Return the numbers of an attribute; `default` completes a list that is too short."""
-        words = self[name].split() if name in self else []
         try:
-            values = [float(word) for word in words]
+            values = [float(word) for word in self.get(name, "").split()]
         except ValueError:
             values = [math.nan]
-        wrong = exact and name in self and len(values) != len(default)
-        if wrong or not all(abs(value) <= _MAX_VALUE for value in values):
-            self._report.refuse(f"{self.label}: {name} {self[name]!r} is not {len(default)} numbers")
+        if not all(map(math.isfinite, values)):
+            self._report.refuse(f"{self.label}: {name} {self[name]!r} is not a list of numbers")
             return list(default)
         return [*values, *default[len(values) :]][: len(default)]
 
     def vector(self, name: str, default: tuple[float, ...]) -> NDArray[np.float64]:
-        """Return the numbers of an attribute that has as many as `default`."""
-        return np.array(self.numbers(name, default, exact=True))
+        """Return the numbers of an attribute that has as many as `default`, each up to 1e6."""
+        count, values = len(default), self.numbers(name, default)
+        if len(self.get(name, "").split()) not in (0, count) or max(map(abs, values)) > _MAX_VALUE:
+            what = f"{name} {self[name]!r} is not {count} numbers up to {_MAX_VALUE:g}"
+            self._report.refuse(f"{self.label}: {what}")
+            return np.array(default)
+        return np.array(values)
 
     def number(self, name: str, default: float) -> float:
         return self.numbers(name, (default,))[0]

@@ -38,7 +38,6 @@ class Mesh:
         reference["quat"] = attributes.get("refquat", "1 0 0 0")
         self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
         self._triangles: Triangles | None = None
-        self._written: Path | None = None
 
     def triangles(self) -> Triangles:
         """Return the transformed triangles.
@@ -63,16 +62,21 @@ class Mesh:
         plain = self._X_FM.IsExactlyIdentity() and (self._scale == 1.0).all()
         if self.file is not None and self.file.suffix.lower() == ".obj" and plain:
             return self.file.resolve()
-        if self._written is None:
-            vertices, faces = self.triangles()
-            vertices, same = np.unique(vertices, axis=0, return_inverse=True)
-            faces = same.reshape(-1)[faces]
-            number = len(list(folder.iterdir()))
-            self._written = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)}.obj"
-            rows = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
-            rows += ["f {} {} {}".format(*(face + 1)) for face in faces]
-            self._written.write_text("\n".join(rows) + "\n")
-        return self._written
+        return self._write(self.triangles(), folder)
+
+    def hull(self, folder: Path) -> Path:
+        """Return an .obj file in `folder` with the convex hull, which is what touches."""
+        return self._write(convex_hull(self.triangles().vertices), folder)
+
+    def _write(self, triangles: Triangles, folder: Path) -> Path:
+        corners = triangles.vertices[triangles.faces]
+        vertices, faces = _merged(corners)
+        number = len(list(folder.iterdir()))
+        path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
+        rows = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
+        rows += ["f {} {} {}".format(*(face + 1)) for face in faces]
+        path.write_text("\n".join(rows) + "\n")
+        return path
 
     def _read(self) -> Triangles:
         if self.file is None:

@@ -14,15 +14,19 @@ from drake_teleop.station.slave.mjcf_meshes import Mesh
 
 
 class MjcfText:
-    """Writer of the text; bodies on the world float in that of a tool."""
+    """Writer of the text; the bodies on the world float in the text of a tool.
 
-    def __init__(self, mjcf: Mjcf, folder: Path, *, is_tool: bool) -> None:
-        self._mjcf, self._folder, self._is_tool = mjcf, folder, is_tool
+    Contact shapes are convex hulls, as in MuJoCo, except in a scene.
+    """
+
+    def __init__(self, mjcf: Mjcf, folder: Path, *, is_tool: bool, is_scene: bool) -> None:
+        self._mjcf, self._folder = mjcf, folder
+        self._is_tool, self._is_scene = is_tool, is_scene
         name = mjcf.root.get("model") or mjcf.path.stem
         self._root = Element("mujoco", model=name)
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
         self._assets = SubElement(self._root, "asset")
-        self._meshes: dict[int, str] = {}
+        self._meshes: dict[tuple[int, bool], str] = {}
         self._colours = {
             element.get("name", ""): rgba
             for element in mjcf.children("asset")
@@ -53,7 +57,7 @@ class MjcfText:
             self._write_joint(element, joint)
         for geom in body.geoms:
             if geom.touches or geom.visible:
-                self._write_geom(element, geom)
+                self._write_geom(element, geom, body)
         for child in body.children:
             inner = SubElement(element, "body", {"name": child.name, **_pose(child.X_PB)})
             if child.inertial is not None and child.inertial.mass > 0.0:
@@ -80,29 +84,36 @@ class MjcfText:
         values["armature"] = repr(max(joint.attributes.number("armature", 0.0), 0.0))
         SubElement(element, "joint", values)
 
-    def _write_geom(self, element: Element, geom: Geom) -> None:
-        given, contact = geom.attributes, "1" if geom.touches else "0"
-        values = {"type": geom.kind, "mass": "0", "contype": contact, "conaffinity": contact}
-        values |= _pose(geom.X_BG)
-        if geom.mesh is None:
-            values["size"] = _text(geom.size)
-        else:
-            values["mesh"] = self._mesh(geom.mesh)
-        if given.get("name"):
-            values["name"] = given["name"]
-        if not geom.visible:
-            values["group"] = "3"
+    def _write_geom(self, element: Element, geom: Geom, body: Body) -> None:
+        given, values = geom.attributes, {"type": geom.kind, "mass": "0", **_pose(geom.X_BG)}
         if "friction" in given:
             values["friction"] = repr(given.numbers("friction", (1.0,))[0])
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
-        SubElement(element, "geom", values)
+        seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
+        if geom.mesh is None or self._is_scene or not geom.touches:
+            values |= {} if geom.touches else seen
+            values |= {} if geom.visible else felt
+            shape = {"size": _text(geom.size)} if geom.mesh is None else self._mesh(geom.mesh)
+            SubElement(element, "geom", {**values, **shape})
+            return
+        if geom.visible:
+            SubElement(element, "geom", {**values, **seen, **self._mesh(geom.mesh)})
+        try:
+            hull = self._mesh(geom.mesh, hull=True)
+        except ValueError:
+            fault = "meshes have no volume; shapes are missing of"
+            self._mjcf.report.repair(fault, body.name)
+        else:
+            SubElement(element, "geom", {**values, **felt, **hull})
 
-    def _mesh(self, mesh: Mesh) -> str:
-        if id(mesh) not in self._meshes:
-            name = self._meshes[id(mesh)] = f"mesh_{len(self._meshes)}"
-            SubElement(self._assets, "mesh", name=name, file=str(mesh.obj(self._folder)))
-        return self._meshes[id(mesh)]
+    def _mesh(self, mesh: Mesh, *, hull: bool = False) -> dict[str, str]:
+        key = id(mesh), hull
+        if key not in self._meshes:
+            file = mesh.hull(self._folder) if hull else mesh.obj(self._folder)
+            self._meshes[key] = f"mesh_{len(self._meshes)}"
+            SubElement(self._assets, "mesh", name=self._meshes[key], file=str(file))
+        return {"mesh": self._meshes[key]}
 
 
 def _text(values: object) -> str:
