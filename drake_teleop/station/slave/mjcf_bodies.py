@@ -151,8 +151,8 @@ class BodyReader:
         self._read_content(body, element, childclass, RigidTransform())
         return body
 
-    def refuse_outside(self) -> None:
-        self._meshes.refuse_outside()
+    def refuse_inaccessible(self) -> None:
+        self._meshes.refuse_inaccessible()
 
     def _invent(self, stem: str) -> str:
         for number in self._counters.setdefault(stem, count(1)):
@@ -216,7 +216,11 @@ class BodyReader:
             return
         if isinstance(mesh, Mesh) and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
-            X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
+            try:
+                X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
+            except ValueError as error:
+                self.lost.setdefault(f"a mesh has {error}", []).append((body, given))
+                return
             X_FG, mesh = X_FG @ X_GM, None
         if given.get("shellinertia") == "true":
             self._mjcf.report.state("solid instead of hollow shapes of", body.name)
@@ -252,7 +256,11 @@ class BodyReader:
         groups = self._mjcf.compiler.numbers("inertiagrouprange", (0.0, 5.0))
         if not groups[0] <= geom.attributes.number("group", 0.0) <= groups[1]:
             return NO_MASS
-        shape = mesh_properties(geom.mesh) if geom.mesh else primitive(geom.kind, geom.size)
+        try:
+            shape = mesh_properties(geom.mesh) if geom.mesh else primitive(geom.kind, geom.size)
+        except ValueError as error:
+            self._mjcf.report.repair(f"no mass of a mesh ({error}) of", geom.attributes.label)
+            return NO_MASS
         mass = geom.attributes.number("mass", -1.0)
         density = geom.attributes.number("density", _DENSITY)
         return shape.scaled(mass if mass >= 0.0 else density * shape.mass).transformed(geom.X_BG)

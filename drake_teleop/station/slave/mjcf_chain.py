@@ -25,7 +25,7 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     kind = "body" if any(sensor in _names(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names(top[0], kind)]
     if len(carriers) != 1:
-        reader.refuse_outside()
+        reader.refuse_inaccessible()
         known = {name for tag in ("body", "site") for top, *_ in tops for name in _names(top, tag)}
         faults = "".join(f"; {cause}" for cause in mjcf.report.causes)
         raise DrakeTeleopError(

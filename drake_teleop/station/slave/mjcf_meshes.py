@@ -39,6 +39,12 @@ class Mesh:
         self._X_FM = mjcf.pose(Attributes(reference, attributes.label, mjcf.report))
         self._triangles: Triangles | None = None
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether Drake can read the file itself."""
+        unmoved = self._X_FM.IsExactlyIdentity() and bool((self._scale == 1.0).all())
+        return unmoved and self.file is not None and self.file.suffix.lower() == ".obj"
+
     def triangles(self) -> Triangles:
         """Return the transformed triangles.
 
@@ -46,7 +52,10 @@ class Mesh:
             ValueError: if the file is damaged or of another kind.
         """
         if self._triangles is None:
-            vertices, faces = self._read()
+            try:
+                vertices, faces = self._read()
+            except (KeyError, IndexError, OSError) as error:  # another kind, or too short
+                raise ValueError(str(error)) from None
             if not faces.size or faces.min() < 0 or faces.max() >= len(vertices):
                 raise ValueError("no triangles")
             if not np.isfinite(vertices).all():
@@ -59,8 +68,7 @@ class Mesh:
 
     def obj(self, folder: Path) -> Path:
         """Return an .obj file for Drake, converted into `folder` if necessary."""
-        plain = self._X_FM.IsExactlyIdentity() and (self._scale == 1.0).all()
-        if self.file is not None and self.file.suffix.lower() == ".obj" and plain:
+        if self.file is not None and self.is_plain:
             return self.file.resolve()
         return self._write(self.triangles(), folder)
 
@@ -69,13 +77,11 @@ class Mesh:
         return self._write(convex_hull(self.triangles().vertices), folder)
 
     def _write(self, triangles: Triangles, folder: Path) -> Path:
-        corners = triangles.vertices[triangles.faces]
-        vertices, faces = _merged(corners)
         number = len(list(folder.iterdir()))
         path = folder / f"{number}_{re.sub(r'[^A-Za-z0-9_-]', '_', self.name)[:40]}.obj"
-        rows = ["v {:.9g} {:.9g} {:.9g}".format(*vertex) for vertex in vertices]
-        rows += ["f {} {} {}".format(*(face + 1)) for face in faces]
-        path.write_text("\n".join(rows) + "\n")
+        vertices, faces = triangles.vertices, triangles.faces + 1
+        text = "v %.9g %.9g %.9g\n" * len(vertices) % tuple(vertices.ravel())
+        path.write_text(text + "f %d %d %d\n" * len(faces) % tuple(faces.ravel()))
         return path
 
     def _read(self) -> Triangles:
@@ -92,7 +98,7 @@ class MeshLibrary:
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf = mjcf
         self._meshes: dict[str, Mesh | str] = {}
-        self._outside: list[str] = []
+        self._faults: list[str] = []
         for element in mjcf.children("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
             attributes = mjcf.attributes(element, "", label)
@@ -101,20 +107,18 @@ class MeshLibrary:
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
 
-    def refuse_outside(self) -> None:
-        """Add the assets outside the allowed folders to the faults of a file that has others."""
-        for fault in self._outside if self._mjcf.report.causes else ():
+    def refuse_inaccessible(self) -> None:
+        """Add the files that may not be read to the faults of a model that has others."""
+        for fault in self._faults if self._mjcf.report.causes else ():
             self._mjcf.report.refuse(fault)
 
     def find(self, name: str) -> Mesh | str:
         """Return a mesh, or its fault as text."""
         mesh = self._meshes.get(name, _NOT_FOUND)
-        if isinstance(mesh, Mesh):
+        if isinstance(mesh, Mesh) and not mesh.is_plain:
             try:
-                triangles = mesh.triangles()
-                if mesh.inertia == "convex":
-                    convex_hull(triangles.vertices)
-            except (ValueError, KeyError, OSError, IndexError):
+                mesh.triangles()
+            except ValueError:
                 self._meshes[name] = mesh = f"{_suffix(mesh.file)}{_UNREADABLE}"
         return mesh
 
@@ -134,8 +138,10 @@ class MeshLibrary:
         try:
             self._mjcf.files.check(file)
         except DrakeTeleopError as error:
-            self._outside.append(str(error))
-            return None, str(error)
+            fault = str(error).removeprefix(f"{self._mjcf.path}: ")
+            fault = fault.replace(str(file.resolve()), str(file.resolve().parent))
+            self._faults.append(fault)
+            return None, fault
         return file, ""
 
 
@@ -144,8 +150,14 @@ def _suffix(file: Path | None) -> str:
 
 
 def _merged(corners: _Array) -> Triangles:
-    vertices, same = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    return Triangles(vertices.astype(float), same.reshape(-1, 3))
+    """Return triangles (m, 3, 3) with each vertex once."""
+    points = corners.reshape(-1, 3).astype(float)
+    order = np.lexsort(points.T)
+    is_new = np.ones(len(points), bool)
+    is_new[1:] = (np.diff(points[order], axis=0) != 0.0).any(axis=1)
+    number = np.empty(len(points), np.intp)
+    number[order] = np.cumsum(is_new) - 1
+    return Triangles(points[order][is_new], number.reshape(-1, 3))
 
 
 def _read_stl(data: bytes) -> Triangles:
@@ -202,4 +214,4 @@ def convex_hull(vertices: _Array) -> Triangles:
     faces = hull.simplices.astype(np.intp)
     inwards = np.linalg.det(vertices[faces] - vertices[hull.vertices].mean(axis=0)) < 0.0
     faces[inwards] = faces[inwards, ::-1]
-    return Triangles(vertices, faces)
+    return _merged(vertices[faces])

@@ -72,7 +72,7 @@ def repair_mjcf(
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _state_lost_shapes(reader, report)
-    reader.refuse_outside()
+    reader.refuse_inaccessible()
     report.raise_causes(path)
     is_tool = not (sensor or is_scene)
     writer = MjcfText(mjcf, folder, is_tool=is_tool, is_scene=is_scene)
