@@ -16,9 +16,9 @@ def effort_limits(mjcf: Mjcf, joints: list[Joint]) -> dict[str, float]:
     by_joint: dict[str, float] = {}
     for element in mjcf.children("actuator"):
         given = mjcf.attributes(element, "", f"actuator {element.get('name', '')}")
-        joint = given.get("joint") or given.get("jointinparent")
-        if joint:
-            by_joint[joint] = by_joint.get(joint, 0.0) + _limit(mjcf, given, element.tag)
+        name = given.get("joint") or given.get("jointinparent")
+        if name:
+            by_joint[name] = by_joint.get(name, 0.0) + _limit(mjcf, given, element.tag)
     limits = {}
     for joint in joints:
         own = joint.attributes.limits(

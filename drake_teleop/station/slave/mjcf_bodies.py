@@ -113,7 +113,7 @@ class BodyReader:
     """Reader of bodies; joints and bodies without names get one."""
 
     def __init__(self, mjcf: Mjcf) -> None:
-        self._mjcf, self._meshes = mjcf, MeshLibrary(mjcf)
+        self._mjcf, self.meshes = mjcf, MeshLibrary(mjcf)
         self._names = {e.get("name", "") for e in mjcf.root.iter() if e.tag in ("body", "joint")}
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
@@ -150,9 +150,6 @@ class BodyReader:
         childclass = element.get("childclass") or childclass
         self._read_content(body, element, childclass, RigidTransform())
         return body
-
-    def refuse_inaccessible(self) -> None:
-        self._meshes.refuse_inaccessible()
 
     def _invent(self, stem: str) -> str:
         for number in self._counters.setdefault(stem, count(1)):
@@ -205,16 +202,16 @@ class BodyReader:
             X_FG = RigidTransform(rotation_to(ends[0] - ends[1]), ends.mean(axis=0))
             half = float(np.linalg.norm(ends[0] - ends[1])) / 2
             size = [size[0], half, 0.0] if kind in _ROUND else [size[0], size[0], half]
-        mesh = self._meshes.find(name) if name else None
-        fault = mesh if isinstance(mesh, str) else ""
+        found = self.meshes.find(name) if name else None
+        mesh, fault = (None, found) if isinstance(found, str) else (found, "")
         if kind in _UNSUPPORTED_SHAPES or (kind == "mesh" and not name):
             fault = f"shapes of type {kind} are not supported"
-        elif kind in _SIZES and not min(size[: _SIZES[kind]]) > 0.0 and not name:
+        elif kind in _SIZES and not name and min(size[: _SIZES[kind]]) <= 0.0:
             fault = "shapes need a size above 0"
         if fault:
             self.lost.setdefault(fault, []).append((body, given))
             return
-        if isinstance(mesh, Mesh) and kind != "mesh":
+        if mesh is not None and kind != "mesh":
             by_box = self._mjcf.compiler.get("fitaabb") == "true"
             try:
                 X_GM, size = fitted_shape(mesh, kind, by_box=by_box)
@@ -224,7 +221,7 @@ class BodyReader:
             X_FG, mesh = X_FG @ X_GM, None
         if given.get("shellinertia") == "true":
             self._mjcf.report.state("solid instead of hollow shapes of", body.name)
-        body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh or None))
+        body.geoms.append(Geom(kind, X_BF @ X_FG, size, given, mesh))
 
     def _inertial(self, body: Body, given: Attributes) -> MassProperties:
         mass = float(given.vector("mass", (0.0,))[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from xml.etree.ElementTree import Element
 
 from pydrake.math import RigidTransform
 
@@ -25,11 +26,10 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     kind = "body" if any(sensor in _names(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names(top[0], kind)]
     if len(carriers) != 1:
-        reader.refuse_inaccessible()
         known = {name for tag in ("body", "site") for top, *_ in tops for name in _names(top, tag)}
-        faults = "".join(f"; {cause}" for cause in mjcf.report.causes)
+        faults = [*mjcf.report.causes, *reader.meshes.inaccessible]
         raise DrakeTeleopError(
-            f"{len(carriers) or 'no'} frames are named {sensor!r}{faults}",
+            "; ".join([f"{len(carriers) or 'no'} frames are named {sensor!r}", *faults]),
             where=str(mjcf.path),
             remedy=f"name one of {listed(sorted(known))}" if known else "give a model with bodies",
         )
@@ -60,6 +60,8 @@ def hold_joints(
         joints, body.joints = body.joints, []
         for joint in joints:
             unknown.pop(joint.name, None)
+            if joint.kind == "free" and not chain:
+                continue  # a tool is welded to the sensor
             if joint.kind == "free":
                 report.state("welded to the world, where it may float:", body.name)
             elif joint.name in hold and joint.kind != "ball":
@@ -84,11 +86,10 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
     for element in mjcf.children("equality"):
         given = mjcf.attributes(element, "", element.tag)
         ends = [given.get(name, "") for name in ("joint1", "joint2")]
-        coupled = [name for name in ends if name in moving]
         if given.get("active") == "false":
             continue
-        if element.tag == "joint" and coupled:
-            report.refuse(f"{coupled[0]} moves with another joint (equality); hold one of them")
+        if element.tag == "joint" and moving.issuperset(filter(None, ends)):
+            report.refuse(f"{ends[0]} moves with another joint (equality); hold one of them")
         elif element.tag in _LOOPS and _is_loop(given, carriers):
             report.refuse(f"its links form a loop, by {element.tag}; cut it")
         else:
@@ -105,24 +106,24 @@ def check_couplings(arm: Body, chain: list[Body], joints: list[Joint], mjcf: Mjc
             report.state("no dry friction, which the model has, of", joint.name)
 
 
-def refuse_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
-    """Refuse couplings and springs in surroundings, where Drake ignores them."""
+def report_couplings(joints: list[Joint], mjcf: Mjcf) -> None:
+    """Report couplings and springs of a complete file, which Drake ignores."""
     for element in (*mjcf.children("equality"), *mjcf.children("tendon")):
         if element.get("active") != "false":
-            name = element.get("name", "")
-            mjcf.report.refuse(f"its bodies are coupled by {element.tag} {name}".rstrip())
+            name = f"{element.tag} {element.get('name', '')}".rstrip()
+            mjcf.report.repair("no coupling, which Drake does not read from MJCF, by", name)
     for joint in joints:
         if joint.attributes.number("stiffness", 0.0) != 0.0:
-            mjcf.report.refuse(f"{joint.name} has a spring (stiffness)")
+            mjcf.report.repair("no spring, which Drake does not read from MJCF, of", joint.name)
 
 
-def _names(top: object, tag: str) -> set[str]:
-    return {each.get("name", "") for each in top.iter(tag)}  # type: ignore[attr-defined]
+def _names(top: Element, tag: str) -> set[str]:
+    return {each.get("name", "") for each in top.iter(tag)}
 
 
-def _force_site(sensor: object) -> str:
-    is_wrench = sensor.tag in ("force", "torque")  # type: ignore[attr-defined]
-    return sensor.get("site", "") if is_wrench else ""  # type: ignore[attr-defined]
+def _force_site(sensor: Element) -> str:
+    is_wrench = sensor.tag in ("force", "torque")
+    return sensor.get("site", "") if is_wrench else ""
 
 
 def _separate_joints(body: Body) -> Body:

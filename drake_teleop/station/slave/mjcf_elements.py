@@ -21,8 +21,8 @@ _MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI unit
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
 _PARTIAL = ("size", "gear", "gainprm", "biasprm", "friction")
-_ACTUATORS = ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder")
-_ACTUATORS += ("muscle", "adhesion", "dcmotor", "plugin")
+_ACTUATORS = {"general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder"}
+_ACTUATORS |= {"muscle", "adhesion", "dcmotor", "plugin"}
 _MAIN = "main"  # name of the class at the top
 
 
@@ -72,6 +72,7 @@ class Mjcf:
 
     def __init__(self, path: Path, files: ModelFiles, report: RepairReport) -> None:
         self.path, self.files, self.report = path, files, report
+        self._folders: dict[Element, Path] = {}  # of included elements
         self.root = read_xml(path)
         if self.root.tag != "mujoco":
             what = f"does not contain a mujoco tag, but {self.root.tag}"
@@ -86,6 +87,12 @@ class Mjcf:
         self._defaults: dict[str, dict[str, dict[str, str]]] = {_MAIN: {}}
         for element in self.root.findall("default"):
             self._read_defaults(element, _MAIN, self._defaults[_MAIN])
+
+    def file(self, element: Element, name: str, folder: str) -> Path | None:
+        """Return a file beside the main file, or else beside the included one."""
+        places = [self.path.resolve().parent, self._folders.get(element)]
+        found = (self.files.file(name, place / folder) for place in places if place)
+        return next((file for file in found if file is not None and file.is_file()), None)
 
     def children(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of this name, such as two `asset` sections."""
@@ -145,13 +152,15 @@ class Mjcf:
             raise DrakeTeleopError(what, where=str(self.path))
         content = list[Element]()
         for child in element:
+            if child.get("file"):
+                self._folders[child] = path.resolve().parent
             if child.tag != "include":
                 self._insert_includes(child, path, included, depth + 1)
                 content.append(child)
                 continue
             name = child.get("file", "")
-            file = self.files.file(name) or self.files.file(name, path.parent)
-            if file is None or not file.is_file():
+            file = self.file(child, name, "")
+            if file is None:
                 self.report.refuse(f"the included file {name!r} was not found")
             elif file.resolve() in included:
                 self.report.refuse(f"{name} is included twice")

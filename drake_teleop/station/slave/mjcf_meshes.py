@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,19 +100,14 @@ class MeshLibrary:
     def __init__(self, mjcf: Mjcf) -> None:
         self._mjcf = mjcf
         self._meshes: dict[str, Mesh | str] = {}
-        self._faults: list[str] = []
+        self.inaccessible: list[str] = []  # faults of files that may not be read
         for element in mjcf.children("asset"):
             label = f"{element.tag} {element.get('name') or element.get('file', '')}"
             attributes = mjcf.attributes(element, "", label)
-            file, fault = self._find(element.tag, attributes)
+            file, fault = self._find(element, attributes)
             if element.tag == "mesh":
                 mesh = Mesh(mjcf, attributes, file)
                 self._meshes[mesh.name] = fault or mesh
-
-    def refuse_inaccessible(self) -> None:
-        """Add the files that may not be read to the faults of a model that has others."""
-        for fault in self._faults if self._mjcf.report.causes else ():
-            self._mjcf.report.refuse(fault)
 
     def find(self, name: str) -> Mesh | str:
         """Return a mesh, or its fault as text."""
@@ -122,25 +119,25 @@ class MeshLibrary:
                 self._meshes[name] = mesh = f"{_suffix(mesh.file)}{_UNREADABLE}"
         return mesh
 
-    def _find(self, tag: str, attributes: Attributes) -> tuple[Path | None, str]:
+    def _find(self, element: Element, attributes: Attributes) -> tuple[Path | None, str]:
         """Return the file of an asset, and its fault as text."""
         name = attributes.get("file", "")
         if not name:
-            return None, "" if tag != "mesh" or "vertex" in attributes else _UNREADABLE
+            return None, "" if "vertex" in attributes else _UNREADABLE
         compiler = self._mjcf.compiler
         if compiler.get("strippath") == "true":
             name = re.split(r"[/\\]", name)[-1]
-        own = "meshdir" if tag == "mesh" else "texturedir"
-        folder = self._mjcf.path.resolve().parent / compiler.get(own, compiler.get("assetdir", ""))
-        file = self._mjcf.files.file(name, folder)
-        if file is None or not file.is_file():
+        own = "meshdir" if element.tag == "mesh" else "texturedir"
+        folder = compiler.get(own, compiler.get("assetdir", ""))
+        file = self._mjcf.file(element, name, folder)
+        if file is None:
             return None, _NOT_FOUND
         try:
             self._mjcf.files.check(file)
         except DrakeTeleopError as error:
             fault = str(error).removeprefix(f"{self._mjcf.path}: ")
             fault = fault.replace(str(file.resolve()), str(file.resolve().parent))
-            self._faults.append(fault)
+            self.inaccessible.append(fault)
             return None, fault
         return file, ""
 
@@ -177,7 +174,7 @@ def _read_obj(data: bytes) -> Triangles:
         elif words[:1] == [b"f"]:
             corners = [int(word.split(b"/")[0]) for word in words[1:]]
             corners = [k - 1 if k > 0 else len(vertices) + k for k in corners]
-            faces += [(corners[0], *pair) for pair in zip(corners[1:], corners[2:], strict=False)]
+            faces += [(corners[0], *pair) for pair in pairwise(corners[1:])]
     return Triangles(np.array(vertices).reshape(-1, 3), np.array(faces, np.intp).reshape(-1, 3))
 
 

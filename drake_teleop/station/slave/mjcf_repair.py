@@ -19,7 +19,7 @@ from drake_teleop.station.slave.mjcf_chain import (
     hold_joints,
     read_all,
     read_arm,
-    refuse_couplings,
+    report_couplings,
 )
 from drake_teleop.station.slave.mjcf_elements import Mjcf
 from drake_teleop.station.slave.mjcf_masses import NO_MASS
@@ -41,11 +41,12 @@ def repair_mjcf(
     folder: Path,
     *,
     is_scene: bool = False,
+    in_directives: bool = False,
 ) -> RepairedModel:
     """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
 
-    Without `sensor`, the file is a tool, whose joints are all held, or a scene, which remains
-    complete. `hold` contains joint positions [rad, m].
+    `hold` contains joint positions [rad, m]. Without `sensor`, the file is a tool, whose joints
+    are all held. A scene, or a file that directives add, keeps all bodies and joints.
 
     Raises:
         DrakeTeleopError: with all faults that cannot be repaired.
@@ -55,15 +56,16 @@ def repair_mjcf(
     reader = BodyReader(mjcf)
     if not mjcf.root.get("model"):
         report.state("the model is named after its file:", path.stem)
-    if sensor:
+    keeps_all = is_scene or in_directives
+    if keeps_all or not sensor:
+        world = read_all(reader)
+        chain = world.all() if keeps_all else []
+    else:
         world = Body("world", RigidTransform(), children=[read_arm(mjcf, reader, sensor)])
         chain = world.path_to(sensor)
-    else:
-        world = read_all(reader)
-        chain = world.all() if is_scene else []
-    if is_scene:
+    if keeps_all:
         moving = [(body, joint) for body in chain for joint in body.joints]
-        refuse_couplings([joint for _, joint in moving], mjcf)
+        report_couplings([joint for _, joint in moving], mjcf)
     else:
         moving = hold_joints(world, chain, hold, mjcf)
         check_couplings(world, chain, [joint for _, joint in moving], mjcf)
@@ -72,9 +74,10 @@ def repair_mjcf(
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _state_lost_shapes(reader, report)
-    reader.refuse_inaccessible()
+    for fault in reader.meshes.inaccessible if report.causes else ():
+        report.refuse(fault)
     report.raise_causes(path)
-    is_tool = not (sensor or is_scene)
+    is_tool = not (sensor or keeps_all)
     writer = MjcfText(mjcf, folder, is_tool=is_tool, is_scene=is_scene)
     text = writer.write(world, limits, [] if is_scene else joints)
     report.raise_causes(path)

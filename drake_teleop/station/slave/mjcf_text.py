@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -101,8 +102,8 @@ class MjcfText:
             SubElement(element, "geom", {**values, **seen, **self._mesh(geom.mesh)})
         try:
             hull = self._mesh(geom.mesh, hull=True)
-        except ValueError:
-            fault = "meshes have no volume; shapes are missing of"
+        except ValueError as error:
+            fault = f"a mesh has {error}; shapes are missing of"
             self._mjcf.report.repair(fault, body.name)
         else:
             SubElement(element, "geom", {**values, **felt, **hull})
@@ -116,8 +117,8 @@ class MjcfText:
         return {"mesh": self._meshes[key]}
 
 
-def _text(values: object) -> str:
-    return " ".join(repr(float(value)) for value in values)  # type: ignore[attr-defined]
+def _text(values: Iterable[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)
 
 
 def _pose(X: RigidTransform) -> dict[str, str]:
