@@ -92,7 +92,7 @@ class Mjcf:
         """Return a file beside the main file, or else beside the included one."""
         places = [self.path.resolve().parent, self._folders.get(element)]
         found = (self.files.file(name, place / folder) for place in places if place)
-        return next((file for file in found if file is not None and file.is_file()), None)
+        return next((file for file in found if file is not None and not file.is_dir()), None)
 
     def children(self, section: str) -> Iterator[Element]:
         """Yield the elements in all sections of this name, such as two `asset` sections."""
