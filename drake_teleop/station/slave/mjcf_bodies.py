@@ -118,15 +118,16 @@ class BodyReader:
         self._counters: dict[str, count[int]] = {}
         self.lost: dict[str, list[tuple[Body, Attributes]]] = {}  # shapes by fault
 
-    def top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
-        """Return bodies on the world, with their `childclass` and the pose of their frame."""
+    def take_top_bodies(self) -> list[tuple[Element, str, RigidTransform]]:
+        """Remove the bodies from the world; return them with `childclass` and pose of the frame."""
         found = []
 
         def collect(parent: Element, childclass: str, X_WF: RigidTransform) -> None:
             childclass = parent.get("childclass") or childclass
-            for child in parent:
+            for child in list(parent):
                 if child.tag == "body":
                     found.append((child, childclass, X_WF))
+                    parent.remove(child)
                 elif child.tag == "frame":
                     attributes = Attributes(child.attrib, "frame", self._mjcf.report)
                     collect(child, childclass, X_WF @ self._mjcf.pose(attributes))

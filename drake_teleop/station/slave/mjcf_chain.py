@@ -17,12 +17,12 @@ _LOOPS = ("connect", "weld", "distance")
 
 
 def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
-    """Return the body on the world that carries the sensor; state what else is on the world.
+    """Return the world's shapes and the body that carries the sensor; state the other bodies.
 
     Raises:
         DrakeTeleopError: if no body or site, or more than one, has the sensor's name.
     """
-    tops = reader.top_bodies()
+    tops = reader.take_top_bodies()
     kind = "body" if any(sensor in _names(top, "body") for top, *_ in tops) else "site"
     carriers = [top for top in tops if sensor in _names(top[0], kind)]
     if len(carriers) != 1:
@@ -33,16 +33,20 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
             where=str(mjcf.path),
             remedy=f"name one of {listed(sorted(known))}" if known else "give a model with bodies",
         )
-    for top, *_ in tops:
-        if top is not carriers[0][0]:
-            name = top.get("name") or "a body without name"
-            mjcf.report.state("bodies that the arm does not carry are left out:", name)
+    world = reader.read_world()
+    others = [
+        top.get("name") or "a body without name" for top, *_ in tops if top not in carriers[0]
+    ]
+    for name in (*others, *world.generators):
+        mjcf.report.state("left out, because the arm does not carry it:", name)
+    world.generators.clear()
     arm = _separate_joints(reader.read(*carriers[0]))
     if kind == "site":
         measured = {site for each in mjcf.children("sensor") if (site := _force_site(each))}
         arm = _insert_site(arm, sensor, is_measured=sensor in measured)
         mjcf.report.state("a frame of the model in place of the site", sensor)
-    return arm
+    world.children = [arm]
+    return world
 
 
 def read_all(reader: BodyReader) -> Body:

@@ -10,7 +10,6 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from pydrake.math import RigidTransform
 
 from drake_teleop.station.slave.mjcf_actuators import effort_limits
 from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, Joint, touches
@@ -61,7 +60,7 @@ def repair_mjcf(
         world = read_all(reader)
         chain = world.all() if keeps_all else []
     else:
-        world = Body("world", RigidTransform(), children=[read_arm(mjcf, reader, sensor)])
+        world = read_arm(mjcf, reader, sensor)
         chain = world.path_to(sensor)
     if keeps_all:
         moving = [(body, joint) for body in chain for joint in body.joints]
