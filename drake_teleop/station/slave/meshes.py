@@ -24,11 +24,12 @@ _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
 def remove_unusable_meshes(
-    root: ElementTree.Element, files: ModelFiles, folder: Path
+    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path
 ) -> dict[str, list[str]]:
     """Remove shapes without a usable mesh; return the names of the affected links by fault.
 
-    STL files become convex hulls, because Drake does not read STL; other paths become absolute.
+    Relative addresses start at the folder of the file `model` and become absolute. STL files become
+    convex hulls, because Drake does not read STL.
     A lost visual is reported only for links without shapes, a lost collision shape only for links
     without a visual or with other collision shapes.
     """
@@ -37,7 +38,7 @@ def remove_unusable_meshes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                if fault := _mesh_fault(shape, files, folder):
+                if fault := _mesh_fault(shape, model, files, folder):
                     link.remove(shape)
                     removed.add(fault)
         if link.find("collision") is not None:
@@ -51,13 +52,15 @@ def remove_unusable_meshes(
     return lost
 
 
-def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
+def _mesh_fault(
+    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path
+) -> str | None:
     """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
     address = mesh.get("filename") or mesh.findtext("uri") or ""
-    file = files.file(address.strip())
+    file = files.file(address.strip(), model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
     try:

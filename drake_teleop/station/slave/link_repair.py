@@ -1,0 +1,113 @@
+"""Repair of masses and inertias of links in URDF and SDF."""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
+from drake_teleop.station.slave.repair_report import RepairReport
+
+_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+# Relative changes of an inertia: rounding below the first, suspicious above the second.
+_ROUNDING, _SUSPICIOUS = 1e-3, 0.05
+_NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
+
+
+def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> None:
+    """Give a link a mass and an inertia that a body can have; state what changed.
+
+    Nothing depends on those of links at rest: they are removed if impossible.
+    """
+    name, inertial = link.get("name", ""), link.find("inertial")
+    if inertial is None or (not is_sdf and inertial.find("mass") is None):
+        _state_missing(link, inertial, report, is_sdf=is_sdf, at_rest=at_rest)
+        return
+    mass, inertia = _mass(inertial), _inertia(inertial, is_sdf=is_sdf)
+    invalid = _fault(mass, inertia)
+    if at_rest:
+        if invalid or (mass == 0.0) != (not inertia.any()) or nearest_possible_inertia(inertia)[1]:
+            link.remove(inertial)
+            report.state("no inertia, as no joint of the arm moves it, of", name)
+    elif invalid:
+        report.refuse(f"link {name}: {invalid}")
+    elif mass == 0.0:
+        if inertia.any():
+            report.repair("an inertia without a mass left out of", name)
+        _remove_mass(link, inertial, is_sdf=is_sdf)
+    elif not inertia.any():
+        report.state("no inertia of", name)
+    else:
+        _correct(inertial, inertia, name, report)
+
+
+def _state_missing(
+    link: Element, inertial: Element | None, report: RepairReport, *, is_sdf: bool, at_rest: bool
+) -> None:
+    if inertial is not None:
+        link.remove(inertial)
+    if is_sdf:
+        report.state("1 kg, the default of SDF, for", link.get("name", ""))
+    elif not at_rest and (link.find("collision") is not None or link.find("visual") is not None):
+        report.state("no inertia of", link.get("name", ""))
+
+
+def _mass(inertial: Element) -> float:
+    element = inertial.find("mass")
+    return 1.0 if element is None else number(element.get("value") or element.text)
+
+
+def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
+    element, tensor = inertial.find("inertia"), np.zeros((3, 3))
+    if element is None:
+        return np.eye(3) if is_sdf else tensor
+    for name, (row, column) in _ENTRIES.items():
+        default = "1" if is_sdf and row == column else "0"
+        text = element.get(name) or element.findtext(name) or default
+        tensor[row, column] = tensor[column, row] = number(text)
+    return tensor
+
+
+def _fault(mass: float, inertia: NDArray[np.float64]) -> str:
+    if not 0.0 <= mass <= MAX_VALUE:
+        return f"mass {mass:g} kg is outside 0 to {MAX_VALUE:g} kg"
+    values = inertia[~(np.abs(inertia) <= MAX_VALUE)]
+    return f"inertia {values[0]:g} is no number up to {MAX_VALUE:g} kg m^2" if values.size else ""
+
+
+def _remove_mass(link: Element, inertial: Element, *, is_sdf: bool) -> None:
+    link.remove(inertial)
+    if is_sdf:  # without the element, the mass is 1 kg
+        inertial = SubElement(link, "inertial")
+        SubElement(inertial, "mass").text = "0"
+        _write(SubElement(inertial, "inertia"), np.zeros((3, 3)), is_sdf=True)
+
+
+def _correct(
+    inertial: Element, inertia: NDArray[np.float64], name: str, report: RepairReport
+) -> None:
+    nearest, change = nearest_possible_inertia(inertia)
+    if change == 0.0:
+        return
+    if change <= _ROUNDING or change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+        report.state("an inertia corrected for rounding of", name)
+    else:
+        what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
+        warning = "check it: " if change > _SUSPICIOUS else ""
+        report.repair(f"{warning}{what}", f"{name} ({100 * change:.2g} %)")
+    element = inertial.find("inertia")
+    if element is not None:
+        _write(element, nearest, is_sdf=element.get("ixx") is None)
+
+
+def _write(element: Element, inertia: NDArray[np.float64], *, is_sdf: bool) -> None:
+    for name, place in _ENTRIES.items():
+        text = f"{inertia[place]:.17g}"
+        if not is_sdf:
+            element.set(name, text)
+            continue
+        child = element.find(name)
+        (SubElement(element, name) if child is None else child).text = text
