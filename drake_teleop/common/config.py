@@ -43,7 +43,9 @@ def choice(default: str, choices: Sequence[str], doc: str) -> Any:
 def plain(default: Any, doc: str) -> Any:
     """Return a dataclass field for a flag, word, integer, list or mapping of names."""
     if isinstance(default, (list, dict)):
-        return dataclasses.field(default_factory=lambda: type(default)(default), metadata={"doc": doc})
+        return dataclasses.field(
+            default_factory=lambda: type(default)(default), metadata={"doc": doc}
+        )
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 

@@ -11,7 +11,14 @@ from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
 from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
 from drake_teleop.station.slave.repair_report import RepairReport
 
-_ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+_ENTRIES = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING, _SUSPICIOUS = 1e-3, 0.05
 _NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
@@ -23,15 +30,21 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     Nothing depends on those of links at rest: they are removed if impossible.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
-    if inertial is None or (not is_sdf and inertial.find("mass") is None):
-        _state_missing(link, inertial, report, is_sdf=is_sdf, at_rest=at_rest)
+    if inertial is None or inertial.find("mass") is None:
+        if is_sdf:
+            report.state("1 kg, the default of SDF, for", name)
+        elif inertial is not None:
+            link.remove(inertial)
+            report.state("no inertia of", name)
         return
     mass, inertia = _mass(inertial), _inertia(inertial, is_sdf=is_sdf)
-    invalid = _fault(mass, inertia)
+    invalid = _fault(inertial, mass, inertia)
     if at_rest:
         if invalid or (mass == 0.0) != (not inertia.any()) or nearest_possible_inertia(inertia)[1]:
             link.remove(inertial)
-            report.state("no inertia, as no joint of the arm moves it, of", name)
+            report.state(
+                "an impossible inertia left out, as no joint of the arm moves the link, of", name
+            )
     elif invalid:
         report.refuse(f"link {name}: {invalid}")
     elif mass == 0.0:
@@ -44,20 +57,12 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
         _correct(inertial, inertia, name, report)
 
 
-def _state_missing(
-    link: Element, inertial: Element | None, report: RepairReport, *, is_sdf: bool, at_rest: bool
-) -> None:
-    if inertial is not None:
-        link.remove(inertial)
-    if is_sdf:
-        report.state("1 kg, the default of SDF, for", link.get("name", ""))
-    elif not at_rest and (link.find("collision") is not None or link.find("visual") is not None):
-        report.state("no inertia of", link.get("name", ""))
-
-
 def _mass(inertial: Element) -> float:
-    element = inertial.find("mass")
-    return 1.0 if element is None else number(element.get("value") or element.text)
+    return number(_text(inertial.find("mass")))
+
+
+def _text(mass: Element | None) -> str:
+    return "" if mass is None else (mass.get("value") or mass.text or "").strip()
 
 
 def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
@@ -71,11 +76,13 @@ def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
     return tensor
 
 
-def _fault(mass: float, inertia: NDArray[np.float64]) -> str:
+def _fault(inertial: Element, mass: float, inertia: NDArray[np.float64]) -> str:
     if not 0.0 <= mass <= MAX_VALUE:
-        return f"mass {mass:g} kg is outside 0 to {MAX_VALUE:g} kg"
-    values = inertia[~(np.abs(inertia) <= MAX_VALUE)]
-    return f"inertia {values[0]:g} is no number up to {MAX_VALUE:g} kg m^2" if values.size else ""
+        text = _text(inertial.find("mass"))
+        return f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
+    if not (np.abs(inertia) <= MAX_VALUE).all():
+        return f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
+    return ""
 
 
 def _remove_mass(link: Element, inertial: Element, *, is_sdf: bool) -> None:
@@ -96,8 +103,8 @@ def _correct(
         report.state("an inertia corrected for rounding of", name)
     else:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
-        warning = "check it: " if change > _SUSPICIOUS else ""
-        report.repair(f"{warning}{what}", f"{name} ({100 * change:.2g} %)")
+        warning = "warning: " if change > _SUSPICIOUS else ""
+        report.repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
     element = inertial.find("inertia")
     if element is not None:
         _write(element, nearest, is_sdf=element.get("ixx") is None)

@@ -3,35 +3,38 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from pydrake.geometry import Capsule
+from numpy.typing import NDArray
+from pydrake.geometry import Capsule, Mesh
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_MIN_CORNERS, _FLAT = 4, 1e-7  # of a solid; smallest thickness, as a share of its length
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
 def remove_unusable_meshes(
-    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path
+    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> dict[str, list[str]]:
     """Remove shapes without a usable mesh; return the names of the affected links by fault.
 
     Relative addresses start at the folder of the file `model` and become absolute. STL files become
-    convex hulls, because Drake does not read STL.
-    A lost visual is reported only for links without shapes, a lost collision shape only for links
-    without a visual or with other collision shapes.
+    convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
+    removed, for a plant without geometry. A lost visual is reported only for links without shapes,
+    a lost collision shape only for links without a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
@@ -49,29 +52,41 @@ def remove_unusable_meshes(
             reported = faults["collision"] | faults["visual"]
         for fault in sorted(reported):
             lost.setdefault(fault, []).append(link.get("name", ""))
+        for shape in [*link.findall("collision"), *link.findall("visual")] if not folder else []:
+            link.remove(shape)
     return lost
 
 
 def _mesh_fault(
-    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path
+    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> str | None:
     """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
-    address = mesh.get("filename") or mesh.findtext("uri") or ""
-    file = files.file(address.strip(), model.resolve().parent)
+    address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
+    file = files.file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
+    if not files.may_read(file):
+        return (
+            f"meshes in {file.resolve().parent} are outside the model's folder and its packages"
+            " (name their folder: --package-path, slave.package_paths)"
+        )
     try:
         files.check(file)
     except DrakeTeleopError as error:
         return str(error)
-    if file.suffix.lower() == ".stl":
-        file = _convert_stl_to_hull(file, folder)
-    if file is None or file.suffix.lower() not in _READABLE_SUFFIXES:
-        suffix = Path(address.strip()).suffix
-        return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
+    suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
+    if suffix not in (".stl", *_READABLE_SUFFIXES):
+        return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
+    is_damaged = suffix == ".stl" or shape.tag == "collision"
+    if is_damaged and not _is_solid(file, written):
+        return f"{Path(address).suffix} meshes are flat, empty or damaged"
+    if suffix == ".stl" and folder is not None:
+        target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
+        target.write_text(_hull_of_stl(file, written))
+        file = target
     if mesh.get("filename"):
         mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
     else:
@@ -79,27 +94,61 @@ def _mesh_fault(
     return None
 
 
-def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
-    """Write the convex hull of an STL file as OBJ; return None for a degenerate hull."""
-    from scipy.spatial import ConvexHull, QhullError
+@lru_cache(maxsize=1024)
+def _is_solid(path: Path, _: int) -> bool:
+    """Return whether the corners of a mesh span a volume, and its faces have corners.
 
+    The second argument is the file's time, so that an edited file is read again.
+    """
+    if path.suffix.lower() in (".gltf", ".vtk"):
+        try:
+            with silent_stderr():
+                return Mesh(str(path)).GetConvexHull().num_vertices() > _MIN_CORNERS
+        except RuntimeError:
+            return False
+    corners = _stl_corners(path) if path.suffix.lower() == ".stl" else _obj_corners(path)
+    if len(corners) < _MIN_CORNERS or not np.isfinite(corners).all():
+        return False
+    spread = np.linalg.eigvalsh(np.cov(corners.T))
+    return bool(spread[0] > _FLAT**2 * spread[2])
+
+
+def _obj_corners(path: Path) -> NDArray[np.float64]:
+    """Return the corners (n, 3) of an OBJ file; none if a face names another one."""
+    data = path.read_bytes()
+    corners = _numbers(re.findall(rb"^\s*v\s+(\S+)\s+(\S+)\s+(\S+)", data, re.M))
+    faces = re.findall(rb"^\s*f\s+(.*)$", data, re.M)
+    used = [int(word) for face in faces for word in re.findall(rb"(?:^|\s)(-?\d+)", face)]
+    valid = used and min(map(abs, used)) > 0 and max(map(abs, used)) <= len(corners)
+    return corners if valid else np.empty((0, 3))
+
+
+def _stl_corners(path: Path) -> NDArray[np.float64]:
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + count * _TRIANGLE.itemsize:
-        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"].reshape(-1, 3)
-    else:
-        lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
-        corners = np.array(lines, dtype=float).reshape(-1, 3)
+        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"]
+        return corners.reshape(-1, 3).astype(np.float64)
+    return _numbers(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data))
+
+
+def _numbers(rows: list[tuple[bytes, ...]]) -> NDArray[np.float64]:
     try:
-        hull = ConvexHull(np.unique(corners.astype(float), axis=0))
-    except (QhullError, ValueError):
-        return None
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    except ValueError:
+        return np.empty((0, 3))
+
+
+@lru_cache(maxsize=1024)
+def _hull_of_stl(path: Path, _: int) -> str:
+    """Return the convex hull of a solid STL file as text of an OBJ file."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(_stl_corners(path))
     number = {vertex: k + 1 for k, vertex in enumerate(hull.vertices)}
     rows = ["v {:.9g} {:.9g} {:.9g}".format(*hull.points[vertex]) for vertex in hull.vertices]
     rows += ["f {} {} {}".format(*(number[k] for k in face)) for face in hull.simplices]
-    target = folder / f"{len(list(folder.iterdir()))}_{path.stem}.obj"
-    target.write_text("\n".join(rows) + "\n")
-    return target
+    return "\n".join(rows) + "\n"
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:

@@ -70,6 +70,7 @@ def read_model(
     if kind == ".yaml":
         read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
     files = ModelFiles(path, package_paths)
+    purpose = purpose._replace(has_geometry=plant.geometry_source_is_registered())
     parser = Parser(plant)
     parser.SetAutoRenaming(True)
     files.share_packages(parser.package_map())

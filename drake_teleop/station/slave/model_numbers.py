@@ -45,7 +45,9 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
             if math.isnan(value) and word.lower().strip("+-") != "nan" and "$" not in word:
                 continue  # a name; Drake reports an invalid number
             if not abs(value) <= MAX_VALUE:
-                report.refuse(f"{where}: {inner.tag} {word} is no finite number up to {MAX_VALUE:g}")
+                report.refuse(
+                    f"{where}: {inner.tag} {word} is no finite number up to {MAX_VALUE:g}"
+                )
             if inner.tag == "drake:rotor_inertia" and value < 0.0:
                 report.refuse(f"{where}: a rotor inertia of {word} kg m^2 is negative")
 

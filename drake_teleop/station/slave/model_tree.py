@@ -103,9 +103,7 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
     return chain
 
 
-def _without_free_base(
-    scope: Element, chain: list[Element], report: RepairReport
-) -> list[Element]:
+def _without_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
     """Remove a first joint that lets the arm's base float or drive."""
     moving = [k for k, joint in enumerate(chain) if joint.get("type") != "fixed"]
     if not moving or chain[moving[0]].get("type") not in _DETACHED:
@@ -145,12 +143,16 @@ def _remove_unreachable(
         if name not in moved:
             scope.remove(link)
             if name != WORLD:
-                report.repair("not connected to the arm and left out:", name or "a link without name")
+                report.repair(
+                    "not connected to the arm and left out:", name or "a link without name"
+                )
     for joint in joints_of(scope):
         if joint not in kept:
             scope.remove(joint)
             if joint_end(joint, "parent") in moved:
-                report.repair("left out, as it closes a loop or has no child:", joint.get("name", ""))
+                report.repair(
+                    "left out, as it closes a loop or has no child:", joint.get("name", "")
+                )
     return moved
 
 

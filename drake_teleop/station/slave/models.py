@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +25,8 @@ from drake_teleop.station.slave.chain_joints import (
 from drake_teleop.station.slave.drake_errors import translate_drake_errors
 from drake_teleop.station.slave.model_files import read_model
 from drake_teleop.station.slave.urdf_repair import Purpose
+
+_MAX_NAMES = 12  # names of frames in an error: the most similar ones
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,9 @@ def _sensor_frame(
     names = {plant.get_frame(k).name() for each in instances for k in plant.GetFrameIndices(each)}
     # Without names that Drake creates for joints.
     ends = ("_parent", "_child", "__model__")
-    known = ", ".join(sorted(each for each in names if not each.endswith(ends)))
+    named = sorted(each for each in names if not each.endswith(ends))
+    nearest = difflib.get_close_matches(name, named, n=_MAX_NAMES, cutoff=0.0)
+    known = ", ".join(sorted(nearest))
     raise DrakeTeleopError(
         f"{len(with_frame) or 'no'} frames are named {name!r}",
         where=where,

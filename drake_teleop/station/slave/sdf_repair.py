@@ -41,7 +41,7 @@ def repair_sdf(
     repair_scope(root, purpose, report, is_sdf=True)
     report.raise_causes(file)
     inner = [_repair_included(uri, file, files, purpose, folder) for uri in root.iterfind(_URIS)]
-    own = finish(root, file, files, report, folder)
+    own = finish(root, file, files, report, folder if purpose.has_geometry else None)
     for each in (each for each in inner if each is not None):
         own = RepairedModel(
             own.text,
@@ -86,7 +86,9 @@ def _keep_one_model(
 ) -> None:
     """Reduce worlds and several models to the model with the sensor."""
     worlds = root.findall("world")
-    models = [each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")]
+    models = [
+        each for scope in (root, *worlds) for each in scope if each.tag in ("model", "include")
+    ]
     if not worlds and len(models) <= 1:
         return
     with_sensor = [each for each in models if _has_frame(each, file, files, sensor)]

@@ -46,6 +46,7 @@ class Purpose(NamedTuple):
         is_tool: whether all joints are held.
         is_scene: whether every element that the tool could touch must be readable.
         in_directives: whether other files may attach to any link, and set positions.
+        has_geometry: whether the plant takes shapes.
     """
 
     sensor: str = ""
@@ -53,6 +54,7 @@ class Purpose(NamedTuple):
     is_tool: bool = False
     is_scene: bool = False
     in_directives: bool = False
+    has_geometry: bool = True
 
 
 def repair_urdf(
@@ -71,8 +73,8 @@ def repair_urdf(
         _keep_one_material_per_name(root)
     repair_scope(root, purpose, report, is_sdf=False)
     if not purpose.is_scene:
-        _remove_idle_parts(root)
-    return finish(root, file, files, report, folder)
+        _remove_idle_parts(root, report)
+    return finish(root, file, files, report, folder if purpose.has_geometry else None)
 
 
 def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
@@ -91,19 +93,28 @@ def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sd
                     joint.remove(mimic)
             in_chain = joint in chain and joint.get("name") not in purpose.hold
             check_joint(joint, links, report, in_chain=in_chain)
+        moving = {
+            joint_end(each, "child") for each in joints_of(scope) if each.get("type") != "fixed"
+        }
         for link in scope.findall("link"):
-            at_rest = tree is not None and tree.moved.get(link.get("name", "")) == 0
-            check_quantities(link, f"link {link.get('name', '')}", report)
+            name = link.get("name", "")
+            check_quantities(link, f"link {name}", report)
+            if link.find("inertial") is None and name in moving and not is_sdf:
+                report.state("no inertia of", name)
+            at_rest = tree is not None and tree.moved.get(name) == 0
             repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
 
 
 def finish(
-    root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path
+    root: Element, file: Path, files: ModelFiles, report: RepairReport, folder: Path | None
 ) -> RepairedModel:
-    """Make the addresses of meshes absolute; return the text, or raise all faults at once."""
+    """Make the addresses of meshes absolute; return the text, or raise all faults at once.
+
+    Without a folder for converted meshes the text has no shapes.
+    """
     report.raise_causes(file)
-    for what, links in remove_unusable_meshes(root, file, files, folder).items():
-        report.repair("shapes are missing of", f"{listed(links)}: {what}")
+    for fault, links in remove_unusable_meshes(root, file, files, folder).items():
+        report.repair("shapes are missing of", f"{listed(links)}: {fault}")
     report.raise_causes(file)
     limits = {
         joint.get("name", ""): number(limit.get("effort") or limit.findtext("effort") or "0")
@@ -150,10 +161,12 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
             report.repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
-    links = set[str]()
+    links, children = set[str](), [joint_end(joint, "child") for joint in joints_of(scope)]
     for link in scope.findall("link"):
         name = link.get("name", "")
-        if name in links:
+        if name in links and children.count(name) > 1:
+            report.refuse(f"two links are named {name}; rename one of them")
+        elif name in links:
             scope.remove(link)
             report.repair("a second link of the same name left out:", name)
         links.add(name)
@@ -185,7 +198,7 @@ def _has_colour(material: Element) -> bool:
     return colour is not None and len(colour.get("rgba", "").split()) == 4
 
 
-def _remove_idle_parts(root: Element) -> None:
+def _remove_idle_parts(root: Element, report: RepairReport) -> None:
     """Remove frames and filters of missing links, and motors without data for Drake."""
     links = {link.get("name", "") for link in root.findall("link")}
     moving = {joint.get("name", "") for joint in joints_of(root) if joint.get("type") != "fixed"}
@@ -202,5 +215,6 @@ def _remove_idle_parts(root: Element) -> None:
             root.remove(motor)
             continue
         moving.discard(names[0])
+        check_quantities(motor, f"motor of {names[0]}", report)
         for actuator in motor.findall("actuator"):
             actuator.set("name", names[0])
