@@ -11,6 +11,7 @@ from drake_teleop.station.slave.repair_report import RepairReport
 WORLD = "world"  # name in URDF and SDF
 JOINT_TAGS = ("joint", "drake:joint")
 _LOOP_TAGS = ("drake:ball_constraint", "drake:linear_bushing_rpy", "drake:tendon_constraint")
+_NUM_ENDS = 2  # names of bodies or frames in such a constraint
 _DETACHED = ("floating", "planar")
 
 
@@ -160,9 +161,9 @@ def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -
     """Remove constraints between links that do not move relative to each other."""
     for element in [child for child in scope if child.tag in _LOOP_TAGS]:
         names = [inner.get("name", "") for inner in element.iter() if inner.get("name")]
-        links = {link_of_frame(scope, name) for name in names}
+        groups = {moved.get(link_of_frame(scope, name), -1) for name in names}
         scope.remove(element)
-        if len({moved.get(link, -1) for link in links}) != 1:
+        if len(names) < _NUM_ENDS or len(groups) > 1:
             report.refuse(
                 f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
             )
