@@ -104,6 +104,7 @@ DAMPED = '<dynamics damping="-1"/>'
 ROTOR = '<transmission type="SimpleTransmission"><joint name="j3"/><actuator name="a">{}</actuator>'
 ROTOR += "</transmission>"
 OF_GEAR = ROTOR.format('<drake:rotor_inertia value="-1"/>')
+IMPOSSIBLE = "an impossible inertia left out, as no joint of the arm moves the link, of "
 
 ERRORS = {
     # Files
@@ -128,11 +129,12 @@ ERRORS = {
     "a bushing": ("urdf", arm(beyond="<drake:linear_bushing_rpy/>"), "form a loop, by drake:"),
     "no parent": ("urdf", arm(j3=joint(3).replace('<parent link="l2"/>', "")),
                   "joint j3 has no parent link"),
-    "no such parent": ("urdf", arm(j3=joint(3, parent="zz")), "joint j3: its parent link 'zz' does not exist"),
+    "no such parent": ("urdf", arm(j3=joint(3, parent="zz")),
+                       "joint j3: its parent link 'zz' does not exist"),
     "links of one name": ("urdf", arm(beyond=FINGER.replace('"f"', '"l2"')),
                           "two links are named l2"),
     "a link without name": ("urdf", arm(l3="<link/>"),
-                            "2 faults: .1. joint j3: its child link 'l3' does not exist; .2. joint j4"),
+                            "2 faults: .1. joint j3: its child link 'l3' does not exist; .2. jo"),
     # Joints
     "mimic": ("urdf", arm(j3=joint(3, inside='<mimic joint="j2"/>')), "j3 moves with another"),
     "planar": ("urdf", arm(j3=joint(3, "planar")), "j3 is a planar joint; up to the sensor, use"),
@@ -157,8 +159,8 @@ ERRORS = {
                              "joint j3: lower limit 'nan' is not a number"),
     "a negative speed": ("urdf", with_limit('<limit velocity="-1"/>'), "velocity limit -1 is neg"),
     # Masses
-    "a negative mass": ("urdf", with_inertial(('"2"', '"-2"')), "link l3: mass -2 kg is not between"),
-    "a mass that is none": ("urdf", with_inertial(('"2"', '"nan"')), "link l3: mass nan kg is not between"),
+    "a negative mass": ("urdf", with_inertial(('"2"', '"-2"')), "mass -2 kg is not between 0"),
+    "a mass that is none": ("urdf", with_inertial(('"2"', '"nan"')), "l3: mass nan kg is not"),
     # Units
     "in mm": ("urdf", scaled(1000), "is 1.25e.03 m long; give lengths in m"),
     "in km": ("urdf", scaled(0.001), "is 0.00125 m long; give lengths in m"),
@@ -231,13 +233,13 @@ ASSUMED = {
     "an inertia of rounded numbers": (with_inertial(('izz="0.01"', 'izz="0.040001"')),
                                       "an inertia corrected for rounding of l3"),
     "a base of an impossible inertia": (arm(l0=link("l0", INERTIAL.replace("0.01", "0.05"))),
-                                        "an impossible inertia left out, as no joint of the arm moves the link, of l0"),
+                                        IMPOSSIBLE + "l0"),
     "the same of a base that is screwed down": (
         arm(l0=link("mount", "") + joint(1, "fixed", "", "mount", "l0", "bolts")
-            + link("l0", INERTIAL.replace("0.01", "0.05"))), "an impossible inertia left out, as no joint of the arm moves the link, of l0"),
+            + link("l0", INERTIAL.replace("0.01", "0.05"))), IMPOSSIBLE + "l0"),
     "an impossible inertia beside the arm": (
         arm(beyond=link("x", INERTIAL.replace('ixx="0.02"', 'ixx="-2"'))
-            + joint(8, parent="l0", child="x")), "an impossible inertia left out, as no joint of the arm moves the link, of x"),
+            + joint(8, parent="l0", child="x")), IMPOSSIBLE + "x"),
     "an inertia that is rounding": (
         with_inertial(('ixx="0.02" ixy="0"', 'ixx="0" ixy="2e-35"'), ('"0.02"', '"0"'),
                       ('"0.01"', '"0"')), "an inertia corrected for rounding of l3"),

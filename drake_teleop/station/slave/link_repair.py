@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drake_teleop.station.slave.model_numbers import MAX_VALUE, number
+from drake_teleop.station.slave.model_tree import WORLD
 from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
 from drake_teleop.station.slave.repair_report import RepairReport
 
@@ -24,10 +25,11 @@ _ROUNDING, _SUSPICIOUS = 1e-3, 0.05
 _NEGLIGIBLE_KG_M2 = 1e-15  # changes below this are rounding
 
 
-def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> None:
+def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest: bool) -> bool:
     """Give a link a mass and an inertia that a body can have; state what changed.
 
-    Nothing depends on those of links at rest: they are removed if impossible.
+    Nothing depends on those of links at rest: they are removed if impossible. Return whether the
+    file gives the link neither.
     """
     name, inertial = link.get("name", ""), link.find("inertial")
     if inertial is None or inertial.find("mass") is None:
@@ -35,8 +37,10 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
             report.state("1 kg, the default of SDF, for", name)
         elif inertial is not None:
             link.remove(inertial)
-            report.state("no inertia of", name)
-        return
+        return not is_sdf
+    if name == WORLD:
+        link.remove(inertial)
+        return False
     mass, inertia = _mass(inertial), _inertia(inertial, is_sdf=is_sdf)
     invalid = _fault(inertial, mass, inertia)
     if at_rest:
@@ -51,10 +55,9 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
         if inertia.any():
             report.repair("an inertia without a mass left out of", name)
         _remove_mass(link, inertial, is_sdf=is_sdf)
-    elif not inertia.any():
-        report.state("no inertia of", name)
-    else:
+    elif inertia.any():
         _correct(inertial, inertia, name, report)
+    return not at_rest and not inertia.any()
 
 
 def _mass(inertial: Element) -> float:

@@ -21,7 +21,7 @@ from drake_teleop.station.slave.model_references import ModelFiles
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
-_MIN_CORNERS, _FLAT = 4, 1e-7  # of a solid; smallest thickness, as a share of its length
+_MIN_CORNERS = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
@@ -80,12 +80,11 @@ def _mesh_fault(
     suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
     if suffix not in (".stl", *_READABLE_SUFFIXES):
         return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
-    is_damaged = suffix == ".stl" or shape.tag == "collision"
-    if is_damaged and not _is_solid(file, written):
-        return f"{Path(address).suffix} meshes are flat, empty or damaged"
+    if (suffix == ".stl" or shape.tag == "collision") and not _is_readable(file, written):
+        return f"{Path(address).suffix} meshes are empty or damaged"
     if suffix == ".stl" and folder is not None:
         target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
-        target.write_text(_hull_of_stl(file, written))
+        target.write_text(_obj_of_stl(file, written))
         file = target
     if mesh.get("filename"):
         mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
@@ -95,22 +94,19 @@ def _mesh_fault(
 
 
 @lru_cache(maxsize=1024)
-def _is_solid(path: Path, _: int) -> bool:
-    """Return whether the corners of a mesh span a volume, and its faces have corners.
+def _is_readable(path: Path, _: int) -> bool:
+    """Return whether a mesh has faces with finite corners.
 
     The second argument is the file's time, so that an edited file is read again.
     """
     if path.suffix.lower() in (".gltf", ".vtk"):
         try:
             with silent_stderr():
-                return Mesh(str(path)).GetConvexHull().num_vertices() > _MIN_CORNERS
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
         except RuntimeError:
             return False
     corners = _stl_corners(path) if path.suffix.lower() == ".stl" else _obj_corners(path)
-    if len(corners) < _MIN_CORNERS or not np.isfinite(corners).all():
-        return False
-    spread = np.linalg.eigvalsh(np.cov(corners.T))
-    return bool(spread[0] > _FLAT**2 * spread[2])
+    return len(corners) >= _MIN_CORNERS and bool(np.isfinite(corners).all())
 
 
 def _obj_corners(path: Path) -> NDArray[np.float64]:
@@ -140,14 +136,19 @@ def _numbers(rows: list[tuple[bytes, ...]]) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=1024)
-def _hull_of_stl(path: Path, _: int) -> str:
-    """Return the convex hull of a solid STL file as text of an OBJ file."""
-    from scipy.spatial import ConvexHull
+def _obj_of_stl(path: Path, _: int) -> str:
+    """Return the convex hull of an STL file, or its triangles if flat, as text of an OBJ file."""
+    from scipy.spatial import ConvexHull, QhullError
 
-    hull = ConvexHull(_stl_corners(path))
-    number = {vertex: k + 1 for k, vertex in enumerate(hull.vertices)}
-    rows = ["v {:.9g} {:.9g} {:.9g}".format(*hull.points[vertex]) for vertex in hull.vertices]
-    rows += ["f {} {} {}".format(*(number[k] for k in face)) for face in hull.simplices]
+    points = _stl_corners(path)
+    try:
+        hull = ConvexHull(points)
+        faces = np.searchsorted(hull.vertices, hull.simplices, sorter=np.argsort(hull.vertices))
+        corners = points[np.sort(hull.vertices)]
+    except QhullError:
+        corners, faces = points, np.arange(len(points)).reshape(-1, 3)
+    rows = ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in corners]
+    rows += ["f {} {} {}".format(*face) for face in faces + 1]
     return "\n".join(rows) + "\n"
 
 

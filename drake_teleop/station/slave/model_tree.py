@@ -95,6 +95,9 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
             report.refuse(f"its joints form a circle through {link}; cut the loop")
             return None
         passed.add(link)
+        if link == WORLD:
+            report.refuse(f"world is the child of {parents[link][0].get('name', '')}")
+            return None
         if len(parents[link]) > 1:
             names = " and ".join(joint.get("name", "") for joint in parents[link])
             report.refuse(f"{link} is the child of two joints, {names}; remove one of them")
@@ -135,7 +138,7 @@ def _remove_unreachable(
         parent = ahead.pop()
         for joint in outboard.get(parent, []):
             child = joint_end(joint, "child")
-            if child in moved or (child not in links and joint not in chain):
+            if child in (*moved, WORLD) or (child not in links and joint not in chain):
                 continue
             moved[child] = numbers.get(id(joint), moved[parent])
             kept.append(joint)

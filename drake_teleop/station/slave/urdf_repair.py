@@ -99,10 +99,10 @@ def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sd
         for link in scope.findall("link"):
             name = link.get("name", "")
             check_quantities(link, f"link {name}", report)
-            if link.find("inertial") is None and name in moving and not is_sdf:
-                report.state("no inertia of", name)
             at_rest = tree is not None and tree.moved.get(name) == 0
-            repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
+            is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
+            if is_massless and name in moving:
+                report.state("no inertia of", name)
 
 
 def finish(
