@@ -15,21 +15,23 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
 from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
+from drake_teleop.station.slave.model_numbers import number
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+_KINDS = ("box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh", "plane")
 _MIN_CORNERS = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
-def remove_unusable_meshes(
+def remove_unusable_shapes(
     root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> dict[str, list[str]]:
-    """Remove shapes without a usable mesh; return the names of the affected links by fault.
+    """Remove shapes that Drake cannot read; return the names of the affected links by fault.
 
     Relative addresses start at the folder of the file `model` and become absolute. STL files become
     convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
@@ -41,7 +43,8 @@ def remove_unusable_meshes(
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                if fault := _mesh_fault(shape, model, files, folder):
+                fault = _shape_fault(shape) or _mesh_fault(shape, model, files, folder)
+                if fault:
                     link.remove(shape)
                     removed.add(fault)
         if link.find("collision") is not None:
@@ -55,6 +58,23 @@ def remove_unusable_meshes(
         for shape in [*link.findall("collision"), *link.findall("visual")] if not folder else []:
             link.remove(shape)
     return lost
+
+
+def _shape_fault(shape: ElementTree.Element) -> str | None:
+    """Return the fault of a shape's kind, size or place as text."""
+    inner = shape.find("geometry/*")
+    kind = "" if inner is None else inner.tag.removeprefix("drake:")
+    if inner is None or kind not in _KINDS:
+        return f"{kind or 'empty'} shapes cannot be read"
+    places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
+    sizes = [each for each in inner.iter() if kind not in ("mesh", "plane")]
+    for element in [*places, *sizes]:
+        texts = [*element.attrib.values()] if element.tag != "pose" else []
+        numbers = [number(word) for text in (*texts, element.text or "") for word in text.split()]
+        smallest = -np.inf if element in places else 0.0
+        if not all(smallest < value < np.inf for value in numbers):
+            return f"a {element.tag} of shapes is no usable number"
+    return None
 
 
 def _mesh_fault(

@@ -40,9 +40,13 @@ def check_quantities(element: Element, where: str, report: RepairReport) -> None
     for inner in element.iter():
         if inner.tag not in _QUANTITY_TAGS:
             continue
+        if inner.tag == "origin":
+            for name, text in inner.attrib.items():
+                if len(text.split()) != 3 or any(math.isnan(number(x)) for x in text.split()):
+                    report.refuse(f"{where}: origin {name}={text!r} is no list of three numbers")
         for word in " ".join([inner.text or "", *map(str, inner.attrib.values())]).split():
             value = number(word)
-            if math.isnan(value) and word.lower().strip("+-") != "nan" and "$" not in word:
+            if math.isnan(value) and word.lower().strip("+-") != "nan":
                 continue  # a name; Drake reports an invalid number
             if not abs(value) <= MAX_VALUE:
                 report.refuse(

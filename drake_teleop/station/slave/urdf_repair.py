@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from drake_teleop.station.slave.link_repair import repair_inertia
-from drake_teleop.station.slave.meshes import remove_unusable_meshes
+from drake_teleop.station.slave.meshes import remove_unusable_shapes
 from drake_teleop.station.slave.model_numbers import (
     check_joint,
     check_quantities,
@@ -98,7 +98,8 @@ def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sd
         }
         for link in scope.findall("link"):
             name = link.get("name", "")
-            check_quantities(link, f"link {name}", report)
+            for part in [link] if purpose.is_scene else link.findall("inertial"):
+                check_quantities(part, f"link {name}", report)
             at_rest = tree is not None and tree.moved.get(name) == 0
             is_massless = repair_inertia(link, report, is_sdf=is_sdf, at_rest=at_rest)
             if is_massless and name in moving:
@@ -113,7 +114,8 @@ def finish(
     Without a folder for converted meshes the text has no shapes.
     """
     report.raise_causes(file)
-    for fault, links in remove_unusable_meshes(root, file, files, folder).items():
+    lost = remove_unusable_shapes(root, file, files, folder)
+    for fault, links in lost.items():
         report.repair("shapes are missing of", f"{listed(links)}: {fault}")
     report.raise_causes(file)
     limits = {
