@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from difflib import get_close_matches
 from xml.etree.ElementTree import Element
 
 from pydrake.math import RigidTransform
@@ -11,8 +12,8 @@ from pydrake.math import RigidTransform
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.mjcf_elements import Mjcf
-from drake_teleop.station.slave.repair_report import listed
 
+_MAX_NAMES = 12  # names of frames in an error: the most similar ones
 _LOOPS = ("connect", "weld", "distance")
 
 
@@ -27,11 +28,12 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     carriers = [top for top in tops if sensor in _names(top[0], kind)]
     if len(carriers) != 1:
         known = {name for tag in ("body", "site") for top, *_ in tops for name in _names(top, tag)}
+        near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_NAMES, cutoff=0.0)
         faults = [*mjcf.report.causes, *reader.meshes.inaccessible]
         raise DrakeTeleopError(
             "; ".join([f"{len(carriers) or 'no'} frames are named {sensor!r}", *faults]),
             where=str(mjcf.path),
-            remedy=f"name one of {listed(sorted(known))}" if known else "give a model with bodies",
+            remedy=f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies",
         )
     world = reader.read_world()
     others = [
@@ -55,31 +57,28 @@ def read_all(reader: BodyReader) -> Body:
 
 
 def hold_joints(
-    arm: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
+    world: Body, chain: list[Body], hold: dict[str, float], mjcf: Mjcf
 ) -> list[tuple[Body, Joint]]:
-    """Weld joints outside the chain, free bases and joints of `hold`; return the other joints."""
-    report, moving = mjcf.report, list[tuple[Body, Joint]]()
-    unknown = dict(hold)
-    for body in arm.all():
+    """Weld free bases and joints outside the chain; return the moving joints with their bodies.
+
+    The joints of `hold` remain, because they are welded after the parsing.
+    """
+    moving = list[tuple[Body, Joint]]()
+    for body in world.all():
         joints, body.joints = body.joints, []
         for joint in joints:
-            unknown.pop(joint.name, None)
-            if joint.kind == "free" and not chain:
-                continue  # a tool is welded to the sensor
             if joint.kind == "free":
-                report.state("welded to the world, where it may float:", body.name)
-            elif joint.name in hold and joint.kind != "ball":
-                body.X_PB = body.X_PB @ joint.pose(hold[joint.name])
-                report.state("held:", f"{joint.name} at {hold[joint.name]:g}")
+                if chain:  # a tool is welded to the sensor
+                    mjcf.report.state("welded to the world, where it may float:", body.name)
+            elif joint.name in hold:
+                body.joints.append(joint)
             elif body not in chain:
-                report.state("held:", joint.name)
+                mjcf.report.state("held:", joint.name)
             elif joint.kind not in ("hinge", "slide"):
-                report.refuse(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
+                mjcf.report.refuse(f"{joint.name} is a {joint.kind} joint; use hinges and slides")
             else:
                 body.joints.append(joint)
                 moving.append((body, joint))
-    for name in unknown:
-        report.refuse(f"hold: there is no joint {name}")
     return moving
 
 

@@ -70,10 +70,9 @@ class Attributes(dict[str, str]):
 class Mjcf:
     """Content of an MJCF file, and the report of its repairs and faults."""
 
-    def __init__(self, path: Path, files: ModelFiles, report: RepairReport) -> None:
-        self.path, self.files, self.report = path, files, report
+    def __init__(self, root: Element, path: Path, files: ModelFiles, report: RepairReport) -> None:
+        self.root, self.path, self.files, self.report = root, path, files, report
         self._folders: dict[Element, Path] = {}  # of included elements
-        self.root = read_xml(path)
         if self.root.tag != "mujoco":
             what = f"does not contain a mujoco tag, but {self.root.tag}"
             raise DrakeTeleopError(what, where=str(path), remedy="give an MJCF file")

@@ -17,6 +17,10 @@ from drake_teleop.station.slave.mjcf_elements import Attributes, Mjcf
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
 _NOT_FOUND = "meshes were not found (--package-path, slave.package_paths)"
+_OUTSIDE = (
+    "{kind} files in {folder} are outside the model's folder and its packages"
+    " (name their folder: --package-path, slave.package_paths)"
+)
 _UNREADABLE = "meshes cannot be read (convert them to .obj or .stl)"
 _Array = NDArray[np.float64]
 
@@ -132,11 +136,14 @@ class MeshLibrary:
         file = self._mjcf.file(element, name, folder)
         if file is None:
             return None, _NOT_FOUND
-        try:
-            self._mjcf.files.check(file)
-        except DrakeTeleopError as error:
-            fault = str(error).removeprefix(f"{self._mjcf.path}: ")
-            fault = fault.replace(str(file.resolve()), str(file.resolve().parent))
+        if self._mjcf.files.may_read(file):
+            try:
+                self._mjcf.files.check(file)
+            except DrakeTeleopError as error:
+                self.inaccessible.append(str(error))
+                return None, str(error)
+        else:
+            fault = _OUTSIDE.format(kind=element.tag, folder=file.resolve().parent)
             self.inaccessible.append(fault)
             return None, fault
         return file, ""

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from drake_teleop.station.slave.mjcf_actuators import effort_limits
-from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, Joint, touches
+from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, touches
 from drake_teleop.station.slave.mjcf_chain import (
     check_couplings,
     hold_joints,
@@ -23,74 +24,68 @@ from drake_teleop.station.slave.mjcf_chain import (
 from drake_teleop.station.slave.mjcf_elements import Mjcf
 from drake_teleop.station.slave.mjcf_masses import NO_MASS
 from drake_teleop.station.slave.mjcf_text import MjcfText
-from drake_teleop.station.slave.model_references import ModelFiles
+from drake_teleop.station.slave.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
 from drake_teleop.station.slave.repair_report import RepairReport, listed
 from drake_teleop.station.slave.repaired_model import RepairedModel
+from drake_teleop.station.slave.urdf_repair import Purpose
 
 # Relative changes of an inertia: rounding below the first, suspicious above the second.
 _ROUNDING, _SUSPICIOUS = 1e-3, 0.05
 
 
 def repair_mjcf(
-    path: Path,
-    files: ModelFiles,
-    sensor: str,
-    hold: dict[str, float],
-    folder: Path,
-    *,
-    is_scene: bool = False,
-    in_directives: bool = False,
+    root: Element, path: Path, files: ModelFiles, purpose: Purpose, folder: Path
 ) -> RepairedModel:
     """Return the text of an MJCF file that Drake reads, with meshes converted in `folder`.
 
-    `hold` contains joint positions [rad, m]. Without `sensor`, the file is a tool, whose joints
-    are all held. A scene, or a file that directives add, keeps all bodies and joints.
+    A scene, or a file that directives add, keeps all bodies and joints.
 
     Raises:
         DrakeTeleopError: with all faults that cannot be repaired.
     """
-    report = RepairReport(strict=is_scene)
-    mjcf = Mjcf(path, files, report)
+    report = RepairReport(strict=purpose.is_scene)
+    mjcf = Mjcf(root, path, files, report)
     reader = BodyReader(mjcf)
-    if not mjcf.root.get("model"):
+    if not root.get("model"):
         report.state("the model is named after its file:", path.stem)
-    keeps_all = is_scene or in_directives
-    if keeps_all or not sensor:
+    is_complete = purpose.is_scene or purpose.in_directives
+    if is_complete or not purpose.sensor:
         world = read_all(reader)
-        chain = world.all() if keeps_all else []
+        chain = world.all() if is_complete else []
     else:
-        world = read_arm(mjcf, reader, sensor)
-        chain = world.path_to(sensor)
-    if keeps_all:
+        world = read_arm(mjcf, reader, purpose.sensor)
+        chain = world.path_to(purpose.sensor)
+    if is_complete:
         moving = [(body, joint) for body in chain for joint in body.joints]
         report_couplings([joint for _, joint in moving], mjcf)
     else:
-        moving = hold_joints(world, chain, hold, mjcf)
+        moving = hold_joints(world, chain, purpose.hold, mjcf)
         check_couplings(world, chain, [joint for _, joint in moving], mjcf)
-    joints = [joint for _, joint in moving if joint.kind != "free"]
-    _check_bodies(world, joints, report)
+    if purpose.is_tool and world.geoms:
+        world.geoms.clear()
+        report.state("left out, because the tool does not carry them: shapes of", "the world")
+    joints = [joint for _, joint in moving if joint.kind in ("hinge", "slide")]
+    _check_bodies(world, report)
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _state_lost_shapes(reader, report)
     for fault in reader.meshes.inaccessible if report.causes else ():
         report.refuse(fault)
     report.raise_causes(path)
-    is_tool = not (sensor or keeps_all)
-    writer = MjcfText(mjcf, folder, is_tool=is_tool, is_scene=is_scene)
-    text = writer.write(world, limits, [] if is_scene else joints)
+    text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_causes(path)
     return RepairedModel(text, report.assumptions, limits)
 
 
-def _check_bodies(world: Body, joints: list[Joint], report: RepairReport) -> None:
+def _check_bodies(world: Body, report: RepairReport) -> None:
     bodies = world.all()
     for body in bodies:
         for tag in body.generators:
             report.refuse(f"{body.name} contains <{tag}>, which is not supported; expand it")
     for kind, names in (
         ("bodies", [body.name for body in bodies]),
-        ("joints", [joint.name for joint in joints]),
+        ("joints", [joint.name for body in bodies for joint in body.joints]),
     ):
         twice = sorted(name for name, number in Counter(names).items() if number > 1)
         if twice:
@@ -138,7 +133,7 @@ def _set_mass(
 
 def _file_mass(mjcf: Mjcf) -> float:
     """Return the mass of all bodies of the file, also of those that are left out."""
-    reader = BodyReader(Mjcf(mjcf.path, mjcf.files, RepairReport()))
+    reader = BodyReader(Mjcf(read_xml(mjcf.path), mjcf.path, mjcf.files, RepairReport()))
     mass = sum(reader.mass(body).mass for body in reader.read_world().all()[1:])
     return mass if mass > 0.0 else np.inf
 

@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform
 from drake_teleop.station.slave.mjcf_bodies import Body, Geom, Joint
 from drake_teleop.station.slave.mjcf_elements import Mjcf
 from drake_teleop.station.slave.mjcf_meshes import Mesh
+from drake_teleop.station.slave.urdf_repair import Purpose
 
 
 class MjcfText:
@@ -20,9 +21,8 @@ class MjcfText:
     Contact shapes are convex hulls, as in MuJoCo, except in a scene.
     """
 
-    def __init__(self, mjcf: Mjcf, folder: Path, *, is_tool: bool, is_scene: bool) -> None:
-        self._mjcf, self._folder = mjcf, folder
-        self._is_tool, self._is_scene = is_tool, is_scene
+    def __init__(self, mjcf: Mjcf, purpose: Purpose, folder: Path) -> None:
+        self._mjcf, self._purpose, self._folder = mjcf, purpose, folder
         name = mjcf.root.get("model") or mjcf.path.stem
         self._root = Element("mujoco", model=name)
         SubElement(self._root, "compiler", angle="radian", autolimits="false")
@@ -35,8 +35,8 @@ class MjcfText:
             and (rgba := mjcf.attributes(element, "", "material").get("rgba"))
         }
 
-    def write(self, world: Body, limits: dict[str, float], moving: list[Joint]) -> str:
-        """Return the text of a world; the joints `moving` get one actuator each."""
+    def write(self, world: Body, moving: list[Joint]) -> str:
+        """Return the text of a world; `moving` get actuators, which carry their rotor inertia."""
         top = SubElement(self._root, "worldbody")
         self._write_content(top, world)
         names = {body.name for body in world.all()}
@@ -47,16 +47,13 @@ class MjcfText:
                 SubElement(contact, "exclude", ends)
         actuators = SubElement(self._root, "actuator")
         for joint in moving:
-            motor = SubElement(actuators, "motor", name=joint.name, joint=joint.name)
-            if joint.name in limits:
-                limit = limits[joint.name]
-                motor.attrib |= {"forcelimited": "true", "forcerange": _text([-limit, limit])}
+            SubElement(actuators, "motor", name=joint.name, joint=joint.name)
         return tostring(self._root, encoding="unicode")
 
     def _write_content(self, element: Element, body: Body) -> None:
         for joint in body.joints:
             self._write_joint(element, joint)
-        for geom in body.geoms:
+        for geom in body.geoms if self._purpose.has_geometry else ():
             if geom.touches or geom.visible:
                 self._write_geom(element, geom, body)
         for child in body.children:
@@ -66,7 +63,7 @@ class MjcfText:
                 entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
                 values = {"mass": repr(mass), "fullinertia": _text(entries)}
                 SubElement(inner, "inertial", {"pos": _text(centre), **values})
-            if self._is_tool and body.name == "world":
+            if self._purpose.is_tool and body.name == "world":
                 SubElement(inner, "freejoint")
             self._write_content(inner, child)
 
@@ -92,7 +89,7 @@ class MjcfText:
         if rgba := given.get("rgba") or self._colours.get(given.get("material", "")):
             values["rgba"] = rgba
         seen, felt = {"contype": "0", "conaffinity": "0"}, {"group": "3"}
-        if geom.mesh is None or self._is_scene or not geom.touches:
+        if geom.mesh is None or self._purpose.is_scene or not geom.touches:
             values |= {} if geom.touches else seen
             values |= {} if geom.visible else felt
             shape = {"size": _text(geom.size)} if geom.mesh is None else self._mesh(geom.mesh)

@@ -84,6 +84,11 @@ class ModelFiles:
             path = (folder or self._folder) / address.removeprefix("file://")
         return next(iter(_existing_paths(path)), None)
 
+    def may_read(self, path: Path) -> bool:
+        """Return whether a file is in the model's folder or a package, after resolving links."""
+        roots = (*self._roots, *self.packages.values())
+        return any(path.resolve().is_relative_to(root) for root in roots)
+
     def check(self, path: Path) -> None:
         """Check a file and all files that it references, except meshes of the model's own links.
 
@@ -102,8 +107,7 @@ class ModelFiles:
     def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         """Check a file; return the number of files and bytes that reading it takes."""
         real, where = path.resolve(), str(including[-1] if including else self._model)
-        roots = (*self._roots, *self.packages.values())
-        if not any(real.is_relative_to(root) for root in roots):
+        if not self.may_read(real):
             raise DrakeTeleopError(
                 f"names {real}, which is outside the model's folder and its packages",
                 where=where,

@@ -58,7 +58,9 @@ class RepairReport:
         count = len(self.causes)
         more = f"; and {count - len(kept)} more" if count > len(kept) else ""
         text = "; ".join(f"({k}) {cause}" for k, cause in enumerate(kept, start=1)) + more
-        raise DrakeTeleopError(kept[0] if count == 1 else f"{count} faults: {text}", where=str(file))
+        raise DrakeTeleopError(
+            kept[0] if count == 1 else f"{count} faults: {text}", where=str(file)
+        )
 
 
 def listed(names: Iterable[str]) -> str:
