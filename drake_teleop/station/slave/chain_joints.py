@@ -214,12 +214,13 @@ def actuate(
 
 
 def assume_rotor_inertias(
-    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame
+    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
 ) -> list[str]:
     """Give joints a rotor inertia if the links that they move have none; return a note.
 
     Without it the joint's acceleration is undefined, or so large that a run takes hours. Gravity
-    and the wrench at the sensor stay those of the model.
+    and the wrench at the sensor stay those of the model. The links of a joint at an `auxiliary`
+    body include those of the next joint.
     """
     joints = [plant.get_joint(index) for index in chain]
     inertia = _ROTOR_MASS_KG * _length(joints, frame) ** 2
@@ -227,7 +228,7 @@ def assume_rotor_inertias(
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
     for joint in (joint for joint in joints if joint.index() in motor):
-        if motor[joint.index()].default_reflected_inertia() > 0.0 or _has_inertia(plant, joint):
+        if motor[joint.index()].default_reflected_inertia() > 0.0 or _has_inertia(plant, joint, auxiliary):
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
@@ -243,7 +244,7 @@ def assume_rotor_inertias(
     ]
 
 
-def _has_inertia(plant: MultibodyPlant, joint: Joint) -> bool:
+def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str]) -> bool:
     """Return whether the joint's child, or a body welded to it, has mass and inertia."""
     ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
     while ahead:
@@ -251,8 +252,9 @@ def _has_inertia(plant: MultibodyPlant, joint: Joint) -> bool:
         moments = body.default_rotational_inertia().get_moments()
         if body.default_mass() > 0.0 and (isinstance(joint, PrismaticJoint) or moments.any()):
             return True
-        welds = [each for each in joints if isinstance(each, WeldJoint)]
-        ahead += [each.child_body() for each in welds if each.parent_body().index() == body.index()]
+        outboard = [each for each in joints if each.parent_body().index() == body.index()]
+        through = body.name() in auxiliary
+        ahead += [e.child_body() for e in outboard if through or isinstance(e, WeldJoint)]
     return False
 
 

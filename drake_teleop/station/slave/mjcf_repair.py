@@ -75,7 +75,8 @@ def repair_mjcf(
     report.raise_causes(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_causes(path)
-    return RepairedModel(text, report.assumptions, limits)
+    auxiliary = frozenset(body.name for body in world.all() if body.is_auxiliary)
+    return RepairedModel(text, report.assumptions, limits, auxiliary=auxiliary)
 
 
 def _check_bodies(world: Body, report: RepairReport) -> None:

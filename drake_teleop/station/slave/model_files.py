@@ -47,6 +47,7 @@ class ReadModel(NamedTuple):
     assumptions: list[str]
     effort_limits: dict[str, float] | None
     dependent: dict[str, str]
+    auxiliary: frozenset[str]
     folder: TemporaryDirectory[str]
 
 
@@ -92,6 +93,7 @@ def read_model(
         list(dict.fromkeys(text for each in repaired for text in each.assumptions)),
         {n: x for each in repaired for n, x in each.effort_limits.items()} if is_complete else None,
         {name: why for each in repaired for name, why in each.dependent.items()},
+        frozenset(name for each in repaired for name in each.auxiliary),
         folder,
     )
 

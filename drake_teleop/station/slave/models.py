@@ -77,7 +77,7 @@ def ParseModel(
     with translate_drake_errors(path):
         held += weld_other_joints(plant, before, chain)
         actuate(plant, chain, read.effort_limits)
-        rotors = assume_rotor_inertias(plant, chain, frame)
+        rotors = assume_rotor_inertias(plant, chain, frame, read.auxiliary)
     instances = {plant.get_joint(k).model_instance() for k in chain if moves(plant, k)}
     if len(instances) > 1:
         names = sorted(map(plant.GetModelInstanceName, instances))
