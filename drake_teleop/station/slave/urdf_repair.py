@@ -34,11 +34,12 @@ from drake_teleop.station.slave.repaired_model import RepairedModel
 
 _URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_PARTS |= {"drake:collision_filter_group"}
+_NUM_COLOURS = 4  # red, green, blue, opacity
 _DRAKE_ROTOR = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
 class Purpose(NamedTuple):
-    """What a model is read for.
+    """Use of a model: as arm, tool or surroundings.
 
     Attributes:
         sensor: frame, link or site of the sensor; empty for tools and surroundings.
@@ -66,6 +67,7 @@ def repair_urdf(
         DrakeTeleopError: with all faults of the arm that cannot be repaired.
     """
     report = RepairReport(strict=purpose.is_scene)
+    root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
         for child in [child for child in root if child.tag not in _URDF_PARTS]:
             if not child.tag.endswith(("_constraint", "_bushing_rpy")):
@@ -197,7 +199,8 @@ def _has_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
-    return colour is not None and len(colour.get("rgba", "").split()) == 4
+    values = [] if colour is None else [number(word) for word in colour.get("rgba", "").split()]
+    return len(values) == _NUM_COLOURS and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _remove_idle_parts(root: Element, report: RepairReport) -> None:
