@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.station.slave.link_repair import repair_inertia
 from drake_teleop.station.slave.meshes import remove_unusable_shapes
@@ -177,22 +177,21 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
 
 
 def _keep_one_material_per_name(root: Element) -> None:
-    known = {each.get("name", "") for each in root.findall("material") if _has_colour(each)}
-    first = set[str]()
+    """Define each named colour once, in the robot; visuals refer to it, or have a nameless one."""
+    own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
+    defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
+    defined = {name: each for name, each in defined.items() if _has_colour(each)}
     for material in root.findall("material"):
-        if not _has_colour(material) or material.get("name", "") in first:
-            root.remove(material)
-        first.add(material.get("name", ""))
+        root.remove(material)
     for visual in root.iterfind("link/visual"):
         for material in visual.findall("material"):
             name = material.get("name", "")
-            if _has_colour(material) and name and name not in known:
-                known.add(name)
-            elif name in known:
-                for child in list(material):
-                    material.remove(child)
-            else:
+            if name in defined:
                 visual.remove(material)
+                SubElement(visual, "material", name=name)
+            elif name or not _has_colour(material):
+                visual.remove(material)
+    root.extend(defined.values())
 
 
 def _has_colour(material: Element) -> bool:
