@@ -5,6 +5,7 @@ Links and joints that the arm does not need never stop the reading. Every repair
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -22,7 +23,6 @@ from drake_teleop.station.slave.model_references import ModelFiles
 from drake_teleop.station.slave.model_tree import (
     WORLD,
     ModelTree,
-    elements_with_scope,
     fix_joint,
     joint_end,
     joints_of,
@@ -82,18 +82,18 @@ def repair_urdf(
 def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
     separate_by_blanks(root)
-    scopes = list(elements_with_scope(root))
+    scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _name_joints(scope, report)
     tree = _tree(scopes, purpose, report)
-    chain = [] if tree is None else tree.chain
+    chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
         for joint in joints_of(scope):
             if joint.get("name") in purpose.hold:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
-            in_chain = joint in chain and joint.get("name") not in purpose.hold
+            in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
             check_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in joints_of(scope) if each.get("type") != "fixed"
@@ -146,8 +146,7 @@ def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> Mode
     """Return the chain to the sensor if one robot or model contains it all."""
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in joints_of(scope)):
-            if joint.get("type") != "fixed":
-                fix_joint(joint, report)
+            fix_joint(joint, report)
         return None
     if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
         return None
@@ -165,10 +164,10 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
             report.repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
-    links, children = set[str](), [joint_end(joint, "child") for joint in joints_of(scope)]
+    links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints_of(scope))
     for link in scope.findall("link"):
         name = link.get("name", "")
-        if name in links and children.count(name) > 1:
+        if name in links and children[name] > 1:
             report.refuse(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
