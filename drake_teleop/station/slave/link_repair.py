@@ -41,6 +41,8 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     if name == WORLD:
         link.remove(inertial)
         return False
+    if not is_sdf:
+        inertial.find("mass").set("value", _text(inertial.find("mass")))  # type: ignore[union-attr]
     mass, inertia = _mass(inertial), _inertia(inertial, is_sdf=is_sdf)
     invalid = _fault(inertial, mass, inertia)
     if at_rest:

@@ -22,7 +22,16 @@ from drake_teleop.station.slave.model_references import ModelFiles
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
-_KINDS = ("box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh", "plane")
+# Numbers of each dimension of a shape.
+_DIMENSIONS = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "ellipsoid": {"a": 1, "b": 1, "c": 1},
+    "mesh": {},
+    "plane": {},
+}
 _MIN_CORNERS = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
@@ -64,17 +73,22 @@ def _shape_fault(shape: ElementTree.Element) -> str | None:
     """Return the fault of a shape's kind, size or place as text."""
     inner = shape.find("geometry/*")
     kind = "" if inner is None else inner.tag.removeprefix("drake:")
-    if inner is None or kind not in _KINDS:
+    if inner is None or kind not in _DIMENSIONS:
         return f"{kind or 'empty'} shapes cannot be read"
+    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS[kind]
+    for name, count in sizes.items():
+        values = _values(inner.get(name) or inner.findtext(name))
+        if len(values) != count or not all(0.0 < value < np.inf for value in values):
+            return f"the {name} of a {kind} is no usable size"
+    scale = _values(inner.get("scale") or inner.findtext("scale"))
     places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
-    sizes = [each for each in inner.iter() if kind not in ("mesh", "plane")]
-    for element in [*places, *sizes]:
-        texts = [*element.attrib.values()] if element.tag != "pose" else []
-        numbers = [number(word) for text in (*texts, element.text or "") for word in text.split()]
-        smallest = -np.inf if element in places else 0.0
-        if not all(smallest < value < np.inf for value in numbers):
-            return f"a {element.tag} of shapes is no usable number"
-    return None
+    texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
+    numbers = [value for text in texts for value in _values(text)]
+    return None if all(scale) and np.isfinite(numbers).all() else "of an invalid place or scale"
+
+
+def _values(text: str | None) -> list[float]:
+    return [number(word) for word in (text or "").split()]
 
 
 def _mesh_fault(

@@ -80,7 +80,7 @@ def check_joint(joint: Element, links: set[str], report: RepairReport, *, in_cha
 
 
 def _check_independent(joint: Element, where: str, report: RepairReport) -> None:
-    kind, name = joint.get("type", ""), joint.get("name", "")
+    kind, name = joint.get("type") or "typeless", joint.get("name", "")
     if kind not in _MOVING:
         between = f" on {joint_end(joint, 'parent')}" if kind == "floating" else ""
         report.refuse(
@@ -103,7 +103,8 @@ def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
     values = dict[str, float]()
     for name in ("lower", "upper", "velocity", "effort"):
         text = limit.get(name) or limit.findtext(name)
-        if text is None:
+        if not text:
+            limit.attrib.pop(name, None)
             continue
         values[name] = number(text)
         if math.isnan(values[name]):
@@ -120,12 +121,15 @@ def _check_limit(limit: Element, where: str, report: RepairReport) -> None:
 
 
 def _check_dynamics(dynamics: Element, name: str, report: RepairReport) -> None:
-    damping = number(dynamics.get("damping") or dynamics.findtext("damping") or "0")
-    if damping < 0.0:
-        report.repair("damping 0 in place of a negative one for", name)
-        if dynamics.get("damping") is not None:
-            dynamics.set("damping", "0")
-        for inner in dynamics.findall("damping"):
-            inner.text = "0"
-    if number(dynamics.get("friction") or dynamics.findtext("friction") or "0") != 0.0:
+    damping, friction = (
+        number(dynamics.get(what) or dynamics.findtext(what) or "0")
+        for what in ("damping", "friction")
+    )
+    if friction != 0.0:
         report.state("no dry friction, which the model has, of", name)
+        dynamics.attrib.pop("friction", None)
+    if not damping >= 0.0:
+        report.repair("damping 0 in place of a negative or unreadable one for", name)
+        dynamics.attrib.pop("damping", None)
+        for inner in dynamics.findall("damping"):
+            dynamics.remove(inner)

@@ -200,7 +200,7 @@ def read_xml(path: Path) -> Element:
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
     try:
-        parser.Parse(path.read_bytes(), True)
+        parser.Parse(path.read_bytes().lstrip(), True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
@@ -68,15 +67,18 @@ def reduce_to_chain(
     chain = _without_free_base(scope, chain, report)
     root = joint_end(chain[0], "parent") if chain else sensor_link
     moved = _remove_unreachable(scope, root, chain, hold, report)
+    in_chain = set(map(id, chain))
     for joint in joints_of(scope):
-        if joint not in chain and joint.get("type") != "fixed" and joint.get("name") not in hold:
+        if id(joint) not in in_chain and joint.get("name") not in hold:
             fix_joint(joint, report)
     _remove_loops(scope, moved, report)
     return ModelTree(chain, moved)
 
 
 def fix_joint(joint: Element, report: RepairReport) -> None:
-    """Make a joint fixed at its default position."""
+    """Make a joint that moves a fixed one, at its default position."""
+    if joint.get("type") == "fixed":
+        return
     report.state("held:", joint.get("name", ""))
     joint.tag = "joint"
     joint.set("type", "fixed")
@@ -102,9 +104,9 @@ def _chain_to(scope: Element, link: str, report: RepairReport) -> list[Element] 
             names = " and ".join(joint.get("name", "") for joint in parents[link])
             report.refuse(f"{link} is the child of two joints, {names}; remove one of them")
             return None
-        chain.insert(0, parents[link][0])
-        link = joint_end(chain[0], "parent")
-    return chain
+        chain.append(parents[link][0])
+        link = joint_end(chain[-1], "parent")
+    return chain[::-1]
 
 
 def _without_free_base(scope: Element, chain: list[Element], report: RepairReport) -> list[Element]:
@@ -126,37 +128,33 @@ def _remove_unreachable(
 ) -> dict[str, int]:
     """Remove links and joints outside the tree of `root`; return `ModelTree.moved`."""
     links = {link.get("name", ""): link for link in scope.findall("link")}
-    outboard: dict[str, list[Element]] = {}
-    for joint in [*chain, *(each for each in joints_of(scope) if each not in chain)]:
-        outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
-    moved, ahead, kept, count = {root: 0}, [root], list[Element](), 0
-    numbers = dict[int, int]()
+    number_of, count = dict[int, int](), 0
     for joint in chain:
         count += joint.get("type") != "fixed" and joint.get("name", "") not in hold
-        numbers[id(joint)] = count
+        number_of[id(joint)] = count
+    outboard: dict[str, list[Element]] = {}
+    for joint in sorted(joints_of(scope), key=lambda joint: id(joint) not in number_of):
+        outboard.setdefault(joint_end(joint, "parent"), []).append(joint)
+    moved, ahead, kept = {root: 0}, [root], set[int]()
     while ahead:
         parent = ahead.pop()
         for joint in outboard.get(parent, []):
             child = joint_end(joint, "child")
-            if child in (*moved, WORLD) or (child not in links and joint not in chain):
-                continue
-            moved[child] = numbers.get(id(joint), moved[parent])
-            kept.append(joint)
-            ahead.append(child)
-    for name, link in links.items():
-        if name not in moved:
-            scope.remove(link)
-            if name != WORLD:
-                report.repair(
-                    "not connected to the arm and left out:", name or "a link without name"
-                )
+            exists = child in links or id(joint) in number_of
+            if exists and child not in moved and child != WORLD:
+                moved[child] = number_of.get(id(joint), moved[parent])
+                kept.add(id(joint))
+                ahead.append(child)
+    for name in links.keys() - moved.keys():
+        scope.remove(links[name])
+    for name in [name for name in links if name not in moved and name != WORLD]:
+        report.repair("not connected to the arm and left out:", name or "a link without name")
     for joint in joints_of(scope):
-        if joint not in kept:
+        if id(joint) not in kept:
             scope.remove(joint)
             if joint_end(joint, "parent") in moved:
-                report.repair(
-                    "left out, as it closes a loop or has no child:", joint.get("name", "")
-                )
+                what = "left out, as it closes a loop or has no child:"
+                report.repair(what, joint.get("name", ""))
     return moved
 
 
@@ -170,8 +168,3 @@ def _remove_loops(scope: Element, moved: dict[str, int], report: RepairReport) -
             report.refuse(
                 f"its links form a loop, by {element.tag}; model the chain to the sensor alone"
             )
-
-
-def elements_with_scope(root: Element) -> Iterator[Element]:
-    """Yield the robots and models of a file, also nested ones."""
-    yield from (each for each in root.iter() if each.tag in ("robot", "model"))

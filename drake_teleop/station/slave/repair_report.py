@@ -8,7 +8,6 @@ from pathlib import Path
 from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError
 
 _MAX_NAMES = 12  # names in one statement
-_NUM_CHARS_OF_ERROR = LONGEST_LINE - 100  # leaves room for the file's name
 
 
 class RepairReport:
@@ -19,14 +18,13 @@ class RepairReport:
 
     def __init__(self, *, strict: bool = False) -> None:
         self._strict = strict
-        self._names: dict[str, list[str]] = {}
-        self.causes: list[str] = []
+        # Dictionaries keep the order and contain each text once.
+        self._names: dict[str, dict[str, None]] = {}
+        self._causes: dict[str, None] = {}
 
     def state(self, what: str, name: str) -> None:
         """State an assumption, such as `no inertia of`, about the joint or link `name`."""
-        names = self._names.setdefault(what, [])
-        if name not in names:
-            names.append(name)
+        self._names.setdefault(what, {})[name] = None
 
     def repair(self, what: str, name: str) -> None:
         """State a repair; with `strict` it is a fault."""
@@ -37,8 +35,7 @@ class RepairReport:
 
     def refuse(self, cause: str) -> None:
         """Add a fault that cannot be repaired."""
-        if cause not in self.causes:
-            self.causes.append(cause)
+        self._causes[cause] = None
 
     @property
     def assumptions(self) -> list[str]:
@@ -46,21 +43,19 @@ class RepairReport:
         return [f"{what} {listed(names)}" for what, names in self._names.items()]
 
     def raise_causes(self, file: Path) -> None:
-        """Raise one DrakeTeleopError that lists all faults, if there are any."""
-        if not self.causes:
-            return
-        kept, left = [self.causes[0]], _NUM_CHARS_OF_ERROR - len(self.causes[0])
-        for cause in self.causes[1:]:
-            left -= len(cause) + 10
-            if left < 0:
+        """Raise one DrakeTeleopError with all faults, if there are any."""
+        causes = list(self._causes)
+        if len(causes) == 1:
+            raise DrakeTeleopError(causes[0], where=str(file))
+        room, texts = LONGEST_LINE - len(f"{file}: 1000 faults: ; and 1000 more"), list[str]()
+        for k, cause in enumerate(causes, start=1):
+            texts.append(f"({k}) {cause}")
+            room -= len(f"{texts[-1]}; ")
+            if room < 0:
+                texts[-1] = f"and {len(causes) - k + 1} more"
                 break
-            kept.append(cause)
-        count = len(self.causes)
-        more = f"; and {count - len(kept)} more" if count > len(kept) else ""
-        text = "; ".join(f"({k}) {cause}" for k, cause in enumerate(kept, start=1)) + more
-        raise DrakeTeleopError(
-            kept[0] if count == 1 else f"{count} faults: {text}", where=str(file)
-        )
+        if causes:
+            raise DrakeTeleopError(f"{len(causes)} faults: {'; '.join(texts)}", where=str(file))
 
 
 def listed(names: Iterable[str]) -> str:

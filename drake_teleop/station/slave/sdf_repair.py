@@ -39,6 +39,8 @@ def repair_sdf(
                 if child.tag not in (allowed or ()) and not child.tag.startswith("drake:"):
                     element.remove(child)
     repair_scope(root, purpose, report, is_sdf=True)
+    for model in root.findall("model"):
+        model.set("name", model.get("name") or file.stem)
     report.raise_causes(file)
     inner = [_repair_included(uri, file, files, purpose, folder) for uri in root.iterfind(_URIS)]
     own = finish(root, file, files, report, folder if purpose.has_geometry else None)

@@ -5,10 +5,11 @@ Links and joints that the arm does not need never stop the reading. Every repair
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 from drake_teleop.station.slave.link_repair import repair_inertia
 from drake_teleop.station.slave.meshes import remove_unusable_shapes
@@ -22,7 +23,6 @@ from drake_teleop.station.slave.model_references import ModelFiles
 from drake_teleop.station.slave.model_tree import (
     WORLD,
     ModelTree,
-    elements_with_scope,
     fix_joint,
     joint_end,
     joints_of,
@@ -34,11 +34,12 @@ from drake_teleop.station.slave.repaired_model import RepairedModel
 
 _URDF_PARTS = {"link", "joint", "drake:joint", "material", "frame", "transmission"}
 _URDF_PARTS |= {"drake:collision_filter_group"}
+_NUM_COLOURS = 4  # red, green, blue, opacity
 _DRAKE_ROTOR = ("drake:rotor_inertia", "drake:gear_ratio")
 
 
 class Purpose(NamedTuple):
-    """What a model is read for.
+    """Use of a model: as arm, tool or surroundings.
 
     Attributes:
         sensor: frame, link or site of the sensor; empty for tools and surroundings.
@@ -66,6 +67,7 @@ def repair_urdf(
         DrakeTeleopError: with all faults of the arm that cannot be repaired.
     """
     report = RepairReport(strict=purpose.is_scene)
+    root.set("name", root.get("name") or file.stem)
     if not purpose.is_scene:
         for child in [child for child in root if child.tag not in _URDF_PARTS]:
             if not child.tag.endswith(("_constraint", "_bushing_rpy")):
@@ -80,18 +82,18 @@ def repair_urdf(
 def repair_scope(root: Element, purpose: Purpose, report: RepairReport, *, is_sdf: bool) -> None:
     """Repair links and joints of a robot, or of a model and its nested models."""
     separate_by_blanks(root)
-    scopes = list(elements_with_scope(root))
+    scopes = [each for each in root.iter() if each.tag in ("robot", "model")]
     for scope in scopes:
         _name_joints(scope, report)
     tree = _tree(scopes, purpose, report)
-    chain = [] if tree is None else tree.chain
+    chain = set() if tree is None else set(map(id, tree.chain))
     for scope in scopes:
         links = {link.get("name", "") for link in scope.findall("link")}
         for joint in joints_of(scope):
             if joint.get("name") in purpose.hold:
                 for mimic in joint.findall("mimic"):
                     joint.remove(mimic)
-            in_chain = joint in chain and joint.get("name") not in purpose.hold
+            in_chain = id(joint) in chain and joint.get("name") not in purpose.hold
             check_joint(joint, links, report, in_chain=in_chain)
         moving = {
             joint_end(each, "child") for each in joints_of(scope) if each.get("type") != "fixed"
@@ -144,8 +146,7 @@ def _tree(scopes: list[Element], purpose: Purpose, report: RepairReport) -> Mode
     """Return the chain to the sensor if one robot or model contains it all."""
     if purpose.is_tool:
         for joint in (joint for scope in scopes for joint in joints_of(scope)):
-            if joint.get("type") != "fixed":
-                fix_joint(joint, report)
+            fix_joint(joint, report)
         return None
     if len(scopes) != 1 or purpose.in_directives or scopes[0].find("include") is not None:
         return None
@@ -163,10 +164,10 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
             report.repair("a new name for the joint", f"{name or 'without name'} ({new})")
             joint.set("name", new)
         names.add(joint.get("name", ""))
-    links, children = set[str](), [joint_end(joint, "child") for joint in joints_of(scope)]
+    links, children = set[str](), Counter(joint_end(joint, "child") for joint in joints_of(scope))
     for link in scope.findall("link"):
         name = link.get("name", "")
-        if name in links and children.count(name) > 1:
+        if name in links and children[name] > 1:
             report.refuse(f"two links are named {name}; rename one of them")
         elif name in links:
             scope.remove(link)
@@ -175,29 +176,29 @@ def _name_joints(scope: Element, report: RepairReport) -> None:
 
 
 def _keep_one_material_per_name(root: Element) -> None:
-    known = {each.get("name", "") for each in root.findall("material") if _has_colour(each)}
-    first = set[str]()
+    """Define each named colour once, in the robot; visuals refer to it, or have a nameless one."""
+    own = [each for each in root.iter("material") if _has_colour(each) and each.get("name")]
+    defined = {each.get("name", ""): each for each in reversed([*root.findall("material"), *own])}
+    defined = {name: each for name, each in defined.items() if _has_colour(each)}
     for material in root.findall("material"):
-        if not _has_colour(material) or material.get("name", "") in first:
-            root.remove(material)
-        first.add(material.get("name", ""))
+        root.remove(material)
     for visual in root.iterfind("link/visual"):
         for material in visual.findall("material"):
             name = material.get("name", "")
-            if _has_colour(material) and name and name not in known:
-                known.add(name)
-            elif name in known:
-                for child in list(material):
-                    material.remove(child)
-            else:
+            if name in defined:
                 visual.remove(material)
+                SubElement(visual, "material", name=name)
+            elif name or not _has_colour(material):
+                visual.remove(material)
+    root.extend(defined.values())
 
 
 def _has_colour(material: Element) -> bool:
     for texture in material.findall("texture"):
         material.remove(texture)
     colour = material.find("color")
-    return colour is not None and len(colour.get("rgba", "").split()) == 4
+    values = [] if colour is None else [number(word) for word in colour.get("rgba", "").split()]
+    return len(values) == _NUM_COLOURS and all(0.0 <= value <= 1.0 for value in values)
 
 
 def _remove_idle_parts(root: Element, report: RepairReport) -> None:
