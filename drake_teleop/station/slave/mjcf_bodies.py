@@ -33,7 +33,7 @@ _MAX_VISIBLE_GROUP = 2  # as in MuJoCo and Drake
 _Array = NDArray[np.float64]
 
 
-@dataclass
+@dataclass(eq=False)
 class Joint:
     """Joint of a body: `kind` hinge, slide, ball or free; `anchor` (3,) and `axis` (3,)."""
 
@@ -59,7 +59,7 @@ class Joint:
         return Joint(self.name, self.kind, anchor, axis, self.attributes, limits, ref)
 
 
-@dataclass
+@dataclass(eq=False)
 class Geom:
     """Shape of a body; `mesh` is set for shapes of type mesh."""
 
@@ -83,7 +83,7 @@ def touches(shape: Attributes) -> bool:
     return any(shape.number(name, 1.0) != 0.0 for name in ("contype", "conaffinity"))
 
 
-@dataclass
+@dataclass(eq=False)
 class Body:
     """Body with its pose X_PB in the parent; `generators` are elements that cannot be read."""
 

@@ -9,7 +9,6 @@ from xml.etree.ElementTree import Element
 
 from pydrake.math import RigidTransform
 
-from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.station.slave.mjcf_bodies import Body, BodyReader, Joint
 from drake_teleop.station.slave.mjcf_elements import Mjcf
 
@@ -29,12 +28,11 @@ def read_arm(mjcf: Mjcf, reader: BodyReader, sensor: str) -> Body:
     if len(carriers) != 1:
         known = {name for tag in ("body", "site") for top, *_ in tops for name in _names(top, tag)}
         near = get_close_matches(sensor, sorted(known - {""}), n=_MAX_NAMES, cutoff=0.0)
-        faults = [*mjcf.report.causes, *reader.meshes.inaccessible]
-        raise DrakeTeleopError(
-            "; ".join([f"{len(carriers) or 'no'} frames are named {sensor!r}", *faults]),
-            where=str(mjcf.path),
-            remedy=f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies",
-        )
+        remedy = f"name one of {', '.join(sorted(near))}" if near else "give a model with bodies"
+        what = f"{len(carriers) or 'no'} frames are named {sensor!r}; {remedy}"
+        for fault in (what, *reader.meshes.inaccessible):
+            mjcf.report.refuse(fault)
+        mjcf.report.raise_causes(mjcf.path)
     world = reader.read_world()
     others = [
         top.get("name") or "a body without name" for top, *_ in tops if top not in carriers[0]

@@ -70,8 +70,6 @@ def repair_mjcf(
     _set_masses(world, reader, {id(body) for body, _ in moving}, mjcf)
     limits = effort_limits(mjcf, joints)
     _state_lost_shapes(reader, report)
-    for fault in reader.meshes.inaccessible if report.causes else ():
-        report.refuse(fault)
     report.raise_causes(path)
     text = MjcfText(mjcf, purpose, folder).write(world, [] if purpose.is_scene else joints)
     report.raise_causes(path)
