@@ -395,8 +395,8 @@ vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1" scale="1 -1 2" refpos="0.1 0 0"/></asset>
 <body name="l2" pos="0 0 0.3" euler="10 20 30" childclass="far"><joint name="j2" axis="0 1 0"
 limited="true" range="-90 90"/><joint name="j3" type="slide" actuatorfrcrange="-9 8"/>
 <geom mass="1"/><site name="sensor" pos="0 0 0.1"/><body name="tip"><joint name="j4"/>
-<inertial pos="0 0 0" mass="0.1" fullinertia="1e-3 2e-3 4e-3 0 0 1e-5"/></body></body></body></frame>
-<body name="cup"><freejoint/><geom size="0.1"/></body></worldbody>
+<inertial pos="0 0 0" mass="0.1" fullinertia="1e-3 2e-3 4e-3 0 0 1e-5"/></body></body></body>
+</frame><body name="cup"><freejoint/><geom size="0.1"/></body></worldbody>
 <equality><joint joint1="j4"/><weld body1="tip" body2="l2"/></equality>
 <actuator><motor joint="j1" ctrlrange="-10 10"/><motor class="far" joint="j2"
 forcerange="-1 1"/></actuator><sensor><force site="sensor"/></sensor></mujoco>

@@ -228,7 +228,9 @@ def assume_rotor_inertias(
     motor = {each.joint().index(): each for each in actuators}
     turning, sliding = list[str](), list[str]()
     for joint in (joint for joint in joints if joint.index() in motor):
-        if motor[joint.index()].default_reflected_inertia() > 0.0 or _has_inertia(plant, joint, auxiliary):
+        if motor[joint.index()].default_reflected_inertia() > 0.0:
+            continue
+        if _has_inertia(plant, joint, auxiliary):
             continue
         slides = isinstance(joint, PrismaticJoint)
         (sliding if slides else turning).append(joint.name())
