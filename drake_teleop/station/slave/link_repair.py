@@ -41,32 +41,31 @@ def repair_inertia(link: Element, report: RepairReport, *, is_sdf: bool, at_rest
     if name == WORLD:
         link.remove(inertial)
         return False
-    if not is_sdf:
-        inertial.find("mass").set("value", _text(inertial.find("mass")))  # type: ignore[union-attr]
-    mass, inertia = _mass(inertial), _inertia(inertial, is_sdf=is_sdf)
-    invalid = _fault(inertial, mass, inertia)
-    if at_rest:
-        if invalid or (mass == 0.0) != (not inertia.any()) or nearest_possible_inertia(inertia)[1]:
-            link.remove(inertial)
-            report.state(
-                "an impossible inertia left out, as no joint of the arm moves the link, of", name
-            )
-    elif invalid:
-        report.refuse(f"link {name}: {invalid}")
-    elif mass == 0.0:
-        if inertia.any():
+    text = _mass_text(inertial)
+    mass, inertia = number(text), _inertia(inertial, is_sdf=is_sdf)
+    fault = ""
+    if not 0.0 <= mass <= MAX_VALUE:
+        fault = f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
+    elif not (np.abs(inertia) <= MAX_VALUE).all():
+        fault = f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
+    no_mass = not fault and mass == 0.0
+    if at_rest and (fault or (no_mass and inertia.any()) or nearest_possible_inertia(inertia)[1]):
+        link.remove(inertial)
+        what = "an impossible inertia left out, as no joint of the arm moves the link, of"
+        report.state(what, name)
+    elif fault:
+        report.refuse(f"link {name}: {fault}")
+    else:
+        if no_mass and inertia.any():
             report.repair("an inertia without a mass left out of", name)
-        _remove_mass(link, inertial, is_sdf=is_sdf)
-    elif inertia.any():
-        _correct(inertial, inertia, name, report)
+        nearest = np.zeros((3, 3)) if no_mass else _possible(inertia, name, report)
+        link.remove(inertial)
+        _write(link, inertial.find("pose" if is_sdf else "origin"), mass, nearest, is_sdf=is_sdf)
     return not at_rest and not inertia.any()
 
 
-def _mass(inertial: Element) -> float:
-    return number(_text(inertial.find("mass")))
-
-
-def _text(mass: Element | None) -> str:
+def _mass_text(inertial: Element) -> str:
+    mass = inertial.find("mass")
     return "" if mass is None else (mass.get("value") or mass.text or "").strip()
 
 
@@ -81,45 +80,34 @@ def _inertia(inertial: Element, *, is_sdf: bool) -> NDArray[np.float64]:
     return tensor
 
 
-def _fault(inertial: Element, mass: float, inertia: NDArray[np.float64]) -> str:
-    if not 0.0 <= mass <= MAX_VALUE:
-        text = _text(inertial.find("mass"))
-        return f"mass {text} kg is not between 0 and {MAX_VALUE:g} kg"
-    if not (np.abs(inertia) <= MAX_VALUE).all():
-        return f"an entry of its inertia is no number up to {MAX_VALUE:g} kg m^2"
-    return ""
-
-
-def _remove_mass(link: Element, inertial: Element, *, is_sdf: bool) -> None:
-    link.remove(inertial)
-    if is_sdf:  # without the element, the mass is 1 kg
-        inertial = SubElement(link, "inertial")
-        SubElement(inertial, "mass").text = "0"
-        _write(SubElement(inertial, "inertia"), np.zeros((3, 3)), is_sdf=True)
-
-
-def _correct(
-    inertial: Element, inertia: NDArray[np.float64], name: str, report: RepairReport
-) -> None:
+def _possible(inertia: NDArray[np.float64], name: str, report: RepairReport) -> NDArray[np.float64]:
     nearest, change = nearest_possible_inertia(inertia)
-    if change == 0.0:
-        return
-    if change <= _ROUNDING or change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
+    if 0.0 < change <= _ROUNDING or 0.0 < change * np.abs(inertia).max() <= _NEGLIGIBLE_KG_M2:
         report.state("an inertia corrected for rounding of", name)
-    else:
+    elif change:
         what = "inertia replaced by the nearest possible one (share of its largest moment) of link"
         warning = "warning: " if change > _SUSPICIOUS else ""
         report.repair(f"{warning}{what}", f"{name} ({100 * change:.3g} %)")
-    element = inertial.find("inertia")
-    if element is not None:
-        _write(element, nearest, is_sdf=element.get("ixx") is None)
+    return nearest
 
 
-def _write(element: Element, inertia: NDArray[np.float64], *, is_sdf: bool) -> None:
-    for name, place in _ENTRIES.items():
-        text = f"{inertia[place]:.17g}"
-        if not is_sdf:
-            element.set(name, text)
-            continue
-        child = element.find(name)
-        (SubElement(element, name) if child is None else child).text = text
+def _write(
+    link: Element,
+    pose: Element | None,
+    mass: float,
+    inertia: NDArray[np.float64],
+    *,
+    is_sdf: bool,
+) -> None:
+    inertial = SubElement(link, "inertial")
+    if pose is not None:
+        inertial.append(pose)
+    entries = {name: f"{inertia[place]:.17g}" for name, place in _ENTRIES.items()}
+    if is_sdf:
+        SubElement(inertial, "mass").text = f"{mass:.17g}"
+        element = SubElement(inertial, "inertia")
+        for name, text in entries.items():
+            SubElement(element, name).text = text
+    else:
+        SubElement(inertial, "mass", value=f"{mass:.17g}")
+        SubElement(inertial, "inertia", entries)
