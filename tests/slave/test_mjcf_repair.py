@@ -195,7 +195,7 @@ def test_mass_of_shapes(tmp_path, shape, suffix):
     """The second moments are those about the joint, 0.4 m below the shape."""
     (tmp_path / "parts").mkdir()
     write_cube(tmp_path / "parts", suffix, offset=1.0)
-    scaled = '<mesh name="beam" scale="1 -2 3" refpos="1 1 1" file="cube.{0}"/>'
+    scaled = '<mesh name="beam" inertia="exact" scale="1 -2 3" refpos="1 1 1" file="cube.{0}"/>'
     assets = f'<asset><mesh file="cube.{{0}}" refpos="1 1 1"/>{scaled}</asset>'.format(suffix)
     head = f'<compiler meshdir="parts"/>{CLASSES}{assets}'
     geom = f'<body pos="0 0 0.4"><geom {shape}/></body>'
@@ -280,14 +280,19 @@ def test_site_as_sensor_frame(tmp_path, sensor, beyond):
         '<site class="s" name="site"/><geom size="0.1" mass="2"/>'
         '<body name="g"><geom size="0.1" mass="1"/></body></body>'
     )
-    classes = '<default><default class="s"><site pos="0.1 0 0" euler="90 0 0"/></default></default>'
+    classes = (
+        '<default><default class="s"><site pos="0.1 0.2 0" euler="0 90 0"/></default></default>'
+    )
     tail = f'<sensor><{sensor} site="site"/></sensor>' if sensor else ""
     _, model, said = read(written(tmp_path, mjcf(arm(inside=hand), classes, tail), "a.xml"), "site")
     assert model.joint_names == ("j", "k")
     assert "in place of the site site" in said
     np.testing.assert_allclose(model.table[:, PHI], [2.0, 3.0 - beyond, beyond])
+    # Mass times centre: 0.1 m along -z of S, 0.2 m along -y.
+    centre = beyond * np.array([0, -0.2, -0.1])
+    np.testing.assert_allclose(model.table[2, PHI + 1 : PHI + 4], centre, atol=1e-12)
     turned = RigidTransform(degrees(0, 0, 90) @ degrees(40, 0, 0), [0, 0, 1])
-    expected = turned @ RigidTransform(degrees(90, 0, 0), [0.1, 0, 0])
+    expected = turned @ RigidTransform(degrees(0, 90, 0), [0.1, 0.2, 0])
     found = pose(model, [0.0, np.radians(40)])
     np.testing.assert_allclose(found, expected.GetAsMatrix34(), atol=1e-12)
 
@@ -350,7 +355,7 @@ def test_held_joint_has_the_drawn_or_requested_pose(tmp_path):
         (mjcf(arm("<joint name='j' type='ball'/>")), "j is a ball joint"),
         (mjcf(arm(JOINT * 2)), "several joints are named j"),
         (mjcf(arm('<joint name="j" range="9 -9"/>')), "range from 9 to -9 is empty"),
-        (mjcf(arm('<joint name="j" axis="0 0 0"/>')), "joint j: its axis is 0"),
+        (mjcf(arm('<joint name="j" axis="0 0 1e-200"/>')), "joint j: its axis is 0"),
         (mjcf(arm('<joint name="j" class="none"/>')), "there is no class none"),
         (mjcf(arm(attributes='pos="0 0"')), "body b: pos '0 0' is not 3 numbers"),
         (mjcf(arm(attributes='pos="0 0 nan"')), "body b: pos '0 0 nan' is not a list"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drake_teleop.station.slave.mjcf_elements import Attributes, Mjcf, rotation_to
+from drake_teleop.station.slave.mjcf_elements import MIN_LENGTH, Attributes, Mjcf, rotation_to
 from drake_teleop.station.slave.mjcf_masses import (
     NO_MASS,
     MassProperties,
@@ -184,7 +184,7 @@ class BodyReader:
         given.label = f"joint {name}"
         kind = "free" if tag == "freejoint" else given.get("type", "hinge")
         axis = given.vector("axis", (0.0, 0.0, 1.0))
-        if not axis.any():
+        if np.linalg.norm(axis) < MIN_LENGTH:
             self._mjcf.report.refuse(f"joint {name}: its axis is 0")
             axis = np.array([0.0, 0.0, 1.0])
         limits = given.limits("range", "limited", automatic=self._mjcf.autolimits)

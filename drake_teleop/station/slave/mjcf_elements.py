@@ -17,6 +17,8 @@ from drake_teleop.station.slave.model_references import ModelFiles, read_xml
 from drake_teleop.station.slave.repair_report import RepairReport
 
 _MAX_DEPTH = 150  # largest depth of nested elements
+MIN_LENGTH = 1e-9
+"""Shortest vector that has a direction."""
 _MAX_VALUE = 1e6  # largest number of a position, size, mass or axis, in SI units
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 # A shorter list replaces only the first numbers of the default.
@@ -135,7 +137,7 @@ class Mjcf:
         if "xyaxes" in given:
             axes = given.vector("xyaxes", (1.0, 0.0, 0.0, 0.0, 1.0, 0.0))
             z = np.cross(axes[:3], axes[3:])
-            if not z.any():
+            if np.linalg.norm(z) < MIN_LENGTH:
                 self.report.refuse(f"{given.label}: its xyaxes are parallel")
                 return RotationMatrix()
             columns = np.column_stack([axes[:3], np.cross(z, axes[:3]), z])
