@@ -56,7 +56,8 @@ from drake_teleop.station.result import Signal, SimulationResult
 from drake_teleop.station.scenario import LoadScenario, ScenarioFromData
 from drake_teleop.station.scenario_reference import commented
 from drake_teleop.station.sensor.sensor_chain import WristSensorConfig
-from drake_teleop.station.slave.models import ParseModel, translate_drake_errors
+from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.models import ParseModel
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.slave.slave_config import Slave
@@ -383,13 +384,22 @@ def _urdfs(_: Path) -> list[bytes]:
     return [(_URDF % (links + "".join(joints))).encode()]
 
 
-_MJCF = b"""<mujoco model="arm"><worldbody><body name="l1" pos="0 0 0.1">
-<inertial pos="0 0 0.1" mass="2" diaginertia="0.02 0.02 0.01"/>
-<joint name="j1" type="hinge" axis="0 0 1" range="-100 100" damping="0.1"/>
-<geom type="capsule" size="0.03 0.1" pos="0 0 0.1"/><body name="sensor" pos="0 0 0.3">
-<joint name="j2" axis="0 1 0" limited="true" range="-90 90"/>
-<geom type="box" size="0.1 0.1 0.1" mass="1"/></body></body></worldbody>
-<actuator><motor joint="j1" ctrlrange="-10 10"/></actuator></mujoco>
+_MJCF = b"""<mujoco model="arm"><compiler eulerseq="xYz" inertiagrouprange="0 3"/>
+<default><joint armature="0.1"/><default class="far"><geom type="box" size="0.1 0.2 0.1"/>
+<motor gear="30"/></default></default><asset><mesh name="t" inertia="exact"
+vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1" scale="1 -1 2" refpos="0.1 0 0"/></asset>
+<worldbody><frame pos="0 0 0.1" zaxis="0 1 1"><body name="l1" axisangle="0 0 1 20">
+<inertial pos="0 0 0.1" mass="2" diaginertia="0.02 0.02 0.01" xyaxes="1 0 0 0 1 1"/>
+<joint name="j1" type="hinge" axis="0 0 1" range="-100 100" damping="0.1" ref="10"/>
+<geom type="capsule" size="0.03" fromto="0 0 0 0.1 0.2 0.1"/><geom type="mesh" mesh="t" mass="1"/>
+<body name="l2" pos="0 0 0.3" euler="10 20 30" childclass="far"><joint name="j2" axis="0 1 0"
+limited="true" range="-90 90"/><joint name="j3" type="slide" actuatorfrcrange="-9 8"/>
+<geom mass="1"/><site name="sensor" pos="0 0 0.1"/><body name="tip"><joint name="j4"/>
+<inertial pos="0 0 0" mass="0.1" fullinertia="1e-3 2e-3 4e-3 0 0 1e-5"/></body></body></body>
+</frame><body name="cup"><freejoint/><geom size="0.1"/></body></worldbody>
+<equality><joint joint1="j4"/><weld body1="tip" body2="l2"/></equality>
+<actuator><motor joint="j1" ctrlrange="-10 10"/><motor class="far" joint="j2"
+forcerange="-1 1"/></actuator><sensor><force site="sensor"/></sensor></mujoco>
 """
 
 

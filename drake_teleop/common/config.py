@@ -41,9 +41,11 @@ def choice(default: str, choices: Sequence[str], doc: str) -> Any:
 
 
 def plain(default: Any, doc: str) -> Any:
-    """Return a dataclass field for a flag, word, integer or list."""
-    if isinstance(default, list):
-        return dataclasses.field(default_factory=lambda: list(default), metadata={"doc": doc})
+    """Return a dataclass field for a flag, word, integer, list or mapping of names."""
+    if isinstance(default, (list, dict)):
+        return dataclasses.field(
+            default_factory=lambda: type(default)(default), metadata={"doc": doc}
+        )
     return dataclasses.field(default=default, metadata={"doc": doc})
 
 
@@ -144,11 +146,15 @@ def _field_names(schema: type) -> list[str]:
 
 
 class Kind(NamedTuple):
-    """Structure of a type: `list[A | B] | None` is (1, (A, B), True)."""
+    """Structure of a type: `list[A | B] | None` is (1, (A, B), True).
+
+    With `by_name` it is a mapping of names to items, `dict[str, A]`.
+    """
 
     lists: int
     items: tuple[Any, ...]
     optional: bool
+    by_name: bool = False
 
 
 @functools.cache
@@ -157,6 +163,8 @@ def kind_of(hint: Any) -> Kind:
     if typing.get_origin(hint) is list:
         inner = kind_of(typing.get_args(hint)[0])
         return Kind(inner.lists + 1, inner.items, False)
+    if typing.get_origin(hint) is dict:
+        return Kind(0, kind_of(typing.get_args(hint)[1]).items, False, by_name=True)
     if typing.get_origin(hint) not in (typing.Union, types.UnionType):
         return Kind(0, (hint,), False)
     options = tuple(option for option in typing.get_args(hint) if option is not type(None))
@@ -168,7 +176,13 @@ def _check_kind(kind: Kind, value: Any, place: str, *, from_file: bool) -> None:
     first = kind.items[0]
     if value is None and kind.optional:
         return
-    if kind.lists:
+    if kind.by_name:
+        if not isinstance(value, dict) or "_tag" in value:
+            raise _kind_error("a mapping of names", value, place, "write {name: value}")
+        for name, item in value.items():
+            inner = kind._replace(by_name=False)
+            _check_kind(inner, item, f"{place}.{name}", from_file=from_file)
+    elif kind.lists:
         if not isinstance(value, list):
             raise _kind_error("a list", value, place, "write it in brackets: [...]")
         inner = Kind(kind.lists - 1, kind.items, False)
@@ -231,6 +245,7 @@ class FieldInfo:
         lists: number of nested lists, 0 for one value.
         length: required length of the list, or None.
         optional: whether the value may be null.
+        by_name: whether the value is a mapping of names to items.
         unit: "1" for a dimensionless quantity; empty if the field is no quantity.
         low, high: range of a quantity, limits included.
         choices: the allowed words; empty if all are allowed.
@@ -249,6 +264,7 @@ class FieldInfo:
     choices: tuple[str, ...]
     blocks: tuple[type, ...]
     meaning: str
+    by_name: bool = False
 
     @property
     def range(self) -> str:
@@ -294,7 +310,7 @@ def fields_of(config: Any) -> list[FieldInfo]:
 
 def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
     hint: Any = entry.type
-    lists, items, optional = kind_of(hint)
+    lists, items, optional, by_name = kind_of(hint)
     blocks = tuple(item for item in items if item not in KINDS)
     metadata = entry.metadata
     return FieldInfo(
@@ -310,6 +326,7 @@ def _field_info(entry: dataclasses.Field[Any], config: Any) -> FieldInfo:
         choices=metadata.get("choices", ()),
         blocks=blocks,
         meaning=metadata.get("doc") or _first_line(blocks[0]),
+        by_name=by_name,
     )
 
 

@@ -92,6 +92,8 @@ def _allowed_values(entry: FieldInfo) -> str:
     words = entry.range if entry.unit or entry.choices else entry.kind
     if entry.lists:
         words = f"{entry.length or 'any number'} of {words}"
+    if entry.by_name:
+        words = f"mapping of names to {words}"
     return f"{words}, or null" if entry.optional else words
 
 
@@ -198,6 +200,8 @@ def _field_schema(entry: FieldInfo) -> dict[str, Any]:
     schema: dict[str, Any] = forms[0] if len(forms) == 1 else {"anyOf": forms}
     for _ in range(entry.lists):
         schema = {"type": "array", "items": schema}
+    if entry.by_name:
+        schema = {"type": "object", "additionalProperties": schema}
     if entry.length is not None:
         schema |= {"minItems": entry.length, "maxItems": entry.length}
     if entry.optional:

@@ -364,7 +364,7 @@ def test_invalid_environment_is_one_error(thing, what):
     [
         ("<drake:compliant_hydroelastic/>", "", "no shape in it is hydroelastic"),
         ("</link>", '</link><joint name="j" type="fixed"><child>gone</child></joint>',
-         "cannot be read as a scene .*folders around it"),
+         "pad.sdf: joint j has no parent link"),
         ('link name="pad"', 'link name="tool"', "the body name tool is reserved"),
         ("<cylinder><radius>0.05</radius><length>0.02</length></cylinder>",
          "<mesh><uri>lost.obj</uri></mesh>", "shapes are missing of pad"),

@@ -31,7 +31,8 @@ from drake_teleop.station.slave.arm import (
     forward_kinematics,
 )
 from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
-from drake_teleop.station.slave.models import ParsedModel, ParseModel, translate_drake_errors
+from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.models import ParsedModel, ParseModel
 
 Array = NDArray[np.float64]
 JOINTS = "joints"

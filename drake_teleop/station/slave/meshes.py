@@ -3,41 +3,57 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from pydrake.geometry import Capsule
+from numpy.typing import NDArray
+from pydrake.geometry import Capsule, Mesh
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 
-from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.errors import DrakeTeleopError, silent_stderr
+from drake_teleop.station.slave.model_numbers import number
 from drake_teleop.station.slave.model_references import ModelFiles
 
 # Suffixes of meshes that Drake accepts as collision shapes.
 _READABLE_SUFFIXES = (".obj", ".gltf", ".vtk")
 # Triangle of a binary STL file.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+# Numbers of each dimension of a shape.
+_DIMENSIONS = {
+    "box": {"size": 3},
+    "sphere": {"radius": 1},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "ellipsoid": {"a": 1, "b": 1, "c": 1},
+    "mesh": {},
+    "plane": {},
+}
+_MIN_CORNERS = 3  # of a mesh
 _STICK_RADIUS_M = 0.035
 _STICK_COLOUR = np.array([0.62, 0.64, 0.67, 1.0])
 
 
-def remove_unusable_meshes(
-    root: ElementTree.Element, files: ModelFiles, folder: Path
+def remove_unusable_shapes(
+    root: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
 ) -> dict[str, list[str]]:
-    """Remove shapes without a usable mesh; return the names of the affected links by fault.
+    """Remove shapes that Drake cannot read; return the names of the affected links by fault.
 
-    STL files become convex hulls, because Drake does not read STL; other paths become absolute.
-    A lost visual is reported only for links without shapes, a lost collision shape only for links
-    without a visual or with other collision shapes.
+    Relative addresses start at the folder of the file `model` and become absolute. STL files become
+    convex hulls in `folder`, because Drake does not read STL. Without a folder all shapes are
+    removed, for a plant without geometry. A lost visual is reported only for links without shapes,
+    a lost collision shape only for links without a visual or with other collision shapes.
     """
     lost: dict[str, list[str]] = {}
     for link in root.iter("link"):
         faults = {"collision": set[str](), "visual": set[str]()}
         for kind, removed in faults.items():
             for shape in link.findall(kind):
-                if fault := _mesh_fault(shape, files, folder):
+                fault = _shape_fault(shape) or _mesh_fault(shape, model, files, folder)
+                if fault:
                     link.remove(shape)
                     removed.add(fault)
         if link.find("collision") is not None:
@@ -48,27 +64,62 @@ def remove_unusable_meshes(
             reported = faults["collision"] | faults["visual"]
         for fault in sorted(reported):
             lost.setdefault(fault, []).append(link.get("name", ""))
+        for shape in [*link.findall("collision"), *link.findall("visual")] if not folder else []:
+            link.remove(shape)
     return lost
 
 
-def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> str | None:
+def _shape_fault(shape: ElementTree.Element) -> str | None:
+    """Return the fault of a shape's kind, size or place as text."""
+    inner = shape.find("geometry/*")
+    kind = "" if inner is None else inner.tag.removeprefix("drake:")
+    if inner is None or kind not in _DIMENSIONS:
+        return f"{kind or 'empty'} shapes cannot be read"
+    sizes = {"radii": 3} if inner.find("radii") is not None else _DIMENSIONS[kind]
+    for name, count in sizes.items():
+        values = _values(inner.get(name) or inner.findtext(name))
+        if len(values) != count or not all(0.0 < value < np.inf for value in values):
+            return f"the {name} of a {kind} is no usable size"
+    scale = _values(inner.get("scale") or inner.findtext("scale"))
+    places = [each for tag in ("origin", "pose") for each in shape.findall(tag)]
+    texts = [text for each in places for text in (each.get("xyz"), each.get("rpy"), each.text)]
+    numbers = [value for text in texts for value in _values(text)]
+    return None if all(scale) and np.isfinite(numbers).all() else "of an invalid place or scale"
+
+
+def _values(text: str | None) -> list[float]:
+    return [number(word) for word in (text or "").split()]
+
+
+def _mesh_fault(
+    shape: ElementTree.Element, model: Path, files: ModelFiles, folder: Path | None
+) -> str | None:
     """Return the fault of a shape's mesh as text; without a fault, make its path absolute."""
     mesh = shape.find("geometry/mesh")
     if mesh is None:
         return None
-    address = mesh.get("filename") or mesh.findtext("uri") or ""
-    file = files.file(address.strip())
+    address = (mesh.get("filename") or mesh.findtext("uri") or "").strip()
+    file = files.file(address, model.resolve().parent)
     if file is None or not file.is_file():
         return "meshes were not found (--package-path, slave.package_paths)"
+    if not files.may_read(file):
+        return (
+            f"meshes in {file.resolve().parent} are outside the model's folder and its packages"
+            " (name their folder: --package-path, slave.package_paths)"
+        )
     try:
         files.check(file)
     except DrakeTeleopError as error:
         return str(error)
-    if file.suffix.lower() == ".stl":
-        file = _convert_stl_to_hull(file, folder)
-    if file is None or file.suffix.lower() not in _READABLE_SUFFIXES:
-        suffix = Path(address.strip()).suffix
-        return f"{suffix} meshes cannot be read (convert them to .obj or .stl)"
+    suffix, written = file.suffix.lower(), file.stat().st_mtime_ns
+    if suffix not in (".stl", *_READABLE_SUFFIXES):
+        return f"{Path(address).suffix} meshes cannot be read (convert them to .obj or .stl)"
+    if (suffix == ".stl" or shape.tag == "collision") and not _is_readable(file, written):
+        return f"{Path(address).suffix} meshes are empty or damaged"
+    if suffix == ".stl" and folder is not None:
+        target = folder / f"{len(list(folder.iterdir()))}_{file.stem}.obj"
+        target.write_text(_obj_of_stl(file, written))
+        file = target
     if mesh.get("filename"):
         mesh.set("filename", f"file://{file.resolve()}")  # Drake does not decode %20
     else:
@@ -76,27 +127,63 @@ def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> 
     return None
 
 
-def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
-    """Write the convex hull of an STL file as OBJ; return None for a degenerate hull."""
-    from scipy.spatial import ConvexHull, QhullError
+@lru_cache(maxsize=1024)
+def _is_readable(path: Path, _: int) -> bool:
+    """Return whether a mesh has faces with finite corners.
 
+    The second argument is the file's time, so that an edited file is read again.
+    """
+    if path.suffix.lower() in (".gltf", ".vtk"):
+        try:
+            with silent_stderr():
+                return Mesh(str(path)).GetConvexHull().num_vertices() >= _MIN_CORNERS
+        except RuntimeError:
+            return False
+    corners = _stl_corners(path) if path.suffix.lower() == ".stl" else _obj_corners(path)
+    return len(corners) >= _MIN_CORNERS and bool(np.isfinite(corners).all())
+
+
+def _obj_corners(path: Path) -> NDArray[np.float64]:
+    """Return the corners (n, 3) of an OBJ file; none if a face names another one."""
+    data = path.read_bytes()
+    corners = _numbers(re.findall(rb"^\s*v\s+(\S+)\s+(\S+)\s+(\S+)", data, re.M))
+    faces = re.findall(rb"^\s*f\s+(.*)$", data, re.M)
+    used = [int(word) for face in faces for word in re.findall(rb"(?:^|\s)(-?\d+)", face)]
+    valid = used and min(map(abs, used)) > 0 and max(map(abs, used)) <= len(corners)
+    return corners if valid else np.empty((0, 3))
+
+
+def _stl_corners(path: Path) -> NDArray[np.float64]:
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little")
     if len(data) == 84 + count * _TRIANGLE.itemsize:
-        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"].reshape(-1, 3)
-    else:
-        lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
-        corners = np.array(lines, dtype=float).reshape(-1, 3)
+        corners = np.frombuffer(data, _TRIANGLE, count, 84)["corners"]
+        return corners.reshape(-1, 3).astype(np.float64)
+    return _numbers(re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data))
+
+
+def _numbers(rows: list[tuple[bytes, ...]]) -> NDArray[np.float64]:
     try:
-        hull = ConvexHull(np.unique(corners.astype(float), axis=0))
-    except (QhullError, ValueError):
-        return None
-    number = {vertex: k + 1 for k, vertex in enumerate(hull.vertices)}
-    rows = ["v {:.9g} {:.9g} {:.9g}".format(*hull.points[vertex]) for vertex in hull.vertices]
-    rows += ["f {} {} {}".format(*(number[k] for k in face)) for face in hull.simplices]
-    target = folder / f"{len(list(folder.iterdir()))}_{path.stem}.obj"
-    target.write_text("\n".join(rows) + "\n")
-    return target
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    except ValueError:
+        return np.empty((0, 3))
+
+
+@lru_cache(maxsize=1024)
+def _obj_of_stl(path: Path, _: int) -> str:
+    """Return the convex hull of an STL file, or its triangles if flat, as text of an OBJ file."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = _stl_corners(path)
+    try:
+        hull = ConvexHull(points)
+        faces = np.searchsorted(hull.vertices, hull.simplices, sorter=np.argsort(hull.vertices))
+        corners = points[np.sort(hull.vertices)]
+    except QhullError:
+        corners, faces = points, np.arange(len(points)).reshape(-1, 3)
+    rows = ["v {:.9g} {:.9g} {:.9g}".format(*corner) for corner in corners]
+    rows += ["f {} {} {}".format(*face) for face in faces + 1]
+    return "\n".join(rows) + "\n"
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:

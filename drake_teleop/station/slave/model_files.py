@@ -1,86 +1,152 @@
-"""Information in model files that Drake's parser does not return."""
+"""Model files in Drake's plant: one file, or those that model directives add, after repairs."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+from pydrake.multibody.parsing import (
+    FlattenModelDirectives,
+    LoadModelDirectives,
+    Parser,
+    ProcessModelDirectives,
+)
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 
 from drake_teleop.common.errors import DrakeTeleopError
-from drake_teleop.common.texts import read_yaml
-from drake_teleop.station.slave.model_check import WORLD
-from drake_teleop.station.slave.model_references import ModelFiles, added_models, read_xml
+from drake_teleop.common.texts import read_text, read_yaml
+from drake_teleop.station.slave.chain_joints import check_tree
+from drake_teleop.station.slave.drake_errors import (
+    ROBOT,
+    SCENE,
+    raise_logged_errors,
+    translate_drake_errors,
+)
+from drake_teleop.station.slave.mjcf_repair import repair_mjcf
+from drake_teleop.station.slave.model_references import ModelFiles, read_xml
+from drake_teleop.station.slave.repaired_model import RepairedModel
+from drake_teleop.station.slave.sdf_repair import repair_sdf
+from drake_teleop.station.slave.urdf_repair import Purpose, repair_urdf
 
-XACRO = "run it through xacro first, and give the URDF that comes out"
+_XACRO = "run it through xacro first, and give the URDF that comes out"
+_REPAIRS = {".urdf": repair_urdf, ".sdf": repair_sdf, ".xml": repair_mjcf}
 
 
-def read_roots(path: Path, files: ModelFiles) -> dict[Path, Element]:
-    """Return the XML root by file: of the model, or of the models that its directives add."""
+class ReadModel(NamedTuple):
+    """Content of a model file in a plant.
+
+    Attributes:
+        effort_limits: by joint, unlimited without an entry; None: those of Drake's actuators.
+        folder: converted meshes, which Drake reads later.
+    """
+
+    instances: list[ModelInstanceIndex]
+    assumptions: list[str]
+    effort_limits: dict[str, float] | None
+    dependent: dict[str, str]
+    auxiliary: frozenset[str]
+    folder: TemporaryDirectory[str]
+
+
+def read_model(
+    plant: MultibodyPlant, path: Path, package_paths: tuple[Path, ...], purpose: Purpose
+) -> ReadModel:
+    """Repair a model's text and parse it into a plant.
+
+    Raises:
+        DrakeTeleopError: if the file, or a file that it names, cannot be read.
+    """
+    if not os.path.isfile(path):
+        raise DrakeTeleopError("there is no such file", where=str(path))
     kind = path.suffix.lower()
+    if kind == ".xacro":
+        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO)
+    if kind == ".xml":
+        read_text(path)  # raises an error for invalid encoding
     if kind == ".yaml":
-        data = read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
-        added = [file for address in added_models(data) if (file := files.file(address))]
-        # Drake reports missing files and reads nested includes.
-        roots = {file: read_xml(file) for file in added if file.suffix in (".urdf", ".sdf")}
-    else:
-        roots = {path: read_xml(path)} if kind in (".urdf", ".sdf", ".xml") else {}
-    for file, root in roots.items():
-        if any(element.tag.startswith("xacro:") for element in root.iter()):
-            raise DrakeTeleopError("is a xacro file", where=str(file), remedy=XACRO)
-    return roots
+        read_yaml(path, tagged=True)  # fails cleanly on deep nesting, unlike Drake's parser
+    files = ModelFiles(path, package_paths)
+    purpose = purpose._replace(has_geometry=plant.geometry_source_is_registered())
+    parser = Parser(plant)
+    parser.SetAutoRenaming(True)
+    files.share_packages(parser.package_map())
+    files.check(path)
+    folder = TemporaryDirectory(prefix="drake_teleop_")
+    forces = plant.num_force_elements()
+    expected = SCENE if purpose.is_scene else ROBOT
+    with translate_drake_errors(path, expected, folder.name):
+        read = _add_directives if kind == ".yaml" else _add_file
+        instances, repaired = read(parser, path, files, purpose, folder)
+        check_tree(plant, str(path))
+    if not purpose.is_scene and plant.num_force_elements() > forces:
+        raise DrakeTeleopError(
+            "has springs or other force elements",
+            where=str(path),
+            remedy="remove them; only motors, gravity and contact move the arm",
+        )
+    is_complete = all(each.text for each in repaired)
+    return ReadModel(
+        instances,
+        list(dict.fromkeys(text for each in repaired for text in each.assumptions)),
+        {n: x for each in repaired for n, x in each.effort_limits.items()} if is_complete else None,
+        {name: why for each in repaired for name, why in each.dependent.items()},
+        frozenset(name for each in repaired for name in each.auxiliary),
+        folder,
+    )
 
 
-def unsupported_joints(root: Element) -> dict[str, str]:
-    """Return, by joint or link, a property that Drake ignores: coupling, spring or free joint."""
-    found: dict[str, str] = {}
-    for joint in root.iter("joint"):
-        if joint.find("mimic") is not None or joint.find("axis/mimic") is not None:
-            found[joint.get("name", "")] = "moves with another joint (mimic)"
-        if joint.get("stiffness", "0").strip("0. "):  # MJCF
-            found[joint.get("name", "")] = "has a spring (stiffness)"
-        for parent, child in zip(joint.findall("parent"), joint.findall("child"), strict=False):
-            if joint.get("type") == "floating" and parent.get("link") != WORLD:
-                found[child.get("link", "")] = f"floats on {parent.get('link')}"
-    for joint in root.findall("equality/joint"):
-        for end in ("joint1", "joint2"):
-            found[joint.get(end, "")] = "moves with another joint (equality)"
-    for joint in root.findall("tendon/*/joint"):
-        found[joint.get("joint", "")] = "is pulled by a tendon"
-    return found
+def _add_file(
+    parser: Parser,
+    path: Path,
+    files: ModelFiles,
+    purpose: Purpose,
+    folder: TemporaryDirectory[str],
+) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
+    repaired = _repair(path, files, purpose, Path(folder.name))
+    with raise_logged_errors():
+        if repaired.text:
+            kind = path.suffix.lower().removeprefix(".")
+            instances = parser.AddModelsFromString(repaired.text, kind)
+        else:
+            instances = parser.AddModels(str(path))
+    return instances, [repaired]
 
 
-def floating_links(root: Element) -> list[str]:
-    """Return the names of links that float freely in the world."""
-    joints = [joint for joint in root.iter("joint") if joint.get("type") == "floating"]
-    ends = [(joint.find("parent"), joint.find("child")) for joint in joints]
-    urdf = [c.get("link", "") for p, c in ends if p is not None and c is not None]
-    bodies = root.findall("worldbody/body")
-    free = [b for b in bodies if b.find("freejoint") is not None or _is_free(b.find("joint"))]
-    return urdf + [body.get("name", "") for body in free]
+def _add_directives(
+    parser: Parser,
+    path: Path,
+    files: ModelFiles,
+    purpose: Purpose,
+    folder: TemporaryDirectory[str],
+) -> tuple[list[ModelInstanceIndex], list[RepairedModel]]:
+    """Add the models of directives after the same repairs; welds and positions stay."""
+    with raise_logged_errors():
+        directives = FlattenModelDirectives(LoadModelDirectives(str(path)), parser.package_map())
+    repaired, purpose = dict[Path, RepairedModel](), purpose._replace(in_directives=True)
+    for added in (each.add_model for each in directives.directives if each.add_model):
+        file = files.file(added.file)
+        if file is None:
+            continue  # Drake reports it
+        if file not in repaired:
+            repaired[file] = _repair(file, files, purpose, Path(folder.name))
+        if repaired[file].text:
+            copy = Path(folder.name) / f"{len(repaired)}_{file.name}"
+            copy.write_text(repaired[file].text, encoding="utf-8")
+            added.file = f"file://{copy}"
+    with raise_logged_errors():
+        models = ProcessModelDirectives(directives, parser)
+    return [each.model_instance for each in models], list(repaired.values())
 
 
-def _is_free(joint: Element | None) -> bool:
-    return joint is not None and joint.get("type") == "free"
-
-
-def effort_limits(root: Element) -> dict[str, float]:
-    """Return torque limits by name of URDF joint; Drake drops limits without a transmission."""
-    limits = ((joint.get("name"), joint.find("limit")) for joint in root.findall("joint"))
-    return {
-        name: float(limit.get("effort", "0"))
-        for name, limit in limits
-        if name is not None and limit is not None
-    }
-
-
-def remove_idle_elements(root: Element) -> list[str]:
-    """Remove `mimic` tags of fixed joints and transmissions of missing joints; return notes."""
-    for joint in root.iter("joint"):
-        for mimic in joint.findall("mimic") if joint.get("type") == "fixed" else ():
-            joint.remove(mimic)
-    joints, idle = {joint.get("name") for joint in root.findall("joint")}, []
-    for motor in root.findall("transmission"):
-        names = [joint.get("name", "") for joint in motor.findall("joint")]
-        if names and not joints.intersection(names):
-            root.remove(motor)
-            idle += names
-    return [f"no motor for joints that are not there: {', '.join(idle)}"] if idle else []
+def _repair(path: Path, files: ModelFiles, purpose: Purpose, folder: Path) -> RepairedModel:
+    """Return the repaired text of a file; without a text if Drake shall read the file itself."""
+    kind = path.suffix.lower()
+    if kind not in _REPAIRS:
+        return RepairedModel("", [], {})
+    root = read_xml(path)
+    if any(element.tag.startswith("xacro:") for element in root.iter()):
+        raise DrakeTeleopError("is a xacro file", where=str(path), remedy=_XACRO)
+    return _REPAIRS[kind](root, path, files, purpose, folder)

@@ -84,6 +84,11 @@ class ModelFiles:
             path = (folder or self._folder) / address.removeprefix("file://")
         return next(iter(_existing_paths(path)), None)
 
+    def may_read(self, path: Path) -> bool:
+        """Return whether a file is in the model's folder or a package, after resolving links."""
+        roots = (*self._roots, *self.packages.values())
+        return any(path.resolve().is_relative_to(root) for root in roots)
+
     def check(self, path: Path) -> None:
         """Check a file and all files that it references, except meshes of the model's own links.
 
@@ -102,8 +107,7 @@ class ModelFiles:
     def _size(self, path: Path, including: tuple[Path, ...]) -> tuple[int, int]:
         """Check a file; return the number of files and bytes that reading it takes."""
         real, where = path.resolve(), str(including[-1] if including else self._model)
-        roots = (*self._roots, *self.packages.values())
-        if not any(real.is_relative_to(root) for root in roots):
+        if not self.may_read(real):
             raise DrakeTeleopError(
                 f"names {real}, which is outside the model's folder and its packages",
                 where=where,
@@ -149,6 +153,9 @@ class ModelFiles:
             )
         elif kind in (".urdf", ".sdf", ".xml", ".config"):
             root = read_xml(path)
+            if self._model.suffix.lower() == ".xml":  # `MeshLibrary` checks the assets
+                yield from (e.get("file", "") for e in root.iter("include"))
+                return
             self._bases |= {e.get(n, "") for e in root.iter("compiler") for n in _FOLDERS}
             yield from _addresses_in_xml(
                 root, meshes=path != self._model.resolve() or kind == ".xml"
@@ -193,7 +200,7 @@ def read_xml(path: Path) -> Element:
 
     parser.SkippedEntityHandler = parser.ExternalEntityRefHandler = unread
     try:
-        parser.Parse(path.read_bytes(), True)
+        parser.Parse(path.read_bytes().lstrip(), True)
         return builder.close()
     except (expat.ExpatError, ValueError, LookupError) as error:  # the last two: invalid encoding
         remedy = "give a URDF or SDF that other readers of XML take too"

@@ -10,8 +10,12 @@ class RepairedModel(NamedTuple):
         text: XML for Drake's parser, with absolute mesh paths.
         assumptions: one text per kind of repair, with the names and numbers of what changed.
         effort_limits: torque or force limits [N m, N] by joint; joints without an entry have none.
+        dependent: reasons why joints or links do not move independently, by name.
+        auxiliary: massless bodies between several joints of one body, which the file does not have.
     """
 
     text: str
     assumptions: list[str]
     effort_limits: dict[str, float]
+    dependent: dict[str, str] = {}  # noqa: RUF012  (never changed)
+    auxiliary: frozenset[str] = frozenset()

@@ -57,6 +57,9 @@ class Slave:
     home: list[float] = plain(
         [], "joint positions at the start [rad, m]; default: computed from position"
     )
+    hold: dict[str, float] = plain(
+        {}, "joints that are fixed, with their positions [rad, m], such as {torso_lift: 0.2}"
+    )
     friction: list[float] = plain(
         [],
         "dry friction of the joints [N m, N], one for all or each, not compensated by joint"
@@ -105,6 +108,13 @@ class Slave:
                 raise DrakeTeleopError(
                     "must be a list of finite numbers" + (", 3 of them" if name == "tip" else ""),
                     where=f"{where}.{name}",
+                )
+        for joint, position in self.hold.items():
+            if not np.isfinite(position):
+                raise DrakeTeleopError(
+                    f"{position:g} is no position",
+                    where=f"{where}.hold.{joint}",
+                    remedy="give an angle [rad] or a distance [m]",
                 )
         if self.tool is not None:
             self.tool.check(f"{where}.tool")

@@ -1,0 +1,274 @@
+"""Joints of a parsed plant: base and other joints welded, motors of the chain to the sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    BodyIndex,
+    Frame,
+    Joint,
+    JointIndex,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    WeldJoint,
+)
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.slave.model_tree import WORLD
+from drake_teleop.station.slave.repair_report import listed
+
+# Rotor inertia, seen at the joint, of an arm of length L [m]: this mass [kg] times L^2. It gives
+# 0.1 kg m^2 at 0.85 m, as common models of such arms have, and 0.02 kg m^2 at 0.4 m.
+_ROTOR_MASS_KG = 0.14
+_SLIDING_MOTOR_KG = 5.0  # mass that moves with a prismatic joint instead
+
+
+def moves(plant: MultibodyPlant, index: JointIndex) -> bool:
+    """Return whether a joint has a velocity."""
+    return plant.get_joint(index).num_velocities() > 0
+
+
+def check_tree(plant: MultibodyPlant, where: str) -> None:
+    """Check that the joints form a tree; Drake aborts on loops, or never finishes.
+
+    Raises:
+        DrakeTeleopError: for a link with two parents, a world with a parent, or a loop.
+    """
+    parents: dict[BodyIndex, Joint] = {}
+    world = plant.world_body().index()
+    for joint in map(plant.get_joint, plant.GetJointIndices()):
+        child = joint.child_body()
+        if child.index() in parents or child.index() == world:
+            other = parents.get(child.index())
+            on = joint.name() if other is None else f"two joints, {other.name()} and {joint.name()}"
+            raise DrakeTeleopError(
+                f"{child.name()} is the child of {on}",
+                where=where,
+                remedy="an arm is a tree: each link is the child of one joint, the world of none",
+            )
+        parents[child.index()] = joint
+    for start in parents:
+        index, passed = start, {start}
+        while index in parents:
+            index = parents[index].parent_body().index()
+            if index in passed:
+                raise DrakeTeleopError(
+                    f"its joints form a circle through {plant.get_body(index).name()}",
+                    where=where,
+                    remedy="an arm is a tree: cut the loop, or model the chain to the sensor alone",
+                )
+            passed.add(index)
+
+
+def weld_base(
+    plant: MultibodyPlant, frame: Frame, X_WBase: RigidTransform | None, where: str
+) -> list[JointIndex]:
+    """Weld a free base to the world; return the joints up to S, from the base outwards.
+
+    Raises:
+        DrakeTeleopError: if the model fixes its base although `X_WBase` is not the identity.
+    """
+    inboard = {j.child_body().index(): j for j in map(plant.get_joint, plant.GetJointIndices())}
+    body, chain = frame.body(), list[Joint]()
+    while body.index() in inboard:
+        chain.append(inboard[body.index()])
+        body = inboard[body.index()].parent_body()
+    if body.index() != plant.world_body().index():
+        X_WB = RigidTransform() if X_WBase is None else X_WBase
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), X_WB)
+    elif X_WBase is not None and not X_WBase.IsExactlyIdentity():
+        raise DrakeTeleopError(
+            f"the model welds {chain[-1].child_body().name()} to the world itself",
+            where=where,
+            remedy="leave slave.base_pose out, or remove that joint from the model",
+        )
+    return [joint.index() for joint in reversed(chain)]
+
+
+def weld_free_bodies(plant: MultibodyPlant, instances: Iterable[ModelInstanceIndex]) -> list[str]:
+    """Weld bodies that are not connected to the arm to the world; return a note."""
+    held = {plant.get_joint(k).child_body().index() for k in plant.GetJointIndices()}
+    bodies = [plant.get_body(k) for each in instances for k in plant.GetBodyIndices(each)]
+    free = [body for body in bodies if body.index() not in held]
+    for body in free:
+        plant.WeldFrames(plant.world_frame(), body.body_frame())
+    names = [body.name() for body in free if body.name() != WORLD]
+    return [f"not connected to the arm and welded to the world: {listed(names)}"] if names else []
+
+
+def check_chain(
+    plant: MultibodyPlant, chain: list[JointIndex], dependent: dict[str, str], where: str
+) -> None:
+    """Raise an error for joints of the chain that do not move alone, about or along one axis."""
+    for joint in (plant.get_joint(index) for index in chain):
+        for name in (joint.name(), joint.child_body().name(), joint.parent_body().name()):
+            if name in dependent:
+                raise DrakeTeleopError(
+                    f"{name} {dependent[name]}",
+                    where=where,
+                    remedy="the arm up to the sensor has to be a chain of independent joints",
+                )
+        one_axis = isinstance(joint, (RevoluteJoint, PrismaticJoint))
+        if joint.num_velocities() > 0 and not one_axis:
+            raise DrakeTeleopError(
+                f"{joint.name()} is a {joint.type_name()} joint",
+                where=where,
+                remedy="up to the sensor, use joints that turn about one axis or slide along it",
+            )
+
+
+def weld_at(
+    plant: MultibodyPlant, hold: dict[str, float], joints: Iterable[JointIndex]
+) -> list[str]:
+    """Weld the named joints at angles or positions [rad, m]; return a note.
+
+    Raises:
+        DrakeTeleopError: for an unknown joint, or a position outside the joint's limits.
+    """
+    known = {plant.get_joint(k).name(): plant.get_joint(k) for k in joints if moves(plant, k)}
+    for name, position in hold.items():
+        joint = known.get(name)
+        if joint is None:
+            raise DrakeTeleopError(
+                f"no moving joint is named {name!r}",
+                where="slave.hold",
+                remedy=f"name one of {', '.join(sorted(known))}",
+            )
+        if joint.num_velocities() != 1:
+            what = f"{name} is a {joint.type_name()} joint, which has no single position"
+            raise DrakeTeleopError(what, where="slave.hold", remedy="leave it out")
+        lower, upper = joint.position_lower_limits()[0], joint.position_upper_limits()[0]
+        if lower < upper and not lower <= position <= upper:
+            what = f"{name} at {position:g} is outside {lower:g} to {upper:g}"
+            raise DrakeTeleopError(what, where="slave.hold", remedy="check the value and its unit")
+        joint.set_default_positions(np.array([position]))
+        _weld(plant, joint)
+    return [f"held at {position:g}: {name}" for name, position in hold.items()]
+
+
+def weld_other_joints(
+    plant: MultibodyPlant, before: set[JointIndex], chain: list[JointIndex]
+) -> list[str]:
+    """Weld moving joints outside the chain at their default positions; return a note."""
+    for constraint in plant.GetConstraintIds():  # for example of coupled fingers
+        plant.RemoveConstraint(constraint)
+    added = set(plant.GetJointIndices()) - before - set(chain)
+    joints = [plant.get_joint(index) for index in added if moves(plant, index)]
+    names = sorted(joint.name() for joint in joints)
+    for joint in joints:
+        _weld(plant, joint)
+    return [f"held: {listed(names)}"] if names else []
+
+
+def _weld(plant: MultibodyPlant, joint: Joint) -> None:
+    name, ends = joint.name(), (joint.frame_on_parent(), joint.frame_on_child())
+    X_FM = _default_pose(joint)
+    for k in plant.GetJointActuatorIndices():
+        if plant.get_joint_actuator(k).joint().index() == joint.index():
+            plant.RemoveJointActuator(plant.get_joint_actuator(k))
+    plant.RemoveJoint(joint)
+    plant.AddJoint(WeldJoint(f"{name}_held", *ends, X_FM))
+
+
+def _default_pose(joint: Joint) -> RigidTransform:
+    # Drake's `GetDefaultPose` covers few kinds of joints.
+    q = joint.default_positions()
+    if isinstance(joint, RevoluteJoint):
+        return RigidTransform(AngleAxis(q[0], joint.revolute_axis()), np.zeros(3))
+    if isinstance(joint, PrismaticJoint):
+        return RigidTransform(q[0] * joint.translation_axis())
+    return joint.GetDefaultPose() if np.any(q) else RigidTransform()
+
+
+def actuate(
+    plant: MultibodyPlant, chain: list[JointIndex], limits: dict[str, float] | None
+) -> None:
+    """Give each moving joint of the chain one actuator, in the order of the chain.
+
+    `limits` are effort limits by joint, without an entry unlimited; None keeps Drake's.
+    """
+    moving = [index for index in chain if moves(plant, index)]
+    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    own = {each.joint().index(): each for each in actuators if each.joint().index() in moving}
+    data = {
+        index: (each.effort_limit(), each.default_rotor_inertia(), each.default_gear_ratio())
+        for index, each in own.items()
+    }
+    for each in own.values():
+        plant.RemoveJointActuator(each)
+    for index in moving:
+        joint = plant.get_joint(index)
+        effort, rotor, gear = data.get(index, (np.inf, 0.0, 1.0))
+        if limits is not None:
+            effort = limits.get(joint.name(), np.inf)
+        actuator = plant.AddJointActuator(joint.name(), joint, effort)
+        actuator.set_default_rotor_inertia(rotor)
+        actuator.set_default_gear_ratio(gear)
+
+
+def assume_rotor_inertias(
+    plant: MultibodyPlant, chain: list[JointIndex], frame: Frame, auxiliary: frozenset[str]
+) -> list[str]:
+    """Give joints a rotor inertia if the links that they move have none; return a note.
+
+    Without it the joint's acceleration is undefined, or so large that a run takes hours. Gravity
+    and the wrench at the sensor stay those of the model. The links of a joint at an `auxiliary`
+    body include those of the next joint.
+    """
+    joints = [plant.get_joint(index) for index in chain]
+    inertia = _ROTOR_MASS_KG * _length(joints, frame) ** 2
+    actuators = map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+    motor = {each.joint().index(): each for each in actuators}
+    turning, sliding = list[str](), list[str]()
+    for joint in (joint for joint in joints if joint.index() in motor):
+        if motor[joint.index()].default_reflected_inertia() > 0.0:
+            continue
+        if _has_inertia(plant, joint, auxiliary):
+            continue
+        slides = isinstance(joint, PrismaticJoint)
+        (sliding if slides else turning).append(joint.name())
+        motor[joint.index()].set_default_rotor_inertia(_SLIDING_MOTOR_KG if slides else inertia)
+        motor[joint.index()].set_default_gear_ratio(1.0)
+    return [
+        f"{what}, as the model has no inertia there, for {listed(names)}"
+        for what, names in (
+            (f"a rotor inertia of {inertia:.3g} kg m^2", turning),
+            (f"a moved mass of {_SLIDING_MOTOR_KG:g} kg", sliding),
+        )
+        if names
+    ]
+
+
+def _has_inertia(plant: MultibodyPlant, joint: Joint, auxiliary: frozenset[str]) -> bool:
+    """Return whether the joint's child, or a body welded to it, has mass and inertia."""
+    ahead, joints = [joint.child_body()], [plant.get_joint(k) for k in plant.GetJointIndices()]
+    while ahead:
+        body: RigidBody = ahead.pop()
+        moments = body.default_rotational_inertia().get_moments()
+        if body.default_mass() > 0.0 and (isinstance(joint, PrismaticJoint) or moments.any()):
+            return True
+        outboard = [each for each in joints if each.parent_body().index() == body.index()]
+        through = body.name() in auxiliary
+        ahead += [e.child_body() for e in outboard if through or isinstance(e, WeldJoint)]
+    return False
+
+
+def _length(chain: list[Joint], frame: Frame) -> float:
+    """Return the length [m] of the arm from its first moving joint to S."""
+    while chain and chain[0].num_velocities() == 0:
+        chain = chain[1:]
+    ends = [*(joint.frame_on_parent() for joint in chain[1:]), frame][: len(chain)]
+    way = 0.0
+    for joint, end in zip(chain, ends, strict=True):
+        start = joint.frame_on_child().GetFixedPoseInBodyFrame().translation()
+        way += float(np.linalg.norm(end.GetFixedPoseInBodyFrame().translation() - start))
+        if isinstance(joint, WeldJoint):
+            way += float(np.linalg.norm(joint.X_FM().translation()))
+    return way

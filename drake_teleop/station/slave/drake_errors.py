@@ -1,0 +1,69 @@
+"""Drake's errors about models in the user's terms."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeAlias
+
+from drake_teleop.common.errors import LONGEST_LINE, DrakeTeleopError, silent_stderr
+
+#: Expected kind of file, and the remedy for missing packages.
+Description: TypeAlias = tuple[str, str]
+ROBOT: Description = ("robot", "with --package-path for package://")
+SCENE: Description = ("scene", "its package:// addresses in folders around it")
+# Places in Drake's source and in repaired texts, which the user does not have.
+_FAILURE = re.compile(r"Failure at \S+ in \w+(\(\))?: ")
+_REPAIRED_TEXT = re.compile(r"<(literal|data)-string>(\.\w+)?(:\d+)*:? ?")
+_COPY = r"(file://)?{folder}/\d+_([^\s:'\"]*)(:\d+)*"
+_NUM_CHARS_OF_PLACE = 30  # " ... " and separators of the error line
+
+
+@contextmanager
+def translate_drake_errors(
+    path: Path, expected: Description = ROBOT, folder: str = ""
+) -> Iterator[None]:
+    """Convert Drake's exceptions about a model to a DrakeTeleopError with the model's file.
+
+    `folder` contains repaired copies of files; messages name the files without it.
+    """
+    try:
+        yield
+    except DrakeTeleopError:
+        raise
+    # SystemExit: failed condition in Drake; LookupError: from C++ containers.
+    except (RuntimeError, SystemExit, ValueError, LookupError) as error:
+        reason = _REPAIRED_TEXT.sub("", _FAILURE.sub("", " ".join(str(error).split())))
+        if folder:
+            reason = re.sub(_COPY.format(folder=re.escape(folder)), r"\2", reason)
+        what = f"cannot be read as a {expected[0]}"
+        remedy = f"give a URDF, SDF, MJCF or .dmd.yaml model, {expected[1]}"
+        room = LONGEST_LINE - len(f"{path}{what}{remedy}") - _NUM_CHARS_OF_PLACE
+        if len(reason) > room:
+            reason = f"{reason[:room]} ..."
+        raise DrakeTeleopError(what, where=str(path), remedy=f"{remedy} ({reason})") from None
+
+
+@contextmanager
+def raise_logged_errors() -> Iterator[None]:
+    """Raise RuntimeError for errors that Drake only logs, and for replaced inertias."""
+    errors: list[str] = []
+
+    def keep(record: logging.LogRecord) -> bool:
+        message = record.getMessage()
+        if record.levelno >= logging.ERROR or "inertia" in message:
+            errors.append(" ".join(message.split()))
+        return False
+
+    log = logging.getLogger("drake")
+    log.addFilter(keep)
+    try:
+        with silent_stderr():  # the parsers below Drake write to stderr
+            yield
+    finally:
+        log.removeFilter(keep)
+    if errors:
+        raise RuntimeError("; ".join(dict.fromkeys(errors)))

@@ -1,0 +1,385 @@
+"""Models as they are published: repairs keep kinematics, masses and limits, and are stated."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
+from test_bad_models import INERTIA, INERTIAL, LIMIT, arm, joint, link
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.station.scenario import LoadScenario
+from drake_teleop.station.scenario_reference import write_scenario
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.arm_from_plant import ArmModelFromPlant
+from drake_teleop.station.slave.drake_errors import translate_drake_errors
+from drake_teleop.station.slave.models import ParseModel, ParseScene
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.possible_inertia import nearest_possible_inertia
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Tool
+
+
+def read(path, sensor="l6", hold=None, shapes=False):
+    """Return plant, arm model and assumptions of a file."""
+    plant = MultibodyPlant(0.0)
+    if shapes:
+        plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.0)
+    parsed = ParseModel(plant, path, sensor, hold=hold)
+    plant.Finalize()
+    model = ArmModelFromPlant(plant, parsed.instance, parsed.sensor_frame.name())
+    return plant, model, "; ".join(parsed.assumptions)
+
+
+def pose(model, q):
+    R, p = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(model.table, np.asarray(q, dtype=float), R, p)
+    return np.column_stack([R, p])
+
+
+def written(folder, text, name="arm.urdf"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    ("given", "expected", "share"),
+    [
+        ((0.1, 0.1, 0.2001), (0.1 + 1e-4 / 3, 0.1 + 1e-4 / 3, 0.2001 - 1e-4 / 3), 1e-4 / 0.6003),
+        ((0.0, 0.0, 3.0), (1.0, 1.0, 2.0), 1 / 3),
+        ((0.2, 1.0, 1.8), (0.4, 1.2, 1.6), 1 / 9),
+        ((-0.3, 1.0, 1.0), (0.0, 1.0, 1.0), 0.3),
+        ((-1.0, 1.0, 4.0), (1.0, 2.0, 3.0), 0.5),
+        ((0.3, 0.4, 0.7), (0.3, 0.4, 0.7), 0.0),
+    ],
+)
+def test_nearest_possible_inertia_shares_the_deficit(given, expected, share):
+    R = RollPitchYaw(0.3, -0.7, 1.1).ToRotationMatrix().matrix()
+    for axes in (np.eye(3), R):
+        found, change = nearest_possible_inertia(axes @ np.diag(given) @ axes.T)
+        np.testing.assert_allclose(found, axes @ np.diag(expected) @ axes.T, atol=3e-9)
+        assert change == pytest.approx(share, abs=3e-9)
+        moments = np.linalg.eigvalsh(found)
+        assert moments[0] >= -1e-15 and moments[2] <= moments[0] + moments[1] + 1e-15
+
+
+LIMITLESS = '<axis xyz="0 0 1"/>'
+TWICE = "".join(
+    f'<transmission name="t{k}"><type>transmission_interface/SimpleTransmission</type><joint '
+    f'name="j{k}"/><actuator name="motor"><mechanicalReduction>1</mechanicalReduction></actuator>'
+    "</transmission>"
+    for k in (1, 2, 3)
+)
+COLOUR = '<visual><geometry><box size=".1 .1 .1"/></geometry><material name="grey"><color rgba="{} '
+COLOUR += '0 0 1"/></material></visual>'
+OFF_CHAIN = link("a") + link("b") + link("c") + link("d") + link("e")
+OFF_CHAIN += joint(21, "planar", parent="l4", child="a") + joint(22, "floating", parent="a",
+                                                                  child="b")  # fmt: skip
+OFF_CHAIN += joint(23, parent="l4", child="c", inside='<mimic joint="j2" multiplier="-1"/>')
+OFF_CHAIN += joint(24, "hinge", parent="c", child="d").replace("0 0 1", "0 0 0")
+OFF_CHAIN += joint(25, parent="l6", child="e").replace(LIMIT, '<limit lower="2" upper="1"/>')
+# Defects of published files, and what is stated about them.
+LOOKALIKES = {
+    "six-joint arm with rounded and thin links": (
+        arm(l3=link("l3", INERTIAL.replace('izz="0.01"', 'izz="0.0405"')))
+        .replace(INERTIA, INERTIA.replace('izz="0.01"', 'izz="0.06"'), 1),
+        "an impossible inertia left out, .* of l0; inertia replaced by .* of link l3 .0.412 %."),
+    "seven-joint arm on a base without mass": (
+        arm(l0=link("l0", INERTIAL.replace('value="2"', 'value="0.0"'))),
+        "^an impossible inertia left out, as no joint of the arm moves the link, of l0$"),
+    "mobile manipulator with commas and shared motor names": (
+        arm(beyond=TWICE, l3=link("l3", INERTIAL + COLOUR.format(1) + COLOUR.format(0.5)))
+        .replace('xyz="0 0 0.25"', 'xyz="0, 0,0.25" rpy="0, 0 0"'), "^$"),
+    "humanoid with coupled fingers, wheels and odd joints": (
+        arm(beyond=OFF_CHAIN), "^held: j21, j22, j23, j24, j25$"),
+    "arm without masses": (
+        re.sub("<inertial>.*?</inertial>", "", arm()),
+        "a rotor inertia of 0.219 kg m.2, as the model has no inertia there, for j1, .*, j6$"),
+    "arm with plugins, a loose cup and a floating base": (
+        arm(l0=link("world", "") + link("l0") + joint(30, "floating", "", "world", "l0"),
+            beyond=link("cup") + '<gazebo reference="l3"><kp>1</kp></gazebo><sensor/>'),
+        "^welded to the world, where it may float: l0; .* and left out: cup$"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", LOOKALIKES)
+def test_repairs_keep_kinematics_and_limits(tmp_path, case):
+    text, expected = LOOKALIKES[case]
+    _, clean, _ = read(written(tmp_path, arm(), "clean.urdf"))
+    _, model, said = read(written(tmp_path, text))
+    assert re.search(expected, said), said
+    for q in np.random.default_rng(3).uniform(-2, 2, (5, 6)):
+        np.testing.assert_allclose(pose(model, q), pose(clean, q), atol=1e-12)
+    for name in ("joint_names", "lower", "upper", "effort_limit", "velocity_limit"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(clean, name))
+
+
+def test_masses_beside_the_chain_stay(tmp_path):
+    """The planar, floating and coupled links move with l4, the last one with the sensor."""
+    plant, model, _ = read(written(tmp_path, arm(beyond=OFF_CHAIN)))
+    assert model.phi_load[0] == pytest.approx(2.0)  # link e
+    masses = model.table[:-1, 12]  # first of the inertial parameters
+    np.testing.assert_allclose(masses, [2.0, 2.0, 2.0, 10.0, 2.0, 2.0])
+    assert plant.num_positions() == 6
+
+
+def test_continuous_joints_keep_their_limits_only_if_given(tmp_path):
+    text = arm(j3=joint(3, "continuous").replace(LIMIT, '<limit effort="9" velocity="1"/>'))
+    _, model, _ = read(
+        written(tmp_path, text.replace('"j2" type="revolute"', '"j2" type="continuous"'))
+    )
+    np.testing.assert_array_equal(model.lower[1:4], [-2.5, -np.inf, -2.5])
+    np.testing.assert_array_equal(model.upper[1:4], [2.5, np.inf, 2.5])
+    np.testing.assert_array_equal(model.effort_limit[1:4], [200.0, 9.0, 200.0])
+
+
+@pytest.mark.parametrize("name", ["j1", "j3", "j5"])
+@pytest.mark.parametrize("position", [0.0, -0.7, 1.9])
+def test_held_joint_is_fixed_at_its_position(tmp_path, name, position):
+    text = arm().replace('"j3" type="revolute"', '"j3" type="prismatic"')
+    path, k = written(tmp_path, text), int(name[1]) - 1
+    _, free, _ = read(path)
+    _, held, said = read(path, hold={name: position})
+    assert held.joint_names == tuple(f"j{i}" for i in range(1, 7) if f"j{i}" != name)
+    assert f"held at {position:g}: {name}" in said
+    for q in np.random.default_rng(4).uniform(-2, 2, (3, 5)):
+        expected = pose(free, np.insert(q, k, position))
+        np.testing.assert_allclose(pose(held, q), expected, atol=1e-12)
+
+
+def test_hold_frees_chain_from_coupled_joint_and_opens_gripper(tmp_path):
+    finger = joint(9, "prismatic", '<mimic joint="j2"/>', parent="l6", child="f") + link("f")
+    coupled = joint(3, inside='<mimic joint="j2"/>')
+    path = written(tmp_path, arm(j3=coupled, beyond=finger))
+    with pytest.raises(DrakeTeleopError, match=r"j3 moves with another joint.*slave\.hold"):
+        read(path)
+    plant, model, said = read(path, hold={"j3": 0.4, "j9": 0.03})
+    assert model.joint_names == ("j1", "j2", "j4", "j5", "j6")
+    assert "held at 0.4: j3; held at 0.03: j9" in said
+    context = plant.CreateDefaultContext()
+    frames = [plant.GetFrameByName(each) for each in ("l6", "f")]
+    p = plant.CalcRelativeTransform(context, *frames).translation()
+    np.testing.assert_allclose(p, [0, 0.03, 0.25], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("hold", "expected"),
+    [
+        ({"torso": 0.1}, r"slave\.hold: no moving joint is named 'torso'; name one of j1, j2, j3"),
+        ({"j3": 2.6}, r"slave\.hold: j3 at 2\.6 is outside -2\.5 to 2\.5"),
+        ({"j3": float("nan")}, r"slave\.hold\.j3: nan is no position"),
+    ],
+)
+def test_invalid_hold_is_one_error(tmp_path, hold, expected):
+    slave = Slave(model=str(written(tmp_path, arm())), sensor_frame="l6", hold=hold)
+    with pytest.raises(DrakeTeleopError, match=expected):
+        slave.check("slave")
+        NominalSlave(slave)
+
+
+def test_hold_is_read_from_a_scenario_and_written_to_one(tmp_path):
+    written(tmp_path, arm())
+    text = "slave: {model: arm.urdf, sensor_frame: l6, home: [0.1, 0.4, 1.2, 1.4, 0.3], hold: "
+    scenario = LoadScenario(written(tmp_path, f"{text}{{j4: -0.2}}}}", "a.yaml"))
+    assert scenario.slave.hold == {"j4": -0.2}
+    assert NominalSlave(scenario.slave).arm.joint_names == ("j1", "j2", "j3", "j5", "j6")
+    write_scenario(tmp_path / "b.yaml", scenario)
+    assert LoadScenario(tmp_path / "b.yaml").slave.hold == {"j4": -0.2}
+    for wrong, expected in (
+        ("[j4]", "slave.hold: expected a mapping"),
+        ("{j4: x}", "hold.j4: exp"),
+    ):
+        with pytest.raises(DrakeTeleopError, match=expected):
+            LoadScenario(written(tmp_path, f"{text}{wrong}}}", "c.yaml"))
+
+
+ARM_SDF = """<model name="arm"><pose>0.3 0 0.5 0 0 0</pose>
+<link name="base"><inertial><mass>0</mass></inertial></link>
+<link name="l1"><pose>0 0 0.2 0.1 0.2 0.3</pose><inertial><mass>2</mass><inertia><ixx>0.1</ixx>
+<iyy>0.1</iyy><izz>0.3</izz></inertia></inertial><sensor name="s" type="imu"/>
+<collision name="c"><material/><geometry><box><size>.1, .1, .1</size></box></geometry></collision>
+<visual name="v"><geometry><box><size>.1 .1 .1</size></box></geometry><plugin/></visual></link>
+<link name="hand"><pose>0 0.1 0.6 0 0 0</pose><inertial><mass>0</mass></inertial></link>
+<joint name="a" type="revolute"><parent>base</parent><child>l1</child><axis><xyz>0 1 0</xyz><limit>
+<lower>-1</lower><upper>2</upper><effort>30</effort></limit></axis></joint>
+<joint name="f" type="ball"><parent>l1</parent><child>hand</child></joint>
+<frame name="ft" attached_to="l1"><pose>0 0 0.3 0 0 0</pose></frame></model>"""
+TABLE = '<model name="table"><link name="top"/><joint name="x" type="gearbox"/></model>'
+
+
+@pytest.mark.parametrize(
+    ("text", "stated"),
+    [
+        (
+            f"<world name='w'>{TABLE}<light/>{ARM_SDF}</world>",
+            "models beside the arm left out: table",
+        ),
+        (f"{ARM_SDF}{TABLE}", "models beside the arm left out: table"),
+        (ARM_SDF, "held: f"),
+    ],
+)
+def test_arm_is_taken_out_of_an_sdf(tmp_path, text, stated):
+    path = written(tmp_path, f"<sdf version='1.7'>{text}</sdf>", "arm.sdf")
+    plant, model, said = read(path, "ft", shapes=True)
+    assert stated in said
+    assert "replaced by the nearest possible one" in said and "of link l1 (11.1 %)" in said
+    assert "an impossible inertia left out, as no joint of the arm moves the link, of base" in said
+    assert "an inertia without a mass left out of hand" in said
+    assert (model.lower[0], model.upper[0], model.effort_limit[0]) == (-1.0, 2.0, 30.0)
+    assert plant.GetBodyByName("hand").default_mass() == 0.0
+    X_BaseL1 = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [0, 0, 0.2])
+    for q in (-0.4, 0.0, 1.3):
+        turn = RigidTransform(RollPitchYaw(0, q, 0), np.zeros(3))
+        expected = (X_BaseL1 @ turn @ RigidTransform([0, 0, 0.3])).GetAsMatrix34()
+        np.testing.assert_allclose(pose(model, [q]), expected, atol=1e-12)
+
+
+def test_included_model_is_repaired(tmp_path):
+    written(tmp_path, f"<sdf version='1.7'>{ARM_SDF}</sdf>", "inside.sdf")
+    outer = (
+        "<sdf version='1.7'><model name='m'><include><uri>inside.sdf</uri></include></model></sdf>"
+    )
+    _, model, said = read(written(tmp_path, outer, "outer.sdf"), "ft")
+    assert model.joint_names == ("a",) and model.effort_limit[0] == 30.0
+    assert "of link l1 (11.1 %)" in said
+
+
+GRIPPER = f"""<robot name="g">{link("palm", INERTIAL.replace('izz="0.01"', 'izz="0.05"'))}
+{link("f")}<joint name="slide" type="prismatic"><parent link="palm"/><child link="f"/>
+<axis xyz="1 0 0"/>{LIMIT}</joint></robot>"""
+DIRECTIVES = """directives:
+- add_model: {{name: arm, file: "file://{0}/arm.urdf", default_joint_positions: {{j8: [0.3]}}}}
+- add_weld: {{parent: world, child: arm::l0, X_PC: {{translation: [0.1, 0.2, 0.3]}}}}
+- add_model: {{name: hand, file: "file://{0}/f.urdf", default_joint_positions: {{slide: [0.02]}}}}
+- add_weld: {{parent: arm::l6, child: hand::palm, X_PC: {{translation: [0, 0, 0.1]}}}}
+- add_model: {{name: cup, file: "file://{0}/cup.urdf"}}
+"""
+
+
+def test_models_of_directives_are_repaired(tmp_path):
+    beside = link("x") + joint(8, parent="l6", child="x")
+    written(tmp_path, arm(beyond=beside, l3=link("l3", INERTIAL.replace(INERTIA, INERTIA.replace(
+        'izz="0.01"', 'izz="0.05"')))))  # fmt: skip
+    written(tmp_path, GRIPPER, "f.urdf")
+    written(tmp_path, f'<robot name="cup">{link("cup")}</robot>', "cup.urdf")
+    path = written(tmp_path, DIRECTIVES.format(tmp_path), "arm.dmd.yaml")
+    plant, model, said = read(path)
+    assert "of link l3 (6.67 %)" in said and "of link palm (6.67 %)" in said
+    assert "connected to the arm and welded to the world: cup" in said
+    assert "held: j8, slide" in said
+    assert model.joint_names == tuple(f"j{k}" for k in range(1, 7))
+    np.testing.assert_array_equal(model.effort_limit, 200.0)
+    assert model.phi_load[0] == pytest.approx(6.0)
+    np.testing.assert_allclose(pose(model, np.zeros(6))[:, 3], [0.1, 0.2, 1.8], atol=1e-12)
+    context = plant.CreateDefaultContext()
+    frames = [plant.GetFrameByName(each) for each in ("palm", "f")]
+    p = plant.CalcRelativeTransform(context, *frames).translation()
+    np.testing.assert_allclose(p, [0.02, 0, 0], atol=1e-12)
+
+
+def test_all_faults_are_listed_at_once(tmp_path):
+    bad = joint(5, "ball").replace(LIMIT, '<limit lower="3" upper="x"/>')
+    text = arm(j3=joint(3, inside='<mimic joint="j2"/>')).replace(joint(5), bad)
+    text = text.replace('<mass value="2"/>', '<mass value="-4"/>', 3).replace("0.25", "1e9", 1)
+    with pytest.raises(DrakeTeleopError) as error:
+        read(written(tmp_path, text))
+    said = str(error.value)
+    assert said.startswith(f"{tmp_path}/arm.urdf: 6 faults: (1) ")
+    for part in ("j3 moves with another joint", "j5 is a ball joint", "'x' is not a number",
+                 "origin 1e9 is no", "link l1: mass -4", "link l2: mass -4"):  # fmt: skip
+        assert part in said
+
+
+@pytest.mark.parametrize("origin", ['xyz="0 0.25"', 'xyz="0 0 a"', 'rpy="0 0 0 0"', 'xyz="${x}"'])
+def test_invalid_origin_of_the_chain_names_its_joint(tmp_path, origin):
+    path = written(tmp_path, arm(j3=joint(3).replace('xyz="0 0 0.25"', origin)))
+    with pytest.raises(DrakeTeleopError, match=r"joint j3: origin \w+='.*' is no list of three"):
+        read(path)
+
+
+def test_message_of_drake_is_whole_and_names_the_users_file(tmp_path):
+    path = written(tmp_path, f"<sdf version='99'>{ARM_SDF}</sdf>", "arm.sdf")
+    outer = f"<sdf version='1.7'><model name='m'><include><uri>{path}</uri></include></model></sdf>"
+    for file in (path, written(tmp_path, outer, "outer.sdf")):
+        with pytest.raises(DrakeTeleopError) as error:
+            read(file, "ft")
+        said = str(error.value)
+        assert said.startswith(f"{file}: cannot be read as a robot; give a URDF, SDF, MJCF or .dmd")
+        assert "Unable to convert from SDF version 99 to 1.12" in said and said.endswith(")")
+        assert not re.search(r"-string|drake_teleop_| \.\.\. ", said)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (
+            "Failure at bazel-out/k8/a.h:104 in Set(): condition 'm > 0' failed.",
+            "condition 'm > 0'",
+        ),
+        ("<literal-string>.urdf:12: error: body b", "(error: body b)"),
+        (
+            "error: /tmp/folder/3_arm.sdf:7: body b; file:///tmp/folder/0_a.sdf",
+            "arm.sdf: body b; a.sdf)",
+        ),
+        ("x" * 2000, "x ...)"),
+    ],
+)
+def test_message_of_drake_loses_only_places_that_the_user_has_not(text, expected):
+    def fail():
+        with translate_drake_errors(Path("arm.urdf"), folder="/tmp/folder"):
+            raise RuntimeError(text)
+
+    with pytest.raises(DrakeTeleopError) as error:
+        fail()
+    said = str(error.value)
+    assert expected in said and not re.search("bazel|-string|/tmp", said) and len(said) < 1000
+
+
+MESHES = {
+    "text.obj": "hello",
+    "empty.stl": "",
+    "nan.obj": "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+    "corner.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n",
+    "points.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\n",
+    "cut.gltf": '{"asset"',
+    "shape.dae": "<COLLADA/>",
+}
+SHAPES = ('<ellipsoid a="-1" b="1" c="1"/>', '<box size="1 nan 1"/>', "<cone/>", "")
+
+
+def test_damaged_meshes_are_dropped_and_stated_for_an_arm_only(tmp_path):
+    flat = "solid a\nfacet\nvertex 0 0 0\nvertex .1 0 0\nvertex 0 .1 0\nendfacet\n"
+    for name, content in (MESHES | {"flat.stl": flat}).items():
+        (tmp_path / name).write_text(content)
+
+    def shape(name):
+        return f'<collision><geometry><mesh filename="{name}"/></geometry></collision>'
+
+    shapes = "".join(map(shape, [*MESHES, "gone.obj"]))
+    shapes += "".join(f"<visual><geometry>{each}</geometry></visual>" for each in SHAPES)
+    path = written(tmp_path, arm(l3=link("l3", INERTIAL + shapes + shape("flat.stl"))))
+    plant, _, said = read(path, shapes=True)
+    assert len(plant.GetCollisionGeometriesForBody(plant.GetBodyByName("l3"))) == 1
+    for part in (".obj meshes are empty or damaged", ".stl meshes are empty or damaged",
+                 ".dae meshes cannot be read", "were not found", "cut.gltf: is no"):  # fmt: skip
+        assert part in said
+    _, _, without = read(path)
+    assert "shapes are missing of l3" in without
+    pad = f'<robot name="s">{link("pad", INERTIAL + shape("gone.obj"))}</robot>'
+    with pytest.raises(DrakeTeleopError, match="shapes are missing of pad"):
+        ParseScene(MultibodyPlant(0.0), written(tmp_path, pad, "pad.urdf"))
+
+
+def test_tool_may_have_joints_of_any_kind(tmp_path):
+    tool = written(tmp_path, GRIPPER.replace("prismatic", "planar"), "tool.urdf")
+    path = written(tmp_path, arm())
+    slave = Slave(model=str(path), sensor_frame="l6", home=[0.1, 0.4, 1.2, 0.2, 1.4, 0.3],
+                  tool=Tool(model=str(tool)))  # fmt: skip
+    nominal = NominalSlave(slave)
+    assert nominal.arm.phi_load[0] == pytest.approx(4.0)
+    assert "held: slide" in nominal.assumptions
