@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -78,6 +79,16 @@ def _mesh_fault(shape: ElementTree.Element, files: ModelFiles, folder: Path) -> 
 
 def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
     """Write the convex hull of an STL file as OBJ; return None for a degenerate hull."""
+    text = _hull_of_stl(path, path.stat().st_mtime_ns)
+    if text is None:
+        return None
+    target = folder / f"{len(list(folder.iterdir()))}_{path.stem}.obj"
+    target.write_text(text)
+    return target
+
+
+@lru_cache(maxsize=256)  # a station reads its model several times
+def _hull_of_stl(path: Path, _: int) -> str | None:
     from scipy.spatial import ConvexHull, QhullError
 
     data = path.read_bytes()
@@ -88,15 +99,13 @@ def _convert_stl_to_hull(path: Path, folder: Path) -> Path | None:
         lines = re.findall(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)", data)
         corners = np.array(lines, dtype=float).reshape(-1, 3)
     try:
-        hull = ConvexHull(np.unique(corners.astype(float), axis=0))
+        hull = ConvexHull(corners.astype(float))
     except (QhullError, ValueError):
         return None
     number = {vertex: k + 1 for k, vertex in enumerate(hull.vertices)}
     rows = ["v {:.9g} {:.9g} {:.9g}".format(*hull.points[vertex]) for vertex in hull.vertices]
     rows += ["f {} {} {}".format(*(number[k] for k in face)) for face in hull.simplices]
-    target = folder / f"{len(list(folder.iterdir()))}_{path.stem}.obj"
-    target.write_text("\n".join(rows) + "\n")
-    return target
+    return "\n".join(rows) + "\n"
 
 
 def AddSkeleton(plant: MultibodyPlant, sensor_frame: Frame) -> None:
