@@ -1,6 +1,7 @@
-"""Warnings about a run from its recorded signals.
+"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start.
 
 ============== ===================================================================================
+overlap        shapes of arm, tool or surroundings overlap at the start, see `posture_shapes`
 saturated      the wrist sensor is saturated
 fault          invalid numbers in the loop, see `drake_teleop.common.blocks`
 unreachable    the inverse kinematics have no solution
@@ -12,7 +13,7 @@ reserve        the hand is faster than the energy reserve of `ledger` allows for
 oscillation    hand, command or joint oscillates (limit cycle) while its command does not
 ============== ===================================================================================
 
-The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total).
+The first six are always reported, the others if they last longer than 0.2 s (`reserve`: in total).
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.posture_shapes import start_overlaps
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -65,7 +67,7 @@ _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence, with times, for each condition of the module's table that occurred.
+    """Return one sentence, with times or depth, for each condition of the module's table that occurred.
 
     Args:
         result: result of a run; checks whose signals were not recorded are skipped.
@@ -79,7 +81,8 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_joints(result, scenario, arm),
         _check_hand(result),
     )
-    return [f"{condition} {_times_text(spans)}" for condition, spans in found if spans]
+    overlaps = start_overlaps(scenario.slave, scenario.surroundings)
+    return [*overlaps, *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans)]
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:

@@ -23,6 +23,13 @@ _LIGHT = np.array([0.35, -0.5, 0.8])
 _VIEWS = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth, from the direction of the tool
 _CELLS = 8  # divisions of the wall in the picture
 _TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
+# Directions (k, 3) whose extreme points represent a shape with more points.
+_TURNS = np.arange(0.5, 250.0)
+_DIRECTIONS = np.column_stack([
+    np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+    np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+    1.0 - _TURNS / 125.0,
+])
 
 
 def start_picture(plan: Plan, title: str) -> Figure:
@@ -78,6 +85,8 @@ def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
 
 def _hull_triangles(points: Array) -> Array:
     """Return the triangles (k, 3, 3) of the convex hull of points, ordered outwards."""
+    if len(points) > len(_DIRECTIONS):
+        points = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):

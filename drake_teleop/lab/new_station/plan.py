@@ -39,7 +39,7 @@ _STAND_IN_MASSES_KG, _MAX_TORQUE_USE = (1.0, 0.5, 0.2, 0.1, 0.05), 0.8
 _MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
-_MAX_SWING_M = 0.04  # largest amplitude of the slave
+_MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT_FORCE_N = 30.0
 # Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
@@ -122,9 +122,10 @@ def plan_station(
         _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS * translation_scale),
         1.0,
     )
-    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
     shapes.move_to(place.q)
     lowest = lowest_point(shapes)
+    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
+    swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
     return Plan(
         joints=tuple(model.joint_names),
         tool=stand_in,

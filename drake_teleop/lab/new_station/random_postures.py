@@ -16,10 +16,10 @@ NUM_POSTURES = 20_000
 _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
 # Distance of S from the vertical line through the first joint, and its height above that joint, in
 # units of the reach.
-_RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.6)
+_RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
 _PREFERRED_RADIUS, _PREFERRED_HEIGHT, _LOWEST_PREFERRED_HEIGHT = 0.6, 0.25, -0.4
-_MIN_TOOL_HEIGHT_M = 0.08  # height of the tool's end above the base plane, for motion and wall
+_MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
 _SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 1.6
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane

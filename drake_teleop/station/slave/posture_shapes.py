@@ -1,7 +1,8 @@
 """Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
 
 Collision shapes count; of a body without them, its visual shapes. Drake uses convex hulls for
-meshes. Bodies that a joint connects may overlap, and pairs that overlap in nearly all postures.
+meshes. Bodies that a joint connects may overlap. So may pairs that overlap in many random postures,
+such as the hulls of a forearm and the next link but one.
 """
 
 from __future__ import annotations
@@ -50,8 +51,8 @@ from drake_teleop.station.slave.surroundings import AddEnvironment
 # Larger overlaps are reported [m]; smaller ones are rounding of models.
 _MIN_DEPTH_M = 1e-3
 _MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
-# Pairs that overlap in this share of random postures do not depend on the posture.
-_NUM_POSTURES, _CONSTANT_SHARE = 12, 0.9
+# Pairs that overlap in this share of random postures overlap by design.
+_NUM_POSTURES, _DESIGN_SHARE = 25, 0.4
 _SIDES = 24  # points on a circumference of a round shape
 
 
@@ -99,7 +100,7 @@ class PostureShapes:
             index: [surface_points(inspector, shape) for shape in self.shapes_of(index)]
             for index in map(BodyIndex, range(self.plant.num_bodies()))
         }
-        self._constant = self._constant_overlaps()
+        self._by_design = self._overlaps_by_design()
 
     def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
         """Return the collision shapes of a body."""
@@ -127,12 +128,12 @@ class PostureShapes:
         return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
 
     def near(self, within: float = 0.0) -> list[Near]:
-        """Return the pairs of bodies closer than `within` [m] that depend on the posture."""
-        found: dict[tuple[BodyIndex, BodyIndex], float] = {}
-        for pair, distance in self._distances(within).items():
-            if pair not in self._constant:
-                found[pair] = distance
-        return [Near(*map(self.plant.get_body, pair), found[pair]) for pair in found]
+        """Return the pairs of bodies closer than `within` [m] that do not overlap by design."""
+        return [
+            Near(*map(self.plant.get_body, pair), distance)
+            for pair, distance in self._distances(within).items()
+            if pair not in self._by_design
+        ]
 
     def points(self, bodies: Collection[BodyIndex]) -> Array:
         """Return points (k, 3) on the shapes of bodies, in W [m]."""
@@ -184,7 +185,7 @@ class PostureShapes:
         for bodies in together:
             manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes(bodies)))
 
-    def _constant_overlaps(self) -> set[tuple[BodyIndex, BodyIndex]]:
+    def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), dict[tuple[BodyIndex, BodyIndex], int]()
         for posture in random.uniform(*sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))):
             self.move_to(posture)
@@ -193,7 +194,7 @@ class PostureShapes:
         return {
             pair
             for pair, count in counts.items()
-            if count > _CONSTANT_SHARE * _NUM_POSTURES and not self.surroundings & set(pair)
+            if count > _DESIGN_SHARE * _NUM_POSTURES and not self.surroundings & set(pair)
         }
 
 
