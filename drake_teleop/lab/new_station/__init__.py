@@ -106,7 +106,7 @@ def _print(plan: Plan, scenario: Path, picture: Path) -> None:
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
         ("Start", f"sensor at {round_row(plan.place.position)} m, tool down"),
-        ("Reachable around it", f"{1e3 * plan.place.half:g} mm in all directions"),
+        ("Reachable around it", f"{1e3 * plan.place.half:g} mm {plan.place.directions}"),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 from drake_teleop.common.numeric import Array
 from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
 from drake_teleop.lab.new_station.plan import Plan
+from drake_teleop.lab.new_station.random_postures import postures_at
 from drake_teleop.lab.new_station.text import wall_of
 from drake_teleop.station.slave.posture_shapes import PostureShapes
 
@@ -42,13 +43,14 @@ def start_picture(plan: Plan, title: str) -> Figure:
     points = surfaces.reshape(-1, 3)
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
-        figure = Picture(figsize=(10.0, 5.6), facecolor="white")
+        figure = Picture(figsize=(10.0, 5.0), facecolor="white")
         figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
         side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
         for k, (elevation, azimuth) in enumerate(_VIEWS):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
             collection = Poly3DCollection(surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4)
             axes.add_collection3d(collection)
+            _draw_chain(axes, plan)
             _draw_plane(axes, lower, upper, plan.plane)
             _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
@@ -122,6 +124,13 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     lines = [[(a, y[0], height), (a, y[-1], height)] for a in x]
     lines += [[(x[0], b, height), (x[-1], b, height)] for b in y]
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
+
+
+def _draw_chain(axes: Any, plan: Plan) -> None:
+    """Draw a line through the joints, which shows how parts without shapes between them move."""
+    at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
+    chain = np.vstack([at_start.origins[0], at_start.p_WS])
+    axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
 
 
 def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:

@@ -24,6 +24,7 @@ from drake_teleop.lab.new_station.random_postures import (
     NUM_POSTURES,
     Postures,
     Region,
+    degrees_of_freedom,
     joint_margins,
     postures_at,
     random_postures,
@@ -49,8 +50,9 @@ TOOL_AXES = {
     "-y": RotationMatrix.MakeXRotation(np.pi / 2),
     "-z": RotationMatrix.MakeXRotation(np.pi),
 }
-_CUBE_HALVES_M = (0.3, 0.2, 0.15, 0.1, 0.075, 0.05, 0.03)  # half edges of tested cubes [m]
-_NUM_CANDIDATES, _NUM_FINALISTS = 40, 12  # numbers of solved postures, and of tested cubes
+_CUBE_HALVES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
+# Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise.
+_NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES = 40, 12, 60
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
@@ -60,6 +62,7 @@ _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
 _SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
 # Vertical extent of the space above and below the tool's lowest point that wall and motion need.
 _WALL_ABOVE_M, _WALL_BELOW_M = 0.015, 0.16
+_MAX_WALL_SHARE = 0.6  # largest edge of a wall, over the reach
 # Cost of overlaps and of shapes below the base plane [1/m], and of each smaller wall.
 _COST_PER_M, _COST_OF_SMALLER_WALL = 30.0, 0.1
 
@@ -75,6 +78,7 @@ class Place(NamedTuple):
         room: smallest distance of a joint to its limit, over half the joint's range.
         score: merit of the posture, see `scores`, without the cost of overlaps.
         wall: edge of the wall that the arm does not touch [m].
+        vertical: True if the arm can only move up and down by `half`.
     """
 
     pose: Array
@@ -84,6 +88,12 @@ class Place(NamedTuple):
     room: float
     score: float = 0.0
     wall: float = WALL_EDGES_M[0]
+    vertical: bool = False
+
+    @property
+    def directions(self) -> str:
+        """Directions of the reachable displacements, as a text."""
+        return "up and down" if self.vertical else "in all directions"
 
     @property
     def position(self) -> Array:
@@ -143,14 +153,18 @@ def find_place(
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
     postures, region = suitable(random_postures(pointed, seed), plane, length)
-    found = [_examined(shapes, place, region) for place in _candidates(pointed, postures, region)]
-    found.sort(key=lambda place: place.score, reverse=True)
+    is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = [
-        _with_cube(pointed, place)
-        for place in found[:_NUM_FINALISTS]
-        if place.score > found[0].score - _SCORE_TOLERANCE
+        _examined(shapes, place, region)
+        for place in _candidates(pointed, postures, region, is_free)
     ]
-    best = max(found, key=_merit, default=None)
+    found.sort(key=lambda place: place.score, reverse=True)
+    good = [place for place in found if place.score > found[0].score - _SCORE_TOLERANCE]
+    best = None
+    for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
+        if best is None or best.half == 0.0:
+            cubes = [_with_cube(pointed, place, is_free, vertical) for place in places[:_NUM_CUBES]]
+            best = max(cubes, key=_merit, default=None)
     if best is None or best.half == 0.0:
         raise DrakeTeleopError(
             f"no posture found in which {axis}_S points down and the arm can move in all directions"
@@ -170,10 +184,14 @@ def _removals(region: Region, left: int) -> str:
     return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
 
 
-def _candidates(arm: ArmModel, postures: Postures, region: Region) -> Iterator[Place]:
-    """Yield starts near the best postures: the tool is exactly down if the arm has six joints."""
+def _candidates(
+    arm: ArmModel, postures: Postures, region: Region, is_free: bool
+) -> Iterator[Place]:
+    """Yield starts near the best postures, with the tool exactly down if the arm can move freely."""
+    if not len(postures.q):
+        return
     order = np.argsort(scores(arm, postures, region))[::-1][:_NUM_CANDIDATES]
-    if arm.num_joints < 6:  # position and orientation are coupled
+    if not is_free:  # position and orientation are coupled
         solved = [(q, _pose(arm, q), False) for q in postures.q[order]]
     else:
         solved = [
@@ -224,10 +242,11 @@ def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Pla
                 depths[wall.pop()] -= distance
         else:
             cost -= distance
-    rank = next((k for k, depth in enumerate(depths.values()) if depth == 0.0), len(walls))
-    if rank == len(walls):
-        cost, rank = cost + list(depths.values())[-1], rank - 1
-    score = place.score - _COST_PER_M * cost - _COST_OF_SMALLER_WALL * rank
+    large = sum(edge > _MAX_WALL_SHARE * region.reach for edge in WALL_EDGES_M[:-1])
+    free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
+    rank = next(free, len(walls) - 1)
+    cost += list(depths.values())[rank]
+    score = place.score - _COST_PER_M * cost - _COST_OF_SMALLER_WALL * (rank - large)
     return place._replace(score=score, wall=WALL_EDGES_M[rank])
 
 
@@ -267,16 +286,26 @@ def _merit(place: Place) -> tuple[float, float, bool, float]:
     return enough_room, enough_space, place.by_position, place.half
 
 
-def _with_cube(arm: ArmModel, place: Place) -> Place:
-    """Return the place with the half edge of its largest reachable cube, or 0."""
-    moves = _reaches if arm.num_joints < 6 else _meets
+def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
+    """Return the place with the half edge of its largest reachable cube, or 0.
+
+    Args:
+        is_free: False for an arm with less than six degrees of freedom, whose cube is a guess.
+        vertical: True examines displacements up and down only.
+    """
+    moves = _meets if is_free else _reaches
     signs = np.array(list(product((-1.0, 1.0), repeat=3)))
-    if arm.num_joints < 6:
+    if vertical or not is_free:
         signs = np.vstack([np.eye(3), -np.eye(3)])
+    if vertical:
+        signs = signs[[2, 5]]
+    largest = 0.0
     for half in _CUBE_HALVES_M:
-        if all(moves(arm, place, half * each) for each in signs):
-            return place._replace(half=half)
-    return place._replace(room=0.0)
+        if not all(moves(arm, place, half * each) for each in signs):
+            break
+        largest = half
+    room = place.room if largest else 0.0
+    return place._replace(half=largest, room=room, vertical=vertical)
 
 
 def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:

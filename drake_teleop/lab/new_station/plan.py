@@ -101,12 +101,12 @@ def plan_station(
         package_paths=[str(path) for path in package_paths],
         tool=stand_in if tool is None else Tool(model=str(tool)),
     )
-    shapes = PostureShapes(slave, TrialWalls())
+    shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     load = shapes.arm.phi_load[:4] - (_STAND_IN_LOAD if tool is None else 0.0)
     axis, own_tool = _tool_axis(shapes, load), False
     if tool is None and _reaches_beyond_link(shapes, axis) and load[0] > _MIN_MASS_KG:
         slave.tool, own_tool = None, True
-        shapes = PostureShapes(slave, TrialWalls())
+        shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
     place, axis, shapes = _find_start(slave, shapes, plane, axis)
     model, stand_in = shapes.arm, None if own_tool or tool is not None else slave.tool
@@ -158,7 +158,7 @@ def _find_start(
             tool = _stand_in(axis, _rod_length(shapes, axis))
             if tool != slave.tool:
                 slave.tool = tool
-                shapes = PostureShapes(slave, TrialWalls())
+                shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
             return find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes
         except DrakeTeleopError as error:

@@ -23,6 +23,7 @@ _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for 
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
 _SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 1.6
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
+_ROUNDING = 1e-9  # singular values that are 0, over the largest
 _NEUTRAL_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
 #: Sufficient values: margin to limits, smallest singular value over L, elbow up.
 _GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
@@ -162,7 +163,7 @@ def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     """
     margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
     L = orientation_length(arm)
-    sigma = np.minimum(singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
+    sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
     elbow = np.minimum(elbow_up(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
     low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - postures.origins[:, 1:, 2], 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
@@ -179,13 +180,26 @@ def joint_margins(arm: ArmModel, q: Array) -> Array:
     return margins
 
 
-def singular_values(arm: ArmModel, postures: Postures) -> Array:
-    """Return the smallest singular value (k,) of the Jacobian, rotations times L [m]."""
+def _singular_values(arm: ArmModel, postures: Postures) -> Array:
+    """Return the singular values (k, min(n, 6)) of the Jacobian, rotations times L [m]."""
     slides = (arm.table[:-1, SLIDES] != 0.0)[:, None]
     arms = postures.p_WS[:, None] - postures.origins
     linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
     angular = np.where(slides, 0.0, orientation_length(arm) * postures.axes)
-    smallest: Array = np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)[:, -1]
+    values: Array = np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)
+    return values
+
+
+def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
+    """Return in how many directions the sensor can move, which may be fewer than the joints."""
+    few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
+    values = _singular_values(arm, few)
+    return int((values > _ROUNDING * values[:, :1]).sum(axis=1).max())
+
+
+def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
+    """Return the smallest singular value (k,) of the Jacobian among its degrees of freedom [m]."""
+    smallest: Array = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
     return smallest
 
 

@@ -67,6 +67,9 @@ class Near(NamedTuple):
 class PostureShapes:
     """Plant with the shapes of a slave and its surroundings, for questions about postures.
 
+    Args:
+        sticks: True gives an arm without shapes sticks between its joints.
+
     Attributes:
         arm: the arm with its load.
         assumptions: texts about data missing in the models.
@@ -74,7 +77,9 @@ class PostureShapes:
         surroundings: indices of the bodies of the environment.
     """
 
-    def __init__(self, slave: Slave, environment: Environment | None = None) -> None:
+    def __init__(
+        self, slave: Slave, environment: Environment | None = None, *, sticks: bool = False
+    ) -> None:
         builder = DiagramBuilder()
         self.plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
         self._parsed = ParseSlave(self.plant, slave)
@@ -83,14 +88,14 @@ class PostureShapes:
             AddEnvironment(self.plant, environment)
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
         _make_solid(self.plant, self._scene_graph)
-        if not any(map(self.shapes_of, map(BodyIndex, range(1, of_slave)))):
+        beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
+        self.tool_bodies = {body.index() for body in beyond}
+        if sticks and not any(map(self.shapes_of, self.moving() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
             _make_solid(self.plant, self._scene_graph)
         finalize(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
-        beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
-        self.tool_bodies = {body.index() for body in beyond}
         self._exclude_joined()
         self._diagram = builder.Build()
         self._root = self._diagram.CreateDefaultContext()
