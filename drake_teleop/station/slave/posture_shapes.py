@@ -87,12 +87,11 @@ class PostureShapes:
         if environment is not None:
             AddEnvironment(self.plant, environment)
         self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
-        _make_solid(self.plant, self._scene_graph)
         beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
         self.tool_bodies = {body.index() for body in beyond}
-        if sticks and not any(map(self.shapes_of, self.moving() - self.tool_bodies)):
+        if sticks and not any(map(self._has_shapes, self.moving() - self.tool_bodies)):
             AddSkeleton(self.plant, self._parsed.sensor_frame)
-            _make_solid(self.plant, self._scene_graph)
+        _make_solid(self.plant, self._scene_graph)
         finalize(self.plant)
         self.arm, assumed = self._parsed.arm()
         self.assumptions = [*self._parsed.assumptions, *assumed]
@@ -109,7 +108,9 @@ class PostureShapes:
 
     def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
         """Return the collision shapes of a body."""
-        return self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
+        inspector = self._scene_graph.model_inspector()
+        shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
+        return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
 
     def move_to(self, q: Array) -> None:
         """Move the arm to joint positions q (n,) [rad, m]."""
@@ -161,6 +162,12 @@ class PostureShapes:
         """Return the indices of the slave's moving bodies."""
         every = set(map(BodyIndex, range(self.plant.num_bodies())))
         return every - self.surroundings - self.anchored()
+
+    def _has_shapes(self, index: BodyIndex) -> bool:
+        body, plant = self.plant.get_body(index), self.plant
+        return bool(
+            plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
+        )
 
     def _distances(self, within: float) -> dict[tuple[BodyIndex, BodyIndex], float]:
         scene = self._scene_graph.GetMyContextFromRoot(self._root)
@@ -249,18 +256,25 @@ def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
 
 
 def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Add visual shapes as collision shapes where a body has none; drop unlimited shapes."""
+    """Add visual shapes as collision shapes where a body has none; drop unlimited shapes.
+
+    Drake's distance query may hang for capsules that overlap: polyhedra replace curved shapes.
+    """
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
-        if not plant.GetCollisionGeometriesForBody(body):
-            for k, visual in enumerate(plant.GetVisualGeometriesForBody(body)):
-                here, shape = inspector.GetPoseInFrame(visual), inspector.GetShape(visual)
-                name = f"{inspector.GetName(visual)}_solid_{k}"
+        solids = plant.GetCollisionGeometriesForBody(body)
+        for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
+            shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
+            is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
+            is_limited = box is not None and max(box.half_width()) < _MAX_SIZE_M
+            if solids and (is_curved or not is_limited):
+                scene_graph.RemoveRole(source, geometry, Role.kProximity)
+            if is_limited and (is_curved or not solids):
+                here, name = inspector.GetPoseInFrame(geometry), f"{body.name()}_solid_{k}"
+                if is_curved:
+                    points = (here.inverse() @ surface_points(inspector, geometry).T)
+                    shape = Convex(points, name)
                 plant.RegisterCollisionGeometry(body, here, shape, name, ProximityProperties())
-        for solid in plant.GetCollisionGeometriesForBody(body):
-            box = inspector.GetObbInGeometryFrame(solid)
-            if box is None or not max(box.half_width()) < _MAX_SIZE_M:
-                scene_graph.RemoveRole(source, solid, Role.kProximity)
 
 
 def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
