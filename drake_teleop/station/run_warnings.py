@@ -82,7 +82,10 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_hand(result),
     )
     overlaps = start_overlaps(scenario.slave, scenario.surroundings)
-    return [*overlaps, *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans)]
+    return [
+        *overlaps,
+        *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans),
+    ]
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:

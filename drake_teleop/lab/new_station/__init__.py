@@ -21,6 +21,9 @@ from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.presets import PRESETS
 
+# Typical duration of the first run with identification on two cores [min].
+_MINUTES, _MINUTES_PER_JOINT = 0.5, 0.25
+
 
 def new_command(
     folder: Path,
@@ -113,5 +116,12 @@ def _print(plan: Plan, scenario: Path, picture: Path) -> None:
     console = Console()
     console.print(table)
     notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
-    for line in [*notes, *(f"assumed: {assumed}" for assumed in plan.assumptions)]:
-        console.print(line, highlight=False, markup=False)
+    notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
+    notes += [f"warning: {overlap}" for overlap in plan.overlaps]
+    minutes = _MINUTES + _MINUTES_PER_JOINT * len(plan.joints)
+    for line in (
+        *notes,
+        f"picture of the start: {picture}",
+        f"the first run takes about {minutes:.0f} minutes",
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -26,11 +26,13 @@ _CELLS = 8  # divisions of the wall in the picture
 _TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
 # Directions (k, 3) whose extreme points represent a shape with more points.
 _TURNS = np.arange(0.5, 250.0)
-_DIRECTIONS = np.column_stack([
-    np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-    np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
-    1.0 - _TURNS / 125.0,
-])
+_DIRECTIONS = np.column_stack(
+    [
+        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+        1.0 - _TURNS / 125.0,
+    ]
+)
 
 
 def start_picture(plan: Plan, title: str) -> Figure:
@@ -48,7 +50,9 @@ def start_picture(plan: Plan, title: str) -> Figure:
         side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
         for k, (elevation, azimuth) in enumerate(_VIEWS):
             axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
-            collection = Poly3DCollection(surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4)
+            collection = Poly3DCollection(
+                surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4
+            )
             axes.add_collection3d(collection)
             _draw_chain(axes, plan)
             _draw_plane(axes, lower, upper, plan.plane)

@@ -111,9 +111,7 @@ def random_postures(arm: ArmModel, seed: int) -> Postures:
     return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
 
 
-def suitable(
-    postures: Postures, plane: float, tool_length: float
-) -> tuple[Postures, Region]:
+def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Postures, Region]:
     """Return the postures that suit a start, and the region on the side with most of them."""
     first = postures.origins[:, 0].mean(axis=0)
     from_first = postures.p_WS - first

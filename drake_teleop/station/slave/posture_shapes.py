@@ -16,9 +16,9 @@ import numpy as np
 from pydrake.geometry import (
     Capsule,
     CollisionFilterDeclaration,
+    Convex,
     Cylinder,
     Ellipsoid,
-    Convex,
     GeometryId,
     GeometrySet,
     HalfSpace,
@@ -143,7 +143,9 @@ class PostureShapes:
 
     def points(self, bodies: Collection[BodyIndex]) -> Array:
         """Return points (k, 3) on the shapes of bodies, in W [m]."""
-        return np.vstack([np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))])
+        return np.vstack(
+            [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
+        )
 
     def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
         """Return points (k, 3) on the hull of each shape of a body, in W [m]; or of each visual."""
@@ -199,7 +201,9 @@ class PostureShapes:
 
     def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
         random, counts = np.random.default_rng(0), dict[tuple[BodyIndex, BodyIndex], int]()
-        for posture in random.uniform(*sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))):
+        for posture in random.uniform(
+            *sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))
+        ):
             self.move_to(posture)
             for pair in self._distances(0.0):
                 counts[pair] = counts.get(pair, 0) + 1
@@ -272,7 +276,7 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
             if is_limited and (is_curved or not solids):
                 here, name = inspector.GetPoseInFrame(geometry), f"{body.name()}_solid_{k}"
                 if is_curved:
-                    points = (here.inverse() @ surface_points(inspector, geometry).T)
+                    points = here.inverse() @ surface_points(inspector, geometry).T
                     shape = Convex(points, name)
                 plant.RegisterCollisionGeometry(body, here, shape, name, ProximityProperties())
 
