@@ -23,17 +23,16 @@ from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.posture_shapes import PostureShapes, start_overlaps
 from drake_teleop.station.slave.slave_config import Slave
 
+pytestmark = pytest.mark.slow
 _HALF = 0.5 * np.pi
 
 
-def write_arm(path, *, base="0 0 0 0 0 0", ranges=(), floor=True, boxes=True, last="1 0 0"):
+def write_arm(path, *, base="0 0 0 0 0 0", ranges=()):
     """Write an arm with six joints; its shapes are boxes.
 
     Args:
         base: pose of the arm in the world.
         ranges: limits (lower, upper) of the joints by number [rad], where not +-pi.
-        floor: add a plate below the base.
-        boxes: add shapes to the links.
     """
     limits = {k: (-np.pi, np.pi) for k in range(1, 7)} | dict(ranges)
     # Axis, origin of each joint, and length of its link along z.
@@ -46,10 +45,10 @@ def write_arm(path, *, base="0 0 0 0 0 0", ranges=(), floor=True, boxes=True, la
         ("0 0 1", "0 0 0.08", 0.04),
     ]
     x, y, z, roll, pitch, yaw = base.split()
-    links = [_link("base", 0.1, boxes, "0.3 0.3 0.02" if floor else "")]
+    links = [_link("base", 0.1, "0.3 0.3 0.02")]
     joints = [_joint("anchor", "fixed", "world", "base", f"{x} {y} {z}", f"{roll} {pitch} {yaw}")]
     for k, (axis, origin, length) in enumerate(chain, 1):
-        links.append(_link(f"link{k}", length, boxes))
+        links.append(_link(f"link{k}", length))
         parent = f"link{k - 1}" if k > 1 else "base"
         lower, upper = limits[k]
         motion = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}" velocity="3"'
@@ -66,10 +65,10 @@ def write_arm(path, *, base="0 0 0 0 0 0", ranges=(), floor=True, boxes=True, la
     return path
 
 
-def _link(name, length, boxes, plate=""):
+def _link(name, length, plate=""):
     mass = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
     inertial = f'<inertial><origin xyz="0 0 {length / 2}"/>{mass}</inertial>'
-    boxed = [(f"0.06 0.06 {length - 0.05 if length > 0.08 else 0.03}", length / 2)] if boxes else []
+    boxed = [(f"0.06 0.06 {length - 0.05 if length > 0.08 else 0.03}", length / 2)]
     boxed += [(plate, 0.01)] if plate else []
     shapes = "".join(
         f'<collision><origin xyz="0 0 {z}"/><geometry><box size="{size}"/></geometry></collision>'
@@ -82,6 +81,13 @@ def _joint(name, kind, parent, child, xyz, rpy="0 0 0", more=""):
     origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
     links = f'<parent link="{parent}"/><child link="{child}"/>'
     return f'<joint name="{name}" type="{kind}">{links}{origin}{more}</joint>'
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """Return file and plan of an arm with boxes."""
+    path = write_arm(tmp_path_factory.mktemp("plain") / "arm.urdf")
+    return path, plan_station(path, "ft")
 
 
 def elbow_of(plan):
@@ -107,7 +113,8 @@ def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
 
 
 def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
-    path = write_arm(tmp_path / "arm.urdf", ranges={1: (-1.9, -1.2)})
+    facing = {1: (-1.9, -1.2), 2: (0.0, 1.5), 3: (0.0, 2.6), 5: (0.0, 2.6)}
+    path = write_arm(tmp_path / "arm.urdf", ranges=facing)
     x, y, _ = plan_station(path, "ft").place.position
     assert y < -0.2 and abs(x) < -y
 
@@ -121,9 +128,8 @@ def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
     assert np.hypot(*(plan.place.position[:2] - [0.4, -0.5])) > 0.25
 
 
-def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(tmp_path):
-    path = write_arm(tmp_path / "arm.urdf")
-    plan = plan_station(path, "ft")
+def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
+    path, plan = plain
     slave = slave_of(plan, path)
     assert start_overlaps(slave, wall_of(plan)) == ()
     elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
@@ -134,8 +140,8 @@ def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(tmp_pat
     assert said.endswith("move the object in environment, or give another start in slave.home")
 
 
-def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(tmp_path):
-    arm = plan_station(write_arm(tmp_path / "arm.urdf", boxes=False, floor=False), "ft").shapes.arm
+def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain):
+    arm = plain[1].shapes.arm
     endless = replace(
         arm,
         lower=np.array([-np.inf, *arm.lower[1:5], -np.inf]),
@@ -149,8 +155,8 @@ def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(tmp_p
     assert found.half > 0.0 and np.isfinite(found.q).all()
 
 
-def test_reason_of_a_failure_counts_the_postures_of_each_condition(tmp_path):
-    arm = plan_station(write_arm(tmp_path / "arm.urdf", boxes=False), "ft").shapes.arm
+def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
+    arm = plain[1].shapes.arm
     tilted = replace(arm, lower=arm.lower * 0.0 - 0.2, upper=arm.upper * 0.0 + 0.2)
     with pytest.raises(DrakeTeleopError, match=r"in 20000 z_S is more than 40 degrees from down"):
         find_place(tilted)
@@ -158,8 +164,8 @@ def test_reason_of_a_failure_counts_the_postures_of_each_condition(tmp_path):
         find_place(arm, plane=5.0)
 
 
-def test_frames_and_degrees_of_freedom_follow_the_joints(tmp_path):
-    arm = plan_station(write_arm(tmp_path / "arm.urdf", boxes=False), "ft").shapes.arm
+def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
+    arm = plain[1].shapes.arm
     at_random = random_postures(arm, 3)
     for k in (0, 17, 4000):
         pose = np.empty(7)
@@ -178,14 +184,12 @@ def test_frames_and_degrees_of_freedom_follow_the_joints(tmp_path):
     assert degrees_of_freedom(short, random_postures(short, 0)) == 4
 
 
-def test_bodies_that_overlap_by_design_are_not_reported(tmp_path):
+def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
     path = write_arm(tmp_path / "arm.urdf")
     # The hull of the forearm encloses the wrist, two joints further, in all postures.
     text = path.read_text().replace('<box size="0.06 0.06 0.3"/>', '<box size="0.3 0.3 0.9"/>', 1)
     path.write_text(text)
-    shapes = PostureShapes(
-        Slave(model=str(path), sensor_frame="ft", tool=plan_station(path, "ft").tool)
-    )
+    shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool))
     shapes.move_to(np.full(6, 0.3))
     assert not any(
         {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.near()

@@ -67,7 +67,7 @@ _MAX_LISTED_TIMES = 3
 
 
 def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) -> list[str]:
-    """Return one sentence, with times or depth, for each condition of the module's table that occurred.
+    """Return one sentence, with times, for each condition of the module's table that occurred.
 
     Args:
         result: result of a run; checks whose signals were not recorded are skipped.

@@ -21,9 +21,6 @@ from drake_teleop.station.master.data_sheets import FIGURES, LEADER, PHANTOM
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.sensor.presets import PRESETS
 
-# Typical duration of the first run with identification on two cores [min].
-_MINUTES, _MINUTES_PER_JOINT = 0.5, 0.25
-
 
 def new_command(
     folder: Path,
@@ -109,7 +106,7 @@ def _print(plan: Plan, scenario: Path, picture: Path) -> None:
         ("Joints", f"{len(plan.joints)}: {', '.join(plan.joints)}"),
         ("Tool", f"{plan.tool_mass:.4g} kg, {tool}"),
         ("Start", f"sensor at {round_row(plan.place.position)} m, tool down"),
-        ("Reachable around it", f"{1e3 * plan.place.half:g} mm {plan.place.directions}"),
+        ("Reachable around it", plan.place.reachable),
         ("Scales", f"motion {plan.translation_scale:g}, force {plan.force_scale:g}"),
     ):
         table.add_row(name, value)
@@ -118,10 +115,9 @@ def _print(plan: Plan, scenario: Path, picture: Path) -> None:
     notes = [f"note: {plan.axis_note}"] if plan.axis_note else []
     notes += [f"assumed: {assumed}" for assumed in plan.assumptions]
     notes += [f"warning: {overlap}" for overlap in plan.overlaps]
-    minutes = _MINUTES + _MINUTES_PER_JOINT * len(plan.joints)
     for line in (
         *notes,
         f"picture of the start: {picture}",
-        f"the first run takes about {minutes:.0f} minutes",
+        "the first run takes about a minute on an idle computer",
     ):
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -91,9 +91,10 @@ class Place(NamedTuple):
     vertical: bool = False
 
     @property
-    def directions(self) -> str:
-        """Directions of the reachable displacements, as a text."""
-        return "up and down" if self.vertical else "in all directions"
+    def reachable(self) -> str:
+        """Reachable displacements from the start, as a text."""
+        directions = "up and down" if self.vertical else "in all directions"
+        return f"{1e3 * self.half:g} mm {directions}"
 
     @property
     def position(self) -> Array:
@@ -187,7 +188,7 @@ def _removals(region: Region, left: int) -> str:
 def _candidates(
     arm: ArmModel, postures: Postures, region: Region, is_free: bool
 ) -> Iterator[Place]:
-    """Yield starts near the best postures, with the tool exactly down if the arm can move freely."""
+    """Yield starts near the best postures; `is_free`: with the tool exactly down."""
     if not len(postures.q):
         return
     order = np.argsort(scores(arm, postures, region))[::-1][:_NUM_CANDIDATES]

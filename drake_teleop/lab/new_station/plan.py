@@ -39,6 +39,7 @@ _STAND_IN_MASSES_KG, _MAX_TORQUE_USE = (1.0, 0.5, 0.2, 0.1, 0.05), 0.8
 _MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
 _COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
 _STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
+_GOOD_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
 _MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
 # Contact force [N] that the device displays in addition to 1.5 times the weight.
 _CONTACT_FORCE_N = 30.0
@@ -149,21 +150,28 @@ def _find_start(
     slave: Slave, shapes: PostureShapes, plane: float, natural: str
 ) -> tuple[Place, str, PostureShapes]:
     """Return the start, the tool's axis of S, and the shapes; set a stand-in along that axis."""
-    first: DrakeTeleopError | None = None
+    found: list[tuple[Place, str, PostureShapes]] = []
+    errors: list[DrakeTeleopError] = []
     is_stand_in = slave.tool is not None and not slave.tool.model
     for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
         if axis == OPPOSITE[natural] and axis != "z":
             continue
         if is_stand_in:
-            tool = _stand_in(axis, _rod_length(shapes, axis))
-            if tool != slave.tool:
-                slave.tool = tool
+            slave.tool = _stand_in(axis, _rod_length(shapes, axis))
+            if axis != "z" or slave.tool.shapes[0].position[2] != _LENGTH_M:
                 shapes = PostureShapes(slave, TrialWalls(), sticks=True)
         try:
-            return find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes
+            found.append((find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes))
         except DrakeTeleopError as error:
-            first = first or error
-    raise first or AssertionError
+            errors.append(error)
+        if found and found[-1][0].score > _GOOD_SCORE:
+            break
+    if not found:
+        raise errors[0]
+    best = max(found, key=lambda each: each[0].score)
+    if is_stand_in:
+        slave.tool = _stand_in(best[1], _rod_length(best[2], best[1]))
+    return best
 
 
 def _tool_axis(shapes: PostureShapes, load: Array) -> str:

@@ -33,7 +33,7 @@ def scenario_text(
         "slave.position": "of the sensor at the start, tool down [m]",
         "slave.home": "joints at the start, tool down [rad, m]",
         "slave.tip": "contact point, p_STip [m]",
-        "kinematic_scaling": f"the arm can move {1e3 * plan.place.half:g} mm {plan.place.directions}",
+        "kinematic_scaling": f"the arm can move {plan.place.reachable}",
         "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
         "operator.intent": "of the hand: up and down, then down onto the wall",
         "rates": "of the device",

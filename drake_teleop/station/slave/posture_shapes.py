@@ -265,20 +265,22 @@ def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     Drake's distance query may hang for capsules that overlap: polyhedra replace curved shapes.
     """
     inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    added = []  # afterwards, because Drake's lists move when shapes are added
     for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
         solids = plant.GetCollisionGeometriesForBody(body)
         for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
             shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
             is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
             is_limited = box is not None and max(box.half_width()) < _MAX_SIZE_M
+            here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
+            if is_curved:
+                shape = Convex(here.inverse() @ surface_points(inspector, geometry).T, name)
+            if is_limited and (is_curved or not solids):
+                added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
             if solids and (is_curved or not is_limited):
                 scene_graph.RemoveRole(source, geometry, Role.kProximity)
-            if is_limited and (is_curved or not solids):
-                here, name = inspector.GetPoseInFrame(geometry), f"{body.name()}_solid_{k}"
-                if is_curved:
-                    points = here.inverse() @ surface_points(inspector, geometry).T
-                    shape = Convex(points, name)
-                plant.RegisterCollisionGeometry(body, here, shape, name, ProximityProperties())
+    for each in added:
+        plant.RegisterCollisionGeometry(*each, ProximityProperties())
 
 
 def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
