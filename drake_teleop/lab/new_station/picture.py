@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
+    Line3DCollection,
+    Poly3DCollection,
+)
 from scipy.spatial import ConvexHull, QhullError
 
 from drake_teleop.common.numeric import Array
@@ -110,8 +113,9 @@ def _box_triangles(top: Array, size: Array) -> Array:
     cells = np.array(list(product(range(_CELLS), range(_CELLS), range(2)))) / [_CELLS, _CELLS, 2]
     pieces = [_hull_triangles(cell + corners / [_CELLS, _CELLS, 2]) for cell in cells]
     unit = np.concatenate(pieces)
-    outside = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
-    return top + size * (unit[outside.any(axis=1)] - [0.5, 0.5, 1.0])
+    is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
+    triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
+    return triangles
 
 
 def _shade(triangles: Array, colour: tuple[float, float, float]) -> Array:

@@ -110,10 +110,10 @@ def plan_station(
         shapes = PostureShapes(slave, TrialWalls(), sticks=True)
     plane = base_plane(shapes)
     place, axis, shapes = _find_start(slave, shapes, plane, axis)
-    model, stand_in = shapes.arm, None if own_tool or tool is not None else slave.tool
-    if stand_in is not None:
-        stand_in.mass = _mass_to_hold(model, place.q)
-    mass = float(model.phi_load[0]) if stand_in is None else stand_in.mass
+    model, on_sensor = shapes.arm, None if tool is not None else slave.tool
+    if on_sensor is not None:
+        on_sensor.mass = _mass_to_hold(model, place.q)
+    mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
     figures = FIGURES.get(device)
     room = _PHANTOM_HALF_M if figures is None else min(figures.size) / 2.0
     peak = FORCE_LIMIT if figures is None else figures.peak_force
@@ -129,7 +129,7 @@ def plan_station(
     swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
     return Plan(
         joints=tuple(model.joint_names),
-        tool=stand_in,
+        tool=on_sensor,
         tool_mass=mass,
         own_tool=own_tool,
         place=place,

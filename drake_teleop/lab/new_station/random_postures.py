@@ -118,7 +118,7 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
     reach = float(np.quantile(radius, 0.98))
     tool_height = postures.p_WS[:, 2] - plane - tool_length
-    conditions = (
+    conditions: tuple[tuple[str, NDArray[np.bool_]], ...] = (
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
@@ -131,7 +131,7 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
             (postures.origins[:, 1:, 2] > plane + _MIN_ORIGIN_HEIGHT_M).all(axis=1),
         ),
     )
-    rows, removed = np.arange(len(radius)), []
+    rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
     for name, met in conditions:
         removed.append((name, int((~met[rows]).sum())))
         rows = rows[met[rows]]

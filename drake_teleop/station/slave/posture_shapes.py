@@ -136,9 +136,9 @@ class PostureShapes:
     def near(self, within: float = 0.0) -> list[Near]:
         """Return the pairs of bodies closer than `within` [m] that do not overlap by design."""
         return [
-            Near(*map(self.plant.get_body, pair), distance)
-            for pair, distance in self._distances(within).items()
-            if pair not in self._by_design
+            Near(self.plant.get_body(first), self.plant.get_body(second), distance)
+            for (first, second), distance in self._distances(within).items()
+            if (first, second) not in self._by_design
         ]
 
     def points(self, bodies: Collection[BodyIndex]) -> Array:
