@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,10 @@ _MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from v
 _RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.8)
 # Preferred radius, height of the tool's end above the base plane, and height above the first joint.
 _PREFERRED_RADIUS, _PREFERRED_HEIGHT, _LOWEST_PREFERRED_HEIGHT = 0.6, 0.25, -0.4
+_MAX_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
 _MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
 # Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
-_SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 1.6
+_SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 2.0
 _MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
 _ROUNDING = 1e-9  # singular values that are 0, over the largest
 _NEUTRAL_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
@@ -118,13 +120,14 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
     reach = float(np.quantile(radius, 0.98))
     tool_height = postures.p_WS[:, 2] - plane - tool_length
-    conditions: tuple[tuple[str, NDArray[np.bool_]], ...] = (
+    conditions: tuple[tuple[str, Any], ...] = (
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
             "S is too near to the first joint, too far, too low or too high",
             _within(radius / reach, _RADIUS)
             & _within(from_first[:, 2] / reach, _HEIGHT)
-            & (tool_height > _MIN_TOOL_HEIGHT_M),
+            & (tool_height > _MIN_TOOL_HEIGHT_M)
+            & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
         ),
         (
             "a joint is below the base plane",
