@@ -45,7 +45,8 @@ def start_picture(plan: Plan, title: str) -> Figure:
     faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
     triangles, colours = [*triangles, faces], [*colours, _shade(faces, _WALL_COLOUR)]
     surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
-    points = surfaces.reshape(-1, 3)
+    chain = _chain(plan)
+    points = np.vstack([surfaces.reshape(-1, 3), chain])
     lower, upper = points.min(axis=0), points.max(axis=0)
     with plot_style():
         figure = Picture(figsize=(10.0, 5.0), facecolor="white")
@@ -57,7 +58,7 @@ def start_picture(plan: Plan, title: str) -> Figure:
                 surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4
             )
             axes.add_collection3d(collection)
-            _draw_chain(axes, plan)
+            axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
             _draw_plane(axes, lower, upper, plan.plane)
             _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
             axes.view_init(elevation, side + azimuth)
@@ -134,11 +135,10 @@ def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
     axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
 
 
-def _draw_chain(axes: Any, plan: Plan) -> None:
-    """Draw a line through the joints, which shows how parts without shapes between them move."""
+def _chain(plan: Plan) -> Array:
+    """Return the joints and the sensor (n + 1, 3), which connect parts without shapes [m]."""
     at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
-    chain = np.vstack([at_start.origins[0], at_start.p_WS])
-    axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
+    return np.vstack([at_start.origins[0], at_start.p_WS])
 
 
 def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:
