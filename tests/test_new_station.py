@@ -18,7 +18,8 @@ from drake_teleop.common.files import models_dir
 from drake_teleop.lab import new_station
 from drake_teleop.lab.analysis.linearization import linearize
 from drake_teleop.lab.identification import true_load
-from drake_teleop.lab.new_station import find_place, new_command, plan_station
+from drake_teleop.lab.new_station import new_command, place, plan_station
+from drake_teleop.lab.new_station.place import Place, find_place
 from drake_teleop.station.scenario import LoadScenario
 from drake_teleop.station.slave.arm import pose_into
 from drake_teleop.station.slave.home import R_WS_HOME
@@ -49,7 +50,10 @@ def test_station_is_written_and_run(tmp_path, runs, capsys):
     scenario = LoadScenario(path)
     assert scenario.slave.path.resolve() == ARM.resolve()
     assert (scenario.master.model, scenario.wrist_sensor.preset) == ("omega_6", "ati_gamma_imu")
-    assert "6: joint_1" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "6: joint_1" in said
+    picture = tmp_path / "mine" / "start.png"
+    assert picture.read_bytes().startswith(b"\x89PNG") and picture.name in said
     plan = plan_station(ARM, "sensor", device="omega_6")
     scale = scenario.kinematic_scaling.translation_scale
     # The scaled device workspace is reachable, and the hand stays inside the device workspace.
@@ -76,13 +80,12 @@ def test_beginners_page_matches_the_written_station(tmp_path, runs, monkeypatch)
 
 def test_place_is_in_front_with_a_reachable_cube():
     arm = NominalSlave(LoadScenario("free_motion_force").slave).arm
-    place, half = find_place(arm).position, find_place(arm).half
-    assert place[0] > abs(place[1]) and place[2] > 0.1
+    found = find_place(arm)
+    assert found.position[0] > abs(found.position[1]) and found.position[2] > 0.1
     w = R_WS_HOME.ToQuaternion().wxyz()
-    q = NominalSlave(LoadScenario("free_motion_force").slave).start
     for signs in product((-1.0, 1.0), repeat=3):
-        pose = np.array([*w, *(place + half * np.array(signs))])
-        assert find_posture(arm, pose, q)[1] == IkStatus.OK
+        pose = np.array([*w, *(found.position + found.half * np.array(signs))])
+        assert find_posture(arm, pose, found.q)[1] == IkStatus.OK
     stiff = dataclasses.replace(arm, lower=arm.lower * 0.0 - 0.01, upper=arm.upper * 0.0 + 0.01)
     with pytest.raises(DrakeTeleopError, match="no posture found in which z_S points down"):
         find_place(stiff)
@@ -99,14 +102,14 @@ def test_rates_match_the_device(tmp_path, runs, device):
 
 
 def test_joint_margin_counts_more_than_cube_size():
-    place = new_station.Place(np.zeros(7), True, np.zeros(6), half=0.05, room=0.2)
+    best = Place(np.zeros(7), True, np.zeros(6), half=0.15, room=0.2)
     worse = [
-        place._replace(half=0.3, room=0.01),
-        place._replace(half=0.3, by_position=False),
-        place._replace(half=0.03, room=0.9),
-        place._replace(half=0.0, room=0.0),
+        best._replace(half=0.3, room=0.01),
+        best._replace(half=0.3, by_position=False),
+        best._replace(half=0.03, room=0.9),
+        best._replace(half=0.0, room=0.0),
     ]
-    assert max([*worse, place], key=new_station._merit) is place
+    assert max([*worse, best], key=place._merit) is best
 
 
 def turned(rpy, tmp_path):
@@ -118,19 +121,29 @@ def turned(rpy, tmp_path):
     return path
 
 
-@pytest.mark.long
-def test_note_about_another_axis_along_the_last_joint(tmp_path, runs, capsys):
-    for rpy, axis, back in (("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")):
-        plan = plan_station(turned(rpy, tmp_path), "turned")
-        assert f"{axis}_S is along" in plan.axis_note and f'rpy="{back}"' in plan.axis_note
-    new_command(tmp_path / "mine", turned("3.1416 0 0", tmp_path), "turned")
-    assert "note: z_S must point to the tool, but -z_S" in " ".join(capsys.readouterr().out.split())
-    assert plan_station(ARM, "sensor").axis_note == ""
-    behind = tmp_path / "behind.sdf"  # origin of the last joint
-    behind.write_text(
-        turned("0 0 0", tmp_path).read_text().replace("<pose>0 0 0 ", "<pose>0 0 -0.4 ")
-    )
-    assert "-z_S is along" in plan_station(behind, "turned").axis_note
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("rpy", "axis", "back"),
+    [("0 -1.5708 0", "x", "0 1.5708 0"), ("1.5708 0 0", "y", "-1.5708 0 0")],
+)
+def test_stand_in_is_along_the_last_joint(rpy, axis, back, tmp_path, runs, capsys):
+    path = turned(rpy, tmp_path)
+    new_command(tmp_path / "mine", path, "turned")
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"note: the tool points along {axis}_S" in said
+    assert f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>' in said
+    slave = LoadScenario(tmp_path / "mine" / "station.yaml").slave
+    start = NominalSlave(slave)
+    R_WS = RotationMatrix(Quaternion(start.X_WS_start[:4])).matrix()
+    along = np.eye(3)["xyz".index(axis)]
+    np.testing.assert_allclose(R_WS @ along, [0.0, 0.0, -1.0], atol=1e-3)
+    np.testing.assert_allclose(slave.tip, 0.112 * along, atol=1e-9)
+    # The advised frame gives a station with z_S down.
+    text = path.read_text()
+    frame = f'<frame name="ft" attached_to="turned"><pose>0 0 0 {back}</pose></frame>'
+    path.write_text(text.replace("</model>", f"{frame}</model>", 1))
+    plan = plan_station(path, "ft")
+    assert (plan.axis_note, plan.tip, plan.place.by_position) == ("", [], True)
 
 
 def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, runs):
@@ -154,7 +167,7 @@ def test_home_joints_are_written_if_the_position_is_not_sufficient(tmp_path, run
 
 
 def test_arm_of_five_joints_starts_with_tool_nearly_down(tmp_path, runs, monkeypatch):
-    monkeypatch.setattr(new_station, "_CUBE_HALVES_M", (2.0, *new_station._CUBE_HALVES_M))
+    monkeypatch.setattr(place, "_CUBE_HALVES_M", (*place._CUBE_HALVES_M, 2.0))
     path = tmp_path / "five.sdf"
     path.write_text(ARM.read_text().replace('"joint_4" type="revolute"', '"joint_4" type="fixed"'))
     new_command(tmp_path / "mine", path, "sensor")
@@ -190,6 +203,7 @@ def test_odd_names_are_preserved_or_refused(tmp_path, runs, monkeypatch):
     """Names of the arm's file and folder, packages, tool, sensor frame."""
     plan = plan_station(ARM, "sensor")
     monkeypatch.setattr(new_station, "plan_station", lambda *_: plan)
+    monkeypatch.setattr(new_station, "write_picture", lambda *_: None)
     equal = 0
     for k, name in enumerate(odd_names(400)):
         folder = tmp_path / str(k) / f"{name}.d".replace("/", "_")

@@ -11,6 +11,7 @@ from drake_teleop.lab.identification import slave_arm, true_load
 from drake_teleop.station.channel.channel import Channel
 from drake_teleop.station.channel.network import NetworkConfig, longest_delay
 from drake_teleop.station.contact_chatter import find_chatter
+from drake_teleop.station.environment.solids import Wall
 from drake_teleop.station.master.phantom import FORCE_LIMIT, HOME, WRIST_TORQUE_LIMIT, jacobian_into
 from drake_teleop.station.operator.operator import MinimumJerk, OperatorConfig
 from drake_teleop.station.oscillation import find_reversals, oscillates
@@ -23,6 +24,7 @@ from drake_teleop.station.sensor.presets import PRESETS
 from drake_teleop.station.signals import SIGNALS
 from drake_teleop.station.simulation import simulate
 from drake_teleop.station.slave.arm import SLIDES
+from drake_teleop.station.slave.plant import NominalSlave
 from drake_teleop.station.slave.scene import Scene
 from drake_teleop.station.station import MakeTeleopStation
 
@@ -126,6 +128,18 @@ def test_short_or_small_deviations_are_not_reported(name, change):
 
 def test_normal_run_has_no_warnings():
     assert run_warnings(recorded(), OVER_NETWORK, ARM) == []
+
+
+def test_overlap_at_the_start_is_reported_with_bodies_depth_and_remedy():
+    """A wall whose face is 20 mm above the end of the tool, or below it."""
+    tip = NominalSlave(Scenario().slave).start_tip
+    for depth, count in ((0.02, 1), (-0.02, 0)):
+        wall = Wall(position=[*tip[:2], tip[2] + depth], size=[0.05, 0.05])
+        found = run_warnings(recorded(), replace(OVER_NETWORK, environment=[wall]), ARM)
+        assert len(found) == count
+        for warning in found:
+            assert warning.startswith("tool and wall overlap by 20.0 mm at the start")
+            assert warning.endswith("environment, or give another start in slave.home")
 
 
 def test_ledger_reserve_warning_gives_the_required_energy():

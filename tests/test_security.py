@@ -90,7 +90,7 @@ WRITING = {
     # To memory, and then into the file with the wrenches that have come before.
     ("robots/table.py", ".write_csv"),
     # Under another name, until it was read back.
-    ("lab/new_station.py", ".write_text"),
+    ("lab/new_station/__init__.py", ".write_text"),
     # Figures, where --json says.
     ("live/device_client.py", ".write_text"),
     # A mark of one byte more.

@@ -1,6 +1,7 @@
-"""Warnings about a run from its recorded signals.
+"""Warnings about a run from its recorded signals, and about overlaps of shapes at its start.
 
 ============== ===================================================================================
+overlap        shapes of arm, tool or surroundings overlap at the start, see `posture_shapes`
 saturated      the wrist sensor is saturated
 fault          invalid numbers in the loop, see `drake_teleop.common.blocks`
 unreachable    the inverse kinematics have no solution
@@ -13,7 +14,7 @@ oscillation    hand, command or joint oscillates (limit cycle) while its command
 chatter        the tool loses and regains contact, see `drake_teleop.station.contact_chatter`
 ============== ===================================================================================
 
-The first five are always reported, the others if they last longer than 0.2 s (`reserve`: in total;
+The first six are always reported, the others if they last longer than 0.2 s (`reserve`: in total;
 `chatter`: 0.3 s).
 """
 
@@ -45,6 +46,7 @@ from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
 from drake_teleop.station.slave.arm import SLIDES, ArmModel
 from drake_teleop.station.slave.inverse_kinematics import IkStatus
+from drake_teleop.station.slave.posture_shapes import start_overlaps
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -85,7 +87,11 @@ def run_warnings(result: SimulationResult, scenario: Scenario, arm: ArmModel) ->
         _check_hand(result),
         _check_contact(result),
     )
-    return [f"{condition} {_times_text(spans)}" for condition, spans in found if spans]
+    overlaps = start_overlaps(scenario.slave, scenario.surroundings)
+    return [
+        *overlaps,
+        *(f"{condition} {_times_text(spans)}" for condition, spans in found if spans),
+    ]
 
 
 def find_spans(t: Array, happened: Flags, least: float = 0.0) -> Spans:

@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,25 +124,25 @@ def start_pose(slave: Slave) -> NDArray[np.float64]:
 def NominalSlave(slave: Slave) -> SlavePlant:
     """Return the slave's plant without environment, from a cache; raises as `AddSlavePlant`."""
     written = tuple(path.stat().st_mtime_ns for path in slave.files())
-    return _nominal_slave(_HashableSlave(slave), written)
+    return _nominal_slave(HashableByValue(slave), written)
 
 
-class _HashableSlave:
-    """Hashable slave, compared by all values."""
+class HashableByValue:
+    """Hashable copy of settings, compared by all values."""
 
-    def __init__(self, slave: Slave) -> None:
-        self.slave, self._values = copy.deepcopy(slave), repr(slave)
+    def __init__(self, value: Any) -> None:
+        self.value, self._values = copy.deepcopy(value), repr(value)
 
     def __hash__(self) -> int:
         return hash(self._values)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _HashableSlave) and self._values == other._values
+        return isinstance(other, HashableByValue) and self._values == other._values
 
 
 @lru_cache(maxsize=4)  # parsing takes longer than building a station
-def _nominal_slave(key: _HashableSlave, _: tuple[int, ...]) -> SlavePlant:
-    return AddSlavePlant(DiagramBuilder(), key.slave, None)
+def _nominal_slave(key: HashableByValue, _: tuple[int, ...]) -> SlavePlant:
+    return AddSlavePlant(DiagramBuilder(), key.value, None)
 
 
 def AddSlavePlant(
@@ -300,16 +301,6 @@ def _remove_shapes(
         for shape in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
             if index not in carried:
                 scene_graph.RemoveRole(plant.get_source_id(), shape, Role.kProximity)
-
-
-def lowest_point(slave: Slave) -> NDArray[np.float64]:
-    """Return the lowest point p_W (3,) [m] at the start: a corner of the load, or the tip."""
-    nominal = NominalSlave(slave)
-    X_WS = nominal.X_WS_start
-    R_WS = RotationMatrix(Quaternion(X_WS[:4] / np.linalg.norm(X_WS[:4]))).matrix()
-    corners = [X_WS[4:] + hull @ R_WS.T for hull in _hulls_on_sensor(slave)]
-    points = np.vstack([nominal.start_tip, *corners])
-    return np.array(points[np.argmin(points[:, 2])])
 
 
 def _hulls_on_sensor(slave: Slave) -> list[NDArray[np.float64]]:

@@ -5,8 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydrake.geometry import AddContactMaterial, Box, ProximityProperties, Shape, Sphere
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.geometry import (
+    AddContactMaterial,
+    Box,
+    Cylinder,
+    ProximityProperties,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody, SpatialInertia, UnitInertia, WeldJoint
 
@@ -18,6 +25,7 @@ from drake_teleop.station.slave.models import ParsedTool, ParseTool
 _STEEL_DENSITY = 7850.0  # kg/m^3
 # Contact material of the shapes, as for the ball of tool.sdf.
 _STIFFNESS, _DISSIPATION, _FRICTION = 4e5, 1.0, 0.2
+_ROD_RADIUS_M = 0.005  # rods from S to the shapes in the 3D replay
 _COLOUR = np.array([0.42, 0.44, 0.47, 1.0])
 
 
@@ -140,6 +148,11 @@ def _add_shapes(plant: MultibodyPlant, body: RigidBody, tool: Tool) -> None:
         name = f"tool_{k}"
         plant.RegisterCollisionGeometry(body, each.pose, each.shape, name, surface)
         plant.RegisterVisualGeometry(body, each.pose, each.shape, name, _COLOUR)
+        if (length := float(np.linalg.norm(each.position))) > 0.0:  # a rod from S, without contact
+            along = RotationMatrix.MakeFromOneVector(np.array(each.position), 2)
+            middle = RigidTransform(along, np.array(each.position) / 2)
+            rod = Cylinder(_ROD_RADIUS_M, length)
+            plant.RegisterVisualGeometry(body, middle, rod, f"{name}_rod", _COLOUR)
 
 
 def _inertia(tool: Tool) -> SpatialInertia:

@@ -1,0 +1,157 @@
+"""Picture of a new station at its start: arm, tool, wall and base plane, from two sides."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
+    Line3DCollection,
+    Poly3DCollection,
+)
+from scipy.spatial import ConvexHull, QhullError
+
+from drake_teleop.common.numeric import Array
+from drake_teleop.common.style import BLACK, BLUE, GREEN, GREY, VERMILION, Picture, plot_style
+from drake_teleop.lab.new_station.plan import Plan
+from drake_teleop.lab.new_station.random_postures import postures_at
+from drake_teleop.lab.new_station.text import wall_of
+from drake_teleop.station.slave.posture_shapes import PostureShapes
+
+_LINK_COLOURS = ((0.74, 0.77, 0.82), (0.52, 0.57, 0.65))
+_BASE_COLOUR, _TOOL_COLOUR, _WALL_COLOUR = (0.36, 0.38, 0.42), (0.84, 0.37, 0.0), (0.78, 0.66, 0.5)
+_WALL_THICKNESS_M = 0.1
+_LIGHT = np.array([0.35, -0.5, 0.8])
+_VIEWS = ((18.0, -60.0), (3.0, -90.0))  # elevation and azimuth, from the direction of the tool
+_CELLS = 8  # divisions of the wall in the picture
+_TRIAD_SHARE = 0.12  # length of the axes of S, over the height of the picture
+# Directions (k, 3) whose extreme points represent a shape with more points.
+_TURNS = np.arange(0.5, 250.0)
+_DIRECTIONS = np.column_stack(
+    [
+        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.cos(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+        np.sqrt(1.0 - (1.0 - _TURNS / 125.0) ** 2) * np.sin(np.pi * (1.0 + 5.0**0.5) * _TURNS),
+        1.0 - _TURNS / 125.0,
+    ]
+)
+
+
+def start_picture(plan: Plan, title: str) -> Figure:
+    """Draw the shapes at the start; meshes as convex hulls."""
+    shapes, wall = plan.shapes, wall_of(plan)
+    triangles, colours = _arm_triangles(shapes)
+    faces = _box_triangles(np.array(wall.position), np.array([*wall.size, _WALL_THICKNESS_M]))
+    triangles, colours = [*triangles, faces], [*colours, _shade(faces, _WALL_COLOUR)]
+    surfaces, face_colours = np.concatenate(triangles), np.concatenate(colours)
+    chain = _chain(plan)
+    points = np.vstack([surfaces.reshape(-1, 3), chain])
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    with plot_style():
+        figure = Picture(figsize=(10.0, 5.0), facecolor="white")
+        figure.suptitle(f"{title}: start posture", x=0.02, ha="left", fontsize=11)
+        side = np.degrees(np.arctan2(*(plan.lowest - shapes.arm.table[0, 9:12])[1::-1]))
+        for k, (elevation, azimuth) in enumerate(_VIEWS):
+            axes: Any = figure.add_subplot(1, 2, k + 1, projection="3d", proj_type="ortho")
+            collection = Poly3DCollection(
+                surfaces, facecolors=face_colours, edgecolors=face_colours, linewidths=0.4
+            )
+            axes.add_collection3d(collection)
+            axes.plot(*chain.T, color=BLACK, linewidth=0.9, marker="o", markersize=2.5, zorder=9)
+            _draw_plane(axes, lower, upper, plan.plane)
+            _draw_triad(axes, shapes, _TRIAD_SHARE * float(max(upper - lower)))
+            axes.view_init(elevation, side + azimuth)
+            _fit(axes, lower, upper, plan.plane)
+        figure.supxlabel(_caption(plan), x=0.02, ha="left", fontsize=9, color=BLACK)
+    return figure
+
+
+def _caption(plan: Plan) -> str:
+    gap = 1e3 * (plan.lowest[2] - wall_of(plan).position[2])
+    return (
+        f"tool (orange) {gap:.0f} mm above the wall; base plane at {plan.plane:.2f} m; axes of S:"
+        " x red, y green, z blue; meshes as convex hulls"
+    )
+
+
+def _arm_triangles(shapes: PostureShapes) -> tuple[list[Array], list[Array]]:
+    anchored, rank = shapes.anchored(), 0
+    triangles, colours = [], []
+    for body in sorted(shapes.moving() | anchored, key=int):
+        hulls = shapes.hulls(body, visual=True)
+        if body in shapes.tool_bodies:
+            colour = _TOOL_COLOUR
+        elif body in anchored:
+            colour = _BASE_COLOUR
+        else:
+            colour, rank = _LINK_COLOURS[rank % 2], rank + bool(hulls)
+        for points in hulls:
+            faces = _hull_triangles(points)
+            triangles.append(faces)
+            colours.append(_shade(faces, colour))
+    return triangles, colours
+
+
+def _hull_triangles(points: Array) -> Array:
+    """Return the triangles (k, 3, 3) of the convex hull of points, ordered outwards."""
+    if len(points) > len(_DIRECTIONS):
+        points = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return np.zeros((0, 3, 3))
+    triangles = hull.points[hull.simplices]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    inwards = (normals * hull.equations[:, :3]).sum(axis=1) < 0.0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return np.asarray(triangles)
+
+
+def _box_triangles(top: Array, size: Array) -> Array:
+    """Return small triangles (k, 3, 3) of a box, which sort by depth better than large ones."""
+    corners = np.array(list(product((0.0, 1.0), repeat=3)))
+    cells = np.array(list(product(range(_CELLS), range(_CELLS), range(2)))) / [_CELLS, _CELLS, 2]
+    pieces = [_hull_triangles(cell + corners / [_CELLS, _CELLS, 2]) for cell in cells]
+    unit = np.concatenate(pieces)
+    is_face = np.isclose(unit, 0.0).all(axis=1) | np.isclose(unit, 1.0).all(axis=1)
+    triangles: Array = top + size * (unit[np.any(is_face, axis=1)] - np.array([0.5, 0.5, 1.0]))
+    return triangles
+
+
+def _shade(triangles: Array, colour: tuple[float, float, float]) -> Array:
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    bright = 0.72 + 0.28 * (normals @ (_LIGHT / np.linalg.norm(_LIGHT)))
+    return np.clip(np.outer(bright, colour), 0.0, 1.0)
+
+
+def _draw_plane(axes: Any, lower: Array, upper: Array, height: float) -> None:
+    margin = 0.1 * float(max(upper - lower))
+    x = np.linspace(lower[0] - margin, upper[0] + margin, 7)
+    y = np.linspace(lower[1] - margin, upper[1] + margin, 7)
+    lines = [[(a, y[0], height), (a, y[-1], height)] for a in x]
+    lines += [[(x[0], b, height), (x[-1], b, height)] for b in y]
+    axes.add_collection3d(Line3DCollection(lines, colors=GREY, linewidths=0.4, alpha=0.6))
+
+
+def _chain(plan: Plan) -> Array:
+    """Return the joints and the sensor (n + 1, 3), which connect parts without shapes [m]."""
+    at_start = postures_at(plan.shapes.arm, plan.place.q[np.newaxis])
+    return np.vstack([at_start.origins[0], at_start.p_WS])
+
+
+def _draw_triad(axes: Any, shapes: PostureShapes, length: float) -> None:
+    X_WS = shapes.X_WS
+    start, ends = X_WS.translation(), X_WS.translation() + length * X_WS.rotation().matrix().T
+    for end, colour in zip(ends, (VERMILION, GREEN, BLUE), strict=True):
+        axes.plot(*np.array([start, end]).T, color=colour, linewidth=2.0, zorder=10)
+
+
+def _fit(axes: Any, lower: Array, upper: Array, plane: float) -> None:
+    lower = np.minimum(lower, [np.inf, np.inf, plane])
+    middle, half = (lower + upper) / 2.0, 0.5 * float(max(upper - lower))
+    for set_limits, m in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):
+        set_limits(m - half, m + half)
+    axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.15)
+    axes.set_axis_off()

@@ -1,0 +1,322 @@
+"""Start of an arm with the tool down, chosen among random postures.
+
+Postures are ranked by distance to joint limits and singularities, elbow up, and overlaps of shapes.
+Of the best, the one with the largest reachable cube is the start. The tool is along an axis of S,
+the z axis of frame A; S and A are the same for tools along z_S.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.geometry import Box, ProximityProperties
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, SpatialInertia
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.new_station.random_postures import (
+    NUM_POSTURES,
+    Postures,
+    Region,
+    degrees_of_freedom,
+    joint_margins,
+    postures_at,
+    random_postures,
+    scores,
+    suitable,
+    with_tool_axis,
+)
+from drake_teleop.station.environment.environment import Environment, LetFloat, NewInstance
+from drake_teleop.station.slave.arm import ArmModel, pose_into
+from drake_teleop.station.slave.home import R_WS_HOME, tool_down
+from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
+from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.station.slave.posture_shapes import PostureShapes
+
+#: Edges of the walls that are tried, the first preferred [m].
+WALL_EDGES_M = (0.4, 0.25, 0.15)
+#: Rotation R_SA from each axis of S to z.
+TOOL_AXES = {
+    "z": RotationMatrix(),
+    "x": RotationMatrix.MakeYRotation(np.pi / 2),
+    "-x": RotationMatrix.MakeYRotation(-np.pi / 2),
+    "y": RotationMatrix.MakeXRotation(-np.pi / 2),
+    "-y": RotationMatrix.MakeXRotation(np.pi / 2),
+    "-z": RotationMatrix.MakeXRotation(np.pi),
+}
+_CUBE_HALVES_M = (0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3)  # half edges of tested cubes [m]
+# Numbers of solved postures, of good ones with a tested cube, and of tested cubes otherwise.
+_NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES = 40, 12, 60
+_SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
+_TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
+_MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
+_SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
+_MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
+_SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
+_SAME_HEIGHT_M = 1e-4  # lowest points within this height share the contact [m]
+# Vertical extent of the space above and below the tool's lowest point that wall and motion need.
+_WALL_ABOVE_M, _WALL_BELOW_M = 0.015, 0.16
+_MAX_WALL_SHARE = 0.6  # largest edge of a wall, over the reach
+# Cost of overlaps and of shapes below the base plane [1/m], and of each smaller wall.
+_COST_PER_M, _COST_OF_SMALLER_WALL = 30.0, 0.1
+
+
+class Place(NamedTuple):
+    """Start of an arm with the tool down.
+
+    Attributes:
+        pose: (7,) start pose X_WS [qw qx qy qz px py pz] [-, m].
+        by_position: True if the position is sufficient to specify the pose in a scenario.
+        q: (n,) joint positions at the start [rad].
+        half: half edge of the reachable cube around the start [m].
+        room: smallest distance of a joint to its limit, over half the joint's range.
+        score: merit of the posture, see `scores`, without the cost of overlaps.
+        wall: edge of the wall that the arm does not touch [m].
+        vertical: True if the arm can only move up and down by `half`.
+    """
+
+    pose: Array
+    by_position: bool
+    q: Array
+    half: float
+    room: float
+    score: float = 0.0
+    wall: float = WALL_EDGES_M[0]
+    vertical: bool = False
+
+    @property
+    def reachable(self) -> str:
+        """Reachable displacements from the start, as a text."""
+        directions = "up and down" if self.vertical else "in all directions"
+        return f"{1e3 * self.half:g} mm {directions}"
+
+    @property
+    def position(self) -> Array:
+        """Position p_WS (3,) of the sensor [m]."""
+        return self.pose[4:]
+
+    @property
+    def home(self) -> list[float]:
+        """Joint positions for the field `slave.home`; empty if the position is sufficient."""
+        return [] if self.by_position else (np.round(self.q, 4) + 0.0).tolist()
+
+
+@dataclass
+class TrialWalls(Environment):
+    """Walls of each size in `WALL_EDGES_M` that can be moved below the tool."""
+
+    @property
+    def slip(self) -> float:
+        return 1e-3
+
+    def AddTo(self, plant: MultibodyPlant) -> None:
+        """Add one floating body for each wall."""
+        for edge in WALL_EDGES_M:
+            name = _wall_name(edge)
+            inertia = SpatialInertia.SolidBoxWithMass(1.0, edge, edge, edge)
+            body = plant.AddRigidBody(name, NewInstance(plant, name), inertia)
+            LetFloat(plant, body, RigidTransform([0.0, 0.0, -100.0]))
+            shape = Box(edge, edge, _WALL_ABOVE_M + _WALL_BELOW_M)
+            plant.RegisterCollisionGeometry(
+                body, RigidTransform(), shape, name, ProximityProperties()
+            )
+
+
+def _wall_name(edge: float) -> str:
+    return f"wall of {edge:g} m"
+
+
+def find_place(
+    arm: ArmModel,
+    shapes: PostureShapes | None = None,
+    *,
+    plane: float = 0.0,
+    axis: str = "z",
+    seed: int = 0,
+) -> Place:
+    """Find a start with the tool down and reachable space in all directions.
+
+    Args:
+        shapes: shapes of the arm and of `TrialWalls`; None: overlaps are not examined.
+        plane: height of the base plane, below which the arm has no joints [m].
+        axis: axis of S along the tool, one of `TOOL_AXES`.
+
+    Raises:
+        DrakeTeleopError: if no such start is found.
+    """
+    R_SA = TOOL_AXES[axis]
+    pointed = with_tool_axis(arm, R_SA.matrix())
+    length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
+    postures, region = suitable(random_postures(pointed, seed), plane, length)
+    is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
+    found = [
+        _examined(shapes, place, region)
+        for place in _candidates(pointed, postures, region, is_free)
+    ]
+    found.sort(key=lambda place: place.score, reverse=True)
+    good = [place for place in found if place.score > found[0].score - _SCORE_TOLERANCE]
+    best = None
+    for places, vertical in ((good[:_NUM_FINALISTS], False), (found, False), (found, True)):
+        if best is None or best.half == 0.0:
+            cubes = [_with_cube(pointed, place, is_free, vertical) for place in places[:_NUM_CUBES]]
+            best = max(cubes, key=_merit, default=None)
+    if best is None or best.half == 0.0:
+        raise DrakeTeleopError(
+            f"no posture found in which {axis}_S points down and the arm can move in all directions"
+            f" ({_removals(region, len(postures.q))})",
+            where="new",
+            remedy="check joint limits and the orientation of sensor_frame",
+        )
+    pose = np.empty(7)
+    pose_into(arm.table, best.q, pose)
+    if axis == "z":
+        pose = best.pose
+    return best._replace(pose=pose, by_position=best.by_position and axis == "z")
+
+
+def _removals(region: Region, left: int) -> str:
+    causes = ", ".join(f"in {count} {name}" for name, count in region.removed if count)
+    return f"of {NUM_POSTURES} random postures, {causes}; {left} are left on the best side"
+
+
+def _candidates(
+    arm: ArmModel, postures: Postures, region: Region, is_free: bool
+) -> Iterator[Place]:
+    """Yield starts near the best postures; `is_free`: with the tool exactly down."""
+    if not len(postures.q):
+        return
+    order = np.argsort(scores(arm, postures, region))[::-1][:_NUM_CANDIDATES]
+    if not is_free:  # position and orientation are coupled
+        solved = [(q, _pose(arm, q), False) for q in postures.q[order]]
+    else:
+        solved = [
+            start for k in order for start in _exact_starts(arm, postures.q[k], postures.p_WS[k])
+        ]
+    if not solved:
+        return
+    exact = postures_at(arm, np.array([q for q, _, _ in solved]))
+    merits, rooms = scores(arm, exact, region), joint_margins(arm, exact.q)
+    for (q, pose, by_position), merit, room in zip(solved, merits, rooms, strict=True):
+        yield Place(pose, by_position, q, 0.0, float(room), float(merit))
+
+
+def _pose(arm: ArmModel, q: Array) -> Array:
+    pose = np.empty(7)
+    pose_into(arm.table, q, pose)
+    return pose
+
+
+def _exact_starts(arm: ArmModel, q: Array, position: Array) -> Iterator[tuple[Array, Array, bool]]:
+    """Yield joint positions near q, the pose, and whether `slave.position` gives them."""
+    position = np.round(position, 2)
+    for yaw_deg in _TOOL_YAWS_DEG:
+        R_WA = RotationMatrix.MakeZRotation(np.radians(yaw_deg)) @ R_WS_HOME
+        pose = np.array([*R_WA.ToQuaternion().wxyz(), *position])
+        if yaw_deg == 0.0 or has_closed_form(arm):
+            usual, status = tool_down(arm, position, R_WA)
+            if status == IkStatus.OK:
+                yield usual, pose, yaw_deg == 0.0
+        if not has_closed_form(arm):
+            found, status = find_posture(arm, pose, q)
+            if status == IkStatus.OK:
+                yield found, pose, False
+
+
+def _examined(shapes: PostureShapes | None, place: Place, region: Region) -> Place:
+    """Return the place with the largest free wall; its score is reduced by the cost of overlaps."""
+    if shapes is None:
+        return place
+    shapes.move_to(place.q)
+    walls = _move_walls(shapes)
+    depths = dict.fromkeys(walls, 0.0)
+    cost = max(region.plane - shapes.points(shapes.moving())[:, 2].min(initial=np.inf), 0.0)
+    for first, second, distance in shapes.near():
+        pair = {first.index(), second.index()}
+        if wall := pair & walls.keys():
+            if not pair & shapes.tool_bodies:
+                depths[wall.pop()] -= distance
+        else:
+            cost -= distance
+    large = sum(edge > _MAX_WALL_SHARE * region.reach for edge in WALL_EDGES_M[:-1])
+    free = (k for k, depth in enumerate(depths.values()) if k >= large and depth == 0.0)
+    rank = next(free, len(walls) - 1)
+    cost += list(depths.values())[rank]
+    score = place.score - _COST_PER_M * cost - _COST_OF_SMALLER_WALL * (rank - large)
+    return place._replace(score=score, wall=WALL_EDGES_M[rank])
+
+
+def _move_walls(shapes: PostureShapes) -> dict[BodyIndex, float]:
+    """Move the walls below the tool, into the space of wall and motion; return their edges."""
+    plant, walls = shapes.plant, {}
+    x, y, z = lowest_point(shapes)
+    middle = RigidTransform([x, y, z + (_WALL_ABOVE_M - _WALL_BELOW_M) / 2.0])
+    for edge in WALL_EDGES_M:
+        body = plant.GetBodyByName(_wall_name(edge))
+        plant.SetFreeBodyPose(shapes.context, body, middle)
+        walls[body.index()] = edge
+    return walls
+
+
+def lowest_point(shapes: PostureShapes) -> Array:
+    """Return the tool's lowest point p_W (3,) [m]; without shapes its centre of mass."""
+    points = shapes.points(shapes.tool_bodies)
+    if not len(points):
+        phi = shapes.arm.phi_load
+        points = (shapes.X_WS @ (phi[1:4] / phi[0]))[np.newaxis]
+    lowest = points[points[:, 2] < points[:, 2].min() + _SAME_HEIGHT_M]
+    return np.array([*lowest[:, :2].mean(axis=0), lowest[:, 2].min()])
+
+
+def extent(shapes: PostureShapes, bodies: Collection[BodyIndex], axis: str) -> float:
+    """Return how far bodies reach beyond S along an axis of S, at least 0 [m]."""
+    points = shapes.X_WS.inverse() @ shapes.points(bodies).T
+    return float((TOOL_AXES[axis].matrix()[:, 2] @ points).max(initial=0.0))
+
+
+def _merit(place: Place) -> tuple[float, float, bool, float]:
+    enough_room, enough_space = (
+        min(place.room, _SUFFICIENT_MARGIN),
+        min(place.half, _SUFFICIENT_HALF_M),
+    )
+    return enough_room, enough_space, place.by_position, place.half
+
+
+def _with_cube(arm: ArmModel, place: Place, is_free: bool, vertical: bool) -> Place:
+    """Return the place with the half edge of its largest reachable cube, or 0.
+
+    Args:
+        is_free: False for an arm with less than six degrees of freedom, whose cube is a guess.
+        vertical: True examines displacements up and down only.
+    """
+    moves = _meets if is_free else _reaches
+    signs = np.array(list(product((-1.0, 1.0), repeat=3)))
+    if vertical or not is_free:
+        signs = np.vstack([np.eye(3), -np.eye(3)])
+    if vertical:
+        signs = signs[[2, 5]]
+    largest = 0.0
+    for half in _CUBE_HALVES_M:
+        if not all(moves(arm, place, half * each) for each in signs):
+            break
+        largest = half
+    room = place.room if largest else 0.0
+    return place._replace(half=largest, room=room, vertical=vertical)
+
+
+def _meets(arm: ArmModel, place: Place, displacement: Array) -> bool:
+    q, status = find_posture(arm, place.pose + np.append(np.zeros(4), displacement), place.q)
+    return status == IkStatus.OK and bool(np.abs(q - place.q).max() < _MAX_TURN)
+
+
+def _reaches(arm: ArmModel, place: Place, displacement: Array) -> bool:
+    """Return whether an arm with few joints follows a displacement approximately."""
+    target = place.pose + np.append(np.zeros(4), displacement)
+    q, _ = find_posture(arm, target, place.q)
+    error = np.linalg.norm(_pose(arm, q)[4:] - target[4:])
+    return bool(error < _MAX_RELATIVE_ERROR * np.linalg.norm(displacement))

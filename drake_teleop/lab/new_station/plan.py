@@ -1,0 +1,235 @@
+"""Start, tool, scales and motions of a new station, chosen for an arm and a device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.lab.new_station.frame_advice import (
+    OPPOSITE,
+    last_joint_axis,
+    nearest_axis,
+    tool_frame_advice,
+)
+from drake_teleop.lab.new_station.place import (
+    TOOL_AXES,
+    Place,
+    TrialWalls,
+    extent,
+    find_place,
+    lowest_point,
+)
+from drake_teleop.station.master.data_sheets import FIGURES, PHANTOM
+from drake_teleop.station.master.phantom import FORCE_LIMIT
+from drake_teleop.station.slave.arm import ArmModel, holding_torque
+from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
+from drake_teleop.station.slave.posture_shapes import PostureShapes, overlap_texts
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.tool import Ball, Tool
+
+#: Half edge of the Phantom's workspace cube around the default start [m] (E).
+_PHANTOM_HALF_M = 0.08
+# Stand-in for a missing tool: masses [kg], of which the arm holds the first with less than this
+# share of its torques; centre of mass, length and radius of the ball [m]; free length of the rod.
+_STAND_IN_MASSES_KG, _MAX_TORQUE_USE = (1.0, 0.5, 0.2, 0.1, 0.05), 0.8
+_MIN_MASS_KG, _MIN_TOOL_LENGTH_M = 1e-6, 0.03  # of a tool in the model
+_COM_M, _LENGTH_M, _RADIUS_M, _FREE_LENGTH_M = 0.05, 0.1, 0.012, 0.05
+_STAND_IN_LOAD = _STAND_IN_MASSES_KG[0] * np.array([1.0, 0.0, 0.0, _COM_M])
+_GOOD_SCORE = 1.5  # of a start without overlaps, at which no other axis of S is tried
+_MIN_SWING_M, _MAX_SWING_M = 0.01, 0.04  # amplitude of the slave
+# Contact force [N] that the device displays in addition to 1.5 times the weight.
+_CONTACT_FORCE_N = 30.0
+# Stiffness of the wall, and largest displayed stiffness [N/m]. The paper's station is stable up to
+# 680 N/m with medium grip.
+WALL_STIFFNESS, _MAX_DISPLAYED_STIFFNESS = 2000.0, 400.0
+SWING_HZ, _MAX_SPEED_USE = 1.0, 0.5  # of the swing [Hz]; largest share of the joint speed limits
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Start, scales and motions of a new station.
+
+    Args:
+        tool: stand-in for a missing tool; None: the model or a file contains the tool.
+        tool_mass: mass beyond the sensor [kg].
+        own_tool: True if the model contains the tool.
+        swing: amplitude of the slave in free motion [m].
+        lowest: (3,) position in W of the tool's lowest point at the start [m].
+        tip: (3,) p_STip of this point if the tool is not along z_S, else empty [m].
+        axis_note: advice on unusual axes of the sensor frame.
+        overlaps: sentences about overlaps of shapes at the start.
+        plane: height of the base plane [m].
+        shapes: shapes of arm and tool, at the start.
+    """
+
+    joints: tuple[str, ...]
+    tool: Tool | None
+    tool_mass: float
+    own_tool: bool
+    place: Place
+    translation_scale: float
+    force_scale: float
+    swing: float
+    lowest: Array
+    tip: list[float]
+    assumptions: tuple[str, ...]
+    axis_note: str
+    overlaps: tuple[str, ...]
+    plane: float
+    shapes: PostureShapes
+
+
+def plan_station(
+    arm: Path,
+    sensor_frame: str,
+    package_paths: tuple[Path, ...] = (),
+    tool: Path | None = None,
+    device: str = PHANTOM,
+) -> Plan:
+    """Choose start, scales and motions for an arm and a device.
+
+    Raises:
+        DrakeTeleopError: for an unusable model, or an arm that cannot point its tool down.
+    """
+    stand_in = _stand_in("z", _LENGTH_M)
+    slave = Slave(
+        model=str(arm),
+        sensor_frame=sensor_frame,
+        package_paths=[str(path) for path in package_paths],
+        tool=stand_in if tool is None else Tool(model=str(tool)),
+    )
+    shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+    load = shapes.arm.phi_load[:4] - (_STAND_IN_LOAD if tool is None else 0.0)
+    axis, own_tool = _tool_axis(shapes, load), False
+    if tool is None and _reaches_beyond_link(shapes, axis) and load[0] > _MIN_MASS_KG:
+        slave.tool, own_tool = None, True
+        shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+    plane = base_plane(shapes)
+    place, axis, shapes = _find_start(slave, shapes, plane, axis)
+    model, on_sensor = shapes.arm, None if tool is not None else slave.tool
+    if on_sensor is not None:
+        on_sensor.mass = _mass_to_hold(model, place.q)
+    mass = float(model.phi_load[0]) if on_sensor is None else on_sensor.mass
+    figures = FIGURES.get(device)
+    room = _PHANTOM_HALF_M if figures is None else min(figures.size) / 2.0
+    peak = FORCE_LIMIT if figures is None else figures.peak_force
+    translation_scale = _round_down(min(place.half / room, 1.0))
+    force_scale = min(
+        peak / (1.5 * 9.81 * mass + _CONTACT_FORCE_N),
+        _MAX_DISPLAYED_STIFFNESS / (WALL_STIFFNESS * translation_scale),
+        1.0,
+    )
+    shapes.move_to(place.q)
+    lowest = lowest_point(shapes)
+    swing = min(_MAX_SWING_M, place.half / 2.0, room * translation_scale / 2.0)
+    swing = min(swing, max(lowest[2] - plane, _MIN_SWING_M) / 2.0)
+    return Plan(
+        joints=tuple(model.joint_names),
+        tool=on_sensor,
+        tool_mass=mass,
+        own_tool=own_tool,
+        place=place,
+        translation_scale=translation_scale,
+        force_scale=_round_down(force_scale),
+        swing=_round_down(swing * min(1.0, _MAX_SPEED_USE / _speed_use(model, place, swing))),
+        lowest=lowest,
+        tip=[] if axis == "z" else (shapes.X_WS.inverse() @ lowest).tolist(),
+        assumptions=tuple(shapes.assumptions),
+        axis_note=tool_frame_advice(model, arm, sensor_frame, axis),
+        overlaps=tuple(overlap_texts(shapes, of_arm=True)),
+        plane=plane,
+        shapes=shapes,
+    )
+
+
+def _find_start(
+    slave: Slave, shapes: PostureShapes, plane: float, natural: str
+) -> tuple[Place, str, PostureShapes]:
+    """Return the start, the tool's axis of S, and the shapes; set a stand-in along that axis."""
+    found: list[tuple[Place, str, PostureShapes]] = []
+    errors: list[DrakeTeleopError] = []
+    is_stand_in = slave.tool is not None and not slave.tool.model
+    for axis in dict.fromkeys((natural, "z", *TOOL_AXES)):
+        if axis == OPPOSITE[natural] and axis != "z":
+            continue
+        if is_stand_in:
+            slave.tool = _stand_in(axis, _rod_length(shapes, axis))
+            if axis != "z" or slave.tool.shapes[0].position[2] != _LENGTH_M:
+                shapes = PostureShapes(slave, TrialWalls(), sticks=True)
+        try:
+            found.append((find_place(shapes.arm, shapes, plane=plane, axis=axis), axis, shapes))
+        except DrakeTeleopError as error:
+            errors.append(error)
+        if found and found[-1][0].score > _GOOD_SCORE:
+            break
+    if not found:
+        raise errors[0]
+    best = max(found, key=lambda each: each[0].score)
+    if is_stand_in:
+        slave.tool = _stand_in(best[1], _rod_length(best[2], best[1]))
+    return best
+
+
+def _tool_axis(shapes: PostureShapes, load: Array) -> str:
+    """Return the axis of S towards the model's own load, or else along the last joint; else z.
+
+    Args:
+        load: (4,) mass [kg] and first moments of the load [kg m] without a stand-in.
+    """
+    if load[0] > _MIN_MASS_KG and (axis := nearest_axis(load[1:] / load[0])):
+        return axis
+    return last_joint_axis(shapes.arm) or "z"
+
+
+def _reaches_beyond_link(shapes: PostureShapes, axis: str) -> bool:
+    """Return whether bodies beyond the sensor, without the stand-in, reach beyond its link."""
+    own_bodies = shapes.tool_bodies - {shapes.tool_body}
+    link_end = extent(shapes, shapes.sensor_link() - shapes.tool_bodies, axis)
+    return extent(shapes, own_bodies, axis) > link_end + _MIN_TOOL_LENGTH_M
+
+
+def base_plane(shapes: PostureShapes) -> float:
+    """Return the height of the base plane [m]: the lowest point of the shapes fixed to the world.
+
+    Without such shapes: the base, but not above the first joint.
+    """
+    heights = shapes.points(shapes.anchored())[:, 2]
+    return float(heights.min()) if len(heights) else min(float(shapes.arm.table[0, 11]), 0.0)
+
+
+def _stand_in(axis: str, length: float) -> Tool:
+    along = TOOL_AXES[axis].matrix()[:, 2]
+    ball = Ball(_RADIUS_M, (np.round(length * along, 3) + 0.0).tolist())
+    return Tool(mass=_STAND_IN_MASSES_KG[0], com=(_COM_M * along).round(6).tolist(), shapes=[ball])
+
+
+def _rod_length(shapes: PostureShapes, axis: str) -> float:
+    """Return the length of a rod that ends beyond the other shapes on the sensor's link [m]."""
+    end = extent(shapes, shapes.sensor_link() - {shapes.tool_body}, axis)
+    return max(_LENGTH_M, float(np.ceil(100.0 * (end + _FREE_LENGTH_M)) / 100.0))
+
+
+def _mass_to_hold(arm: ArmModel, q: Array) -> float:
+    """Return the mass of a stand-in that the motors can hold [kg]."""
+    phi = arm.phi_load
+    for mass in _STAND_IN_MASSES_KG:
+        torque = holding_torque(arm.with_load(phi * mass / phi[0]), q)
+        if np.abs(torque / arm.effort_limit).max() < _MAX_TORQUE_USE:
+            break
+    return mass
+
+
+def _speed_use(arm: ArmModel, place: Place, swing: float) -> float:
+    above = place.pose.copy()
+    above[6] += swing
+    displacement = np.abs(find_posture(arm, above, place.q)[0] - place.q)
+    return float((2.0 * np.pi * SWING_HZ * displacement / arm.velocity_limit).max())
+
+
+def _round_down(value: float) -> float:
+    unit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(f"{np.floor(value / unit + 1e-9) * unit:.12g}")

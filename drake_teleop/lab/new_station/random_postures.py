@@ -1,0 +1,230 @@
+"""Random postures of an arm, and the conditions on a start posture that each one meets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.slave.arm import ROTATION, SLIDES, TRANSLATION, ArmModel
+from drake_teleop.station.slave.numeric_inverse_kinematics import orientation_length
+from drake_teleop.station.slave.posture_shapes import sampled_range
+
+NUM_POSTURES = 20_000
+_MIN_COS_TILT = np.cos(np.radians(40.0))  # largest tilt of the tool axis from vertical
+# Distance of S from the vertical line through the first joint, and its height above that joint, in
+# units of the reach.
+_RADIUS, _HEIGHT = (0.35, 0.85), (-0.75, 0.8)
+# Preferred radius, height of the tool's end above the base plane, and height above the first joint.
+_PREFERRED_RADIUS, _PREFERRED_HEIGHT, _LOWEST_PREFERRED_HEIGHT = 0.6, 0.25, -0.4
+_MAX_COORDINATE_M = 1.9  # of S; a wall of a scenario is within 2 m
+_MIN_TOOL_HEIGHT_M = 0.05  # height of the tool's end above the base plane, for motion and wall
+# Half width of a side [rad], number of examined sides, and advantage of the side of x_W.
+_SIDE_RAD, _NUM_SIDES, _FRONT_ADVANTAGE = np.arccos(0.9), 24, 2.0
+_MIN_ORIGIN_HEIGHT_M = 0.03  # height of joint origins above the base plane
+_ROUNDING = 1e-9  # singular values that are 0, over the largest
+_NEUTRAL_OFFSET = 0.03  # smaller offset of the elbow, over the reach, has no direction
+#: Sufficient values: margin to limits, smallest singular value over L, elbow up.
+_GOOD_MARGIN, _GOOD_SINGULAR_VALUE, _GOOD_ELBOW = 0.3, 0.05, 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Postures:
+    """Joint positions with the frames that they give; arrays with a row for each posture.
+
+    Attributes:
+        q: (k, n) joint positions [rad, m].
+        origins: (k, n, 3) origins of the joints, p_W [m].
+        axes: (k, n, 3) axes of the joints, in W.
+        R_WS: (k, 3, 3) orientation of the sensor.
+        p_WS: (k, 3) position of the sensor [m].
+    """
+
+    q: Array
+    origins: Array
+    axes: Array
+    R_WS: Array
+    p_WS: Array
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> Postures:
+        return Postures(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class Region:
+    """Region of a start.
+
+    Attributes:
+        plane: height of the base plane [m].
+        tool_length: distance of the tool's end from S [m].
+        first: (3,) origin of the first joint, p_W [m].
+        reach: radius that the arm reaches about its first joint [m].
+        side: direction of the region about z_W, from x_W [rad].
+        removed: number of random postures that each condition removed, in this order.
+    """
+
+    plane: float
+    tool_length: float
+    first: Array
+    reach: float
+    side: float = 0.0
+    removed: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def preferred(self) -> Array:
+        """Preferred position p_WS (3,) of the sensor [m]."""
+        r, height = _PREFERRED_RADIUS * self.reach, self.plane + self.tool_length
+        height = max(
+            height + _PREFERRED_HEIGHT * self.reach,
+            float(self.first[2]) + _LOWEST_PREFERRED_HEIGHT * self.reach,
+        )
+        direction = np.array([np.cos(self.side), np.sin(self.side)])
+        return np.array([*(self.first[:2] + r * direction), height])
+
+
+def postures_at(arm: ArmModel, q: Array) -> Postures:
+    """Return the frames of an arm at joint positions q (k, n)."""
+    R, p = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
+    origins, axes = [], []
+    for row, angle in zip(arm.table, [*q.T, np.zeros(len(q))], strict=True):
+        p = p + R @ row[TRANSLATION : TRANSLATION + 3]
+        R = R @ row[ROTATION:TRANSLATION].reshape(3, 3)
+        origins.append(p)
+        axes.append(R[:, :, 2])
+        if row is not arm.table[-1] and row[SLIDES]:
+            p = p + angle[:, None] * R[:, :, 2]
+        else:
+            R = R @ _rotations_about_z(angle)
+    return Postures(q, np.stack(origins[:-1], 1), np.stack(axes[:-1], 1), R, p)
+
+
+def _rotations_about_z(angle: Array) -> Array:
+    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], 1).reshape(-1, 3, 3)
+
+
+def random_postures(arm: ArmModel, seed: int) -> Postures:
+    """Return `NUM_POSTURES` random postures."""
+    lower, upper = sampled_range(arm)
+    random = np.random.default_rng(seed)
+    return postures_at(arm, random.uniform(lower, upper, (NUM_POSTURES, arm.num_joints)))
+
+
+def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Postures, Region]:
+    """Return the postures that suit a start, and the region on the side with most of them."""
+    first = postures.origins[:, 0].mean(axis=0)
+    from_first = postures.p_WS - first
+    radius = np.hypot(from_first[:, 0], from_first[:, 1])
+    reach = float(np.quantile(radius, 0.98))
+    tool_height = postures.p_WS[:, 2] - plane - tool_length
+    conditions: tuple[tuple[str, Any], ...] = (
+        ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
+        (
+            "S is too near to the first joint, too far, too low or too high",
+            _within(radius / reach, _RADIUS)
+            & _within(from_first[:, 2] / reach, _HEIGHT)
+            & (tool_height > _MIN_TOOL_HEIGHT_M)
+            & (np.abs(postures.p_WS) < _MAX_COORDINATE_M).all(axis=1),
+        ),
+        (
+            "a joint is below the base plane",
+            (postures.origins[:, 1:, 2] > plane + _MIN_ORIGIN_HEIGHT_M).all(axis=1),
+        ),
+    )
+    rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
+    for name, met in conditions:
+        removed.append((name, int((~met[rows]).sum())))
+        rows = rows[met[rows]]
+    angle = np.arctan2(from_first[rows, 1], from_first[rows, 0])
+    sides = 2.0 * np.pi * np.arange(_NUM_SIDES) / _NUM_SIDES
+    counts = np.array([float(_on_side(angle, side).sum()) for side in sides])
+    counts[0] *= _FRONT_ADVANTAGE
+    side = float(sides[int(np.argmax(counts))])
+    region = Region(plane, tool_length, first, reach, side, tuple(removed))
+    return postures[rows[_on_side(angle, side)]], region
+
+
+def _within(values: Array, limits: tuple[float, float]) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = (values > limits[0]) & (values < limits[1])
+    return inside
+
+
+def _on_side(angle: Array, side: float) -> NDArray[np.bool_]:
+    near: NDArray[np.bool_] = np.cos(angle - side) > np.cos(_SIDE_RAD)
+    return near
+
+
+def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
+    """Return a score (k,): far from limits and singularities, elbow up, near the preferred place.
+
+    Metres below the base plane count 30 times.
+    """
+    margin = np.minimum(joint_margins(arm, postures.q) / _GOOD_MARGIN, 1.0)
+    L = orientation_length(arm)
+    sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
+    elbow = np.minimum(elbow_up(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
+    low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - postures.origins[:, 1:, 2], 0.0)
+    away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
+    total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
+    return total
+
+
+def joint_margins(arm: ArmModel, q: Array) -> Array:
+    """Return the smallest distance (k,) to a limit over half the range; 1 without limits."""
+    limited = np.isfinite(arm.lower) & np.isfinite(arm.upper)
+    lower, upper, inner = arm.lower[limited], arm.upper[limited], q[:, limited]
+    shares = 2.0 * np.minimum(inner - lower, upper - inner) / (upper - lower)
+    margins: Array = shares.min(axis=1, initial=1.0)
+    return margins
+
+
+def _singular_values(arm: ArmModel, postures: Postures) -> Array:
+    """Return the singular values (k, min(n, 6)) of the Jacobian, rotations times L [m]."""
+    slides = (arm.table[:-1, SLIDES] != 0.0)[:, None]
+    arms = postures.p_WS[:, None] - postures.origins
+    linear = np.where(slides, postures.axes, np.cross(postures.axes, arms))
+    angular = np.where(slides, 0.0, orientation_length(arm) * postures.axes)
+    values: Array = np.linalg.svd(np.concatenate([linear, angular], 2), compute_uv=False)
+    return values
+
+
+def degrees_of_freedom(arm: ArmModel, postures: Postures) -> int:
+    """Return in how many directions the sensor can move, which may be fewer than the joints."""
+    few = postures[np.arange(0, len(postures.q), max(len(postures.q) // 50, 1))]
+    values = _singular_values(arm, few)
+    return int((values > _ROUNDING * values[:, :1]).sum(axis=1).max())
+
+
+def smallest_singular_values(arm: ArmModel, postures: Postures) -> Array:
+    """Return the smallest singular value (k,) of the Jacobian among its degrees of freedom [m]."""
+    smallest: Array = _singular_values(arm, postures)[:, degrees_of_freedom(arm, postures) - 1]
+    return smallest
+
+
+def elbow_up(postures: Postures, reach: float) -> Array:
+    """Return the upward share (k,) of the elbow's offset from the line shoulder-wrist, -1 to 1.
+
+    The elbow is the joint that is farthest from the line of the first and last joint.
+    """
+    shoulder, wrist = postures.origins[:, 0], postures.origins[:, -1]
+    along = wrist - shoulder
+    along = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    offsets = postures.origins - shoulder[:, None]
+    offsets = offsets - (offsets * along[:, None]).sum(axis=2, keepdims=True) * along[:, None]
+    sizes = np.linalg.norm(offsets, axis=2)
+    rows = np.arange(len(sizes))
+    farthest = sizes.argmax(axis=1)
+    size = sizes[rows, farthest]
+    up: Array = offsets[rows, farthest, 2] / np.maximum(size, 1e-9)
+    return np.where(size > _NEUTRAL_OFFSET * reach, up, 1.0)
+
+
+def with_tool_axis(arm: ArmModel, R_SA: Array) -> ArmModel:
+    """Return the arm with the frame A, whose z is the tool axis, instead of S."""
+    table = arm.table.copy()
+    R = table[-1, ROTATION:TRANSLATION].reshape(3, 3) @ R_SA
+    table[-1, ROTATION:TRANSLATION] = R.ravel()
+    return replace(arm, table=table)

@@ -1,0 +1,93 @@
+"""Text of a new station's scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from drake_teleop.common.texts import yaml_text
+from drake_teleop.lab.new_station.plan import SWING_HZ, WALL_STIFFNESS, Plan
+from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.master.data_sheets import Master
+from drake_teleop.station.scenario import Rates
+
+_MAX_DEPTH_M = 0.01  # largest depth in the wall
+
+
+def scenario_text(
+    plan: Plan, slave: dict[str, Any], tool: str | None, device: str, sensor: str | None
+) -> str:
+    """Return the commented scenario; `slave` contains model, packages and sensor frame.
+
+    Args:
+        tool: path of the tool's file, if given.
+        sensor: preset of the wrist sensor, or None.
+    """
+    s, swing = plan.translation_scale, plan.swing
+    down = 1.5 * swing + min(_MAX_DEPTH_M, swing / 4.0)
+    if plan.place.by_position:
+        slave["position"] = round_row(plan.place.position)
+    else:
+        slave["home"] = plan.place.home
+    comments = {
+        "slave.position": "of the sensor at the start, tool down [m]",
+        "slave.home": "joints at the start, tool down [rad, m]",
+        "slave.tip": "contact point, p_STip [m]",
+        "kinematic_scaling": f"the arm can move {plan.place.reachable}",
+        "force_scaling": "sigma 1 displays the whole load of the tool; force_scale: see analyze",
+        "operator.intent": "of the hand: up and down, then down onto the wall",
+        "rates": "of the device",
+    }
+    if tool is not None:
+        slave["tool"] = {"model": tool}
+    elif plan.tool is None:
+        slave["tool"], comments["slave.tool"] = None, "the bodies of the model beyond the sensor"
+    else:
+        slave["tool"] = {"mass": plan.tool.mass, "com": plan.tool.com}
+        slave["tool"] |= {"shapes": [{"_tag": "!Ball"} | vars(plan.tool.shapes[0])]}
+        comments["slave.tool"] = "a stand-in: put model file or numbers of your tool here"
+    if plan.tip:
+        slave["tip"] = round_row(plan.tip)
+    swing_motion = {"_tag": "!Sine", "t_start": 0.2, "duration": 2.6, "ramp": 0.5}
+    swing_motion |= {"frequency": SWING_HZ, "translation": round_row([0.0, 0.0, swing / s])}
+    press_motion = {"_tag": "!MinimumJerk", "t_start": 3.2, "duration": 1.2}
+    press_motion |= {"translation": round_row([0.0, 0.0, -down / s])}
+    wall = wall_of(plan)
+    size = {} if wall.size == Wall().size else {"size": wall.size}
+    data = {
+        "description": f"{Path(slave['model']).stem} commanded by {device}",
+        "simulation": {"duration": 5.0, "settle": 0.8},
+        **_device_rates(device),
+        "slave": slave,
+        "master": {"model": device},
+        **({"wrist_sensor": {"preset": sensor}} if sensor else {}),
+        "kinematic_scaling": {"translation_scale": s},
+        "force_scaling": {"sigma": 0.0, "force_scale": plan.force_scale},
+        "environment": [
+            {"_tag": "!Wall", "position": wall.position, "stiffness": wall.stiffness} | size
+        ],
+        "operator": {"grip": "medium", "intent": [swing_motion, press_motion]},
+    }
+    head = "Made by drake-teleop new. All fields and defaults: drake-teleop scenario station.yaml"
+    return yaml_text(data, head=[head], comments=comments)
+
+
+def wall_of(plan: Plan) -> Wall:
+    """Return the wall below the tool."""
+    x, y, z = plan.lowest
+    return Wall(
+        position=round_row([x, y, z - 1.5 * plan.swing]),
+        size=[plan.place.wall, plan.place.wall],
+        stiffness=WALL_STIFFNESS,
+    )
+
+
+def _device_rates(device: str) -> dict[str, Any]:
+    """Return the rates of a slow device for the scenario, as `analyze` requires."""
+    own = Master(model=device).own_period(Rates().hand_hz)
+    return {} if own is None else {"rates": dict.fromkeys(("hand_hz", "joint_control_hz"), 1 / own)}
+
+
+def round_row(values: Any) -> list[float]:
+    """Return numbers with four significant digits, for a file."""
+    return [float(f"{value:.4g}") for value in values]

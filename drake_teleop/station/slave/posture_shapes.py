@@ -1,0 +1,321 @@
+"""Shapes of arm, tool and surroundings at given joint positions: distances and overlaps.
+
+Collision shapes count; of a body without them, its visual shapes. Drake uses convex hulls for
+meshes. Bodies that a joint connects may overlap. So may pairs that overlap in many random postures,
+such as the hulls of a forearm and the next link but one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.geometry import (
+    Capsule,
+    CollisionFilterDeclaration,
+    Convex,
+    Cylinder,
+    Ellipsoid,
+    GeometryId,
+    GeometrySet,
+    HalfSpace,
+    Mesh,
+    ProximityProperties,
+    Role,
+    SceneGraph,
+    SceneGraphInspector,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.environment.environment import Environment, Several
+from drake_teleop.station.slave.arm import ArmModel
+from drake_teleop.station.slave.meshes import AddSkeleton
+from drake_teleop.station.slave.plant import (
+    HashableByValue,
+    NominalSlave,
+    ParseSlave,
+    bodies_beyond,
+    finalize,
+)
+from drake_teleop.station.slave.slave_config import Slave
+from drake_teleop.station.slave.surroundings import AddEnvironment
+
+# Larger overlaps are reported [m]; smaller ones are rounding of models.
+_MIN_DEPTH_M = 1e-3
+_MAX_SIZE_M = 1e3  # largest size of a shape [m]; at 1e4 Drake's distance query aborts or hangs
+# Pairs that overlap in this share of random postures overlap by design.
+_NUM_POSTURES, _DESIGN_SHARE = 25, 0.4
+_SIDES = 24  # points on a circumference of a round shape
+
+
+class Near(NamedTuple):
+    """Two bodies and the distance of their nearest shapes [m], negative if they overlap."""
+
+    first: RigidBody
+    second: RigidBody
+    distance: float
+
+
+class PostureShapes:
+    """Plant with the shapes of a slave and its surroundings, for questions about postures.
+
+    Args:
+        sticks: True gives an arm without shapes sticks between its joints.
+
+    Attributes:
+        arm: the arm with its load.
+        assumptions: texts about data missing in the models.
+        tool_bodies: indices of the bodies beyond the sensor.
+        surroundings: indices of the bodies of the environment.
+    """
+
+    def __init__(
+        self, slave: Slave, environment: Environment | None = None, *, sticks: bool = False
+    ) -> None:
+        builder = DiagramBuilder()
+        self.plant, self._scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
+        self._parsed = ParseSlave(self.plant, slave)
+        of_slave = self.plant.num_bodies()
+        if environment is not None:
+            AddEnvironment(self.plant, environment)
+        self.surroundings = set(map(BodyIndex, range(of_slave, self.plant.num_bodies())))
+        beyond = bodies_beyond(self.plant, self._parsed.sensor_frame.body())
+        self.tool_bodies = {body.index() for body in beyond}
+        if sticks and not any(map(self._has_shapes, self.moving() - self.tool_bodies)):
+            AddSkeleton(self.plant, self._parsed.sensor_frame)
+        _make_solid(self.plant, self._scene_graph)
+        finalize(self.plant)
+        self.arm, assumed = self._parsed.arm()
+        self.assumptions = [*self._parsed.assumptions, *assumed]
+        self._exclude_joined()
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self.context = self.plant.GetMyMutableContextFromRoot(self._root)
+        inspector = self._scene_graph.model_inspector()
+        self._points = {
+            index: [surface_points(inspector, shape) for shape in self.shapes_of(index)]
+            for index in map(BodyIndex, range(self.plant.num_bodies()))
+        }
+        self._by_design = self._overlaps_by_design()
+
+    def shapes_of(self, body: BodyIndex) -> list[GeometryId]:
+        """Return the collision shapes of a body."""
+        inspector = self._scene_graph.model_inspector()
+        shapes = self.plant.GetCollisionGeometriesForBody(self.plant.get_body(body))
+        return [each for each in shapes if inspector.GetProximityProperties(each) is not None]
+
+    def move_to(self, q: Array) -> None:
+        """Move the arm to joint positions q (n,) [rad, m]."""
+        positions = self.plant.GetPositions(self.context)
+        positions[self.arm.position_index] = q
+        self.plant.SetPositions(self.context, positions)
+
+    @property
+    def X_WS(self) -> RigidTransform:
+        """Pose of the sensor."""
+        return self._parsed.sensor_frame.CalcPoseInWorld(self.context)
+
+    @property
+    def tool_body(self) -> BodyIndex:
+        """Index of the tool's body on the sensor."""
+        return self._parsed.tool
+
+    def sensor_link(self) -> set[BodyIndex]:
+        """Return the indices of the bodies that are fixed to the sensor, with the tool."""
+        body = self._parsed.sensor_frame.body()
+        return {each.index() for each in self.plant.GetBodiesWeldedTo(body)}
+
+    def near(self, within: float = 0.0) -> list[Near]:
+        """Return the pairs of bodies closer than `within` [m] that do not overlap by design."""
+        return [
+            Near(self.plant.get_body(first), self.plant.get_body(second), distance)
+            for (first, second), distance in self._distances(within).items()
+            if (first, second) not in self._by_design
+        ]
+
+    def points(self, bodies: Collection[BodyIndex]) -> Array:
+        """Return points (k, 3) on the shapes of bodies, in W [m]."""
+        return np.vstack(
+            [np.zeros((0, 3)), *(hull for body in bodies for hull in self.hulls(body))]
+        )
+
+    def hulls(self, index: BodyIndex, *, visual: bool = False) -> list[Array]:
+        """Return points (k, 3) on the hull of each shape of a body, in W [m]; or of each visual."""
+        body, hulls = self.plant.get_body(index), self._points[index]
+        if visual and (shapes := self.plant.GetVisualGeometriesForBody(body)):
+            hulls = [surface_points(self._scene_graph.model_inspector(), each) for each in shapes]
+        X_WB = self.plant.EvalBodyPoseInWorld(self.context, body)
+        return [(X_WB @ points.T).T for points in hulls]
+
+    def anchored(self) -> set[BodyIndex]:
+        """Return the indices of the slave's bodies that are fixed to the world."""
+        fixed = self.plant.GetBodiesWeldedTo(self.plant.world_body())
+        return {body.index() for body in fixed} - self.surroundings
+
+    def moving(self) -> set[BodyIndex]:
+        """Return the indices of the slave's moving bodies."""
+        every = set(map(BodyIndex, range(self.plant.num_bodies())))
+        return every - self.surroundings - self.anchored()
+
+    def _has_shapes(self, index: BodyIndex) -> bool:
+        body, plant = self.plant.get_body(index), self.plant
+        return bool(
+            plant.GetCollisionGeometriesForBody(body) or plant.GetVisualGeometriesForBody(body)
+        )
+
+    def _distances(self, within: float) -> dict[tuple[BodyIndex, BodyIndex], float]:
+        scene = self._scene_graph.GetMyContextFromRoot(self._root)
+        query = self._scene_graph.get_query_output_port().Eval(scene)
+        found: dict[tuple[BodyIndex, BodyIndex], float] = {}
+        for each in query.ComputeSignedDistancePairwiseClosestPoints(within):
+            frames = [query.inspector().GetFrameId(shape) for shape in (each.id_A, each.id_B)]
+            bodies = [self.plant.GetBodyFromFrameId(frame).index() for frame in frames]
+            first, second = sorted(bodies, key=int)
+            found[first, second] = min(each.distance, found.get((first, second), np.inf))
+        return found
+
+    def _exclude_joined(self) -> None:
+        """Exclude pairs on one link, on two links with a common joint, and in the environment."""
+        plant, manager = self.plant, self._scene_graph.collision_filter_manager()
+
+        def link(body: RigidBody) -> set[BodyIndex]:
+            return {each.index() for each in plant.GetBodiesWeldedTo(body)} - self.surroundings
+
+        def shapes(bodies: Collection[BodyIndex]) -> GeometrySet:
+            return GeometrySet([shape for each in bodies for shape in self.shapes_of(each)])
+
+        together = [self.surroundings]
+        for joint in map(plant.get_joint, plant.GetJointIndices()):
+            if joint.child_body().index() not in self.surroundings:
+                together.append(link(joint.parent_body()) | link(joint.child_body()))
+        for bodies in together:
+            manager.Apply(CollisionFilterDeclaration().ExcludeWithin(shapes(bodies)))
+
+    def _overlaps_by_design(self) -> set[tuple[BodyIndex, BodyIndex]]:
+        random, counts = np.random.default_rng(0), dict[tuple[BodyIndex, BodyIndex], int]()
+        for posture in random.uniform(
+            *sampled_range(self.arm), (_NUM_POSTURES, len(self.arm.lower))
+        ):
+            self.move_to(posture)
+            for pair in self._distances(0.0):
+                counts[pair] = counts.get(pair, 0) + 1
+        return {
+            pair
+            for pair, count in counts.items()
+            if count > _DESIGN_SHARE * _NUM_POSTURES and not self.surroundings & set(pair)
+        }
+
+
+def sampled_range(arm: ArmModel) -> tuple[Array, Array]:
+    """Return the range (n,), (n,) of random joint positions: the limits, at most one rotation."""
+    wide = arm.upper - arm.lower > 2.0 * np.pi + 1e-9
+    around_zero = wide & (arm.lower <= -np.pi) & (arm.upper >= np.pi)
+    finite_lower = np.where(np.isfinite(arm.lower), arm.lower, -np.pi)
+    finite_upper = np.where(np.isfinite(arm.upper), arm.upper, np.pi)
+    return np.where(around_zero, -np.pi, finite_lower), np.where(around_zero, np.pi, finite_upper)
+
+
+def start_overlaps(slave: Slave, environment: Environment | None) -> tuple[str, ...]:
+    """Return one sentence for each pair of bodies that overlap at the slave's start."""
+    parts = [] if environment is None else list(environment.parts)
+    written = tuple(path.stat().st_mtime_ns for path in slave.files())
+    return _start_overlaps(HashableByValue((slave, parts)), written)
+
+
+@lru_cache(maxsize=4)
+def _start_overlaps(key: HashableByValue, _: tuple[int, ...]) -> tuple[str, ...]:
+    slave, parts = key.value
+    shapes = PostureShapes(slave, Several(parts) if parts else None)
+    shapes.move_to(NominalSlave(slave).start)
+    return tuple(overlap_texts(shapes))
+
+
+def overlap_texts(shapes: PostureShapes, *, of_arm: bool = False) -> list[str]:
+    """Return one sentence for each pair of overlapping bodies: names, depth and remedy.
+
+    Args:
+        of_arm: True leaves out the surroundings.
+    """
+    found = []
+    for first, second, distance in shapes.near():
+        with_surroundings = bool(shapes.surroundings & {first.index(), second.index()})
+        if distance > -_MIN_DEPTH_M or (of_arm and with_surroundings):
+            continue
+        remedy = "give another start in slave.home, or correct the shapes of the model"
+        if with_surroundings:
+            remedy = "move the object in environment, or give another start in slave.home"
+        found.append(
+            f"{first.name()} and {second.name()} overlap by {-1e3 * distance:.1f} mm at the start"
+            f" (convex hulls of meshes count); {remedy}"
+        )
+    return found
+
+
+def _make_solid(plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Add visual shapes as collision shapes where a body has none; drop unlimited shapes.
+
+    Drake's distance query may hang for capsules that overlap: polyhedra replace curved shapes.
+    """
+    inspector, source = scene_graph.model_inspector(), plant.get_source_id()
+    added = []  # afterwards, because Drake's lists move when shapes are added
+    for body in map(plant.get_body, map(BodyIndex, range(plant.num_bodies()))):
+        solids = plant.GetCollisionGeometriesForBody(body)
+        for k, geometry in enumerate(solids or plant.GetVisualGeometriesForBody(body)):
+            shape, box = inspector.GetShape(geometry), inspector.GetObbInGeometryFrame(geometry)
+            is_curved = isinstance(shape, (Capsule, Cylinder, Ellipsoid))
+            is_limited = box is not None and max(box.half_width()) < _MAX_SIZE_M
+            here, name = RigidTransform(inspector.GetPoseInFrame(geometry)), f"solid_{k}"
+            if is_curved:
+                shape = Convex(here.inverse() @ surface_points(inspector, geometry).T, name)
+            if is_limited and (is_curved or not solids):
+                added.append((body, here, shape.Clone(), f"{body.name()}_{name}"))
+            if solids and (is_curved or not is_limited):
+                scene_graph.RemoveRole(source, geometry, Role.kProximity)
+    for each in added:
+        plant.RegisterCollisionGeometry(*each, ProximityProperties())
+
+
+def surface_points(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+    """Return points (k, 3) on the convex hull of a shape, in the frame of its body [m]."""
+    shape = inspector.GetShape(geometry)
+    if isinstance(shape, (Mesh, Convex)):
+        hull = shape.GetConvexHull()
+        points = np.array([hull.vertex(k) for k in range(hull.num_vertices())])
+    elif isinstance(shape, Sphere):
+        points = shape.radius() * _unit_sphere()
+    elif isinstance(shape, Ellipsoid):
+        points = _unit_sphere() * [shape.a(), shape.b(), shape.c()]
+    elif isinstance(shape, Capsule):
+        end = [0.0, 0.0, shape.length() / 2]
+        ball = shape.radius() * _unit_sphere()
+        points = np.vstack([ball - end, ball + end])
+    elif isinstance(shape, Cylinder):
+        rim = _unit_sphere()[_SIDES : 2 * _SIDES] * [1.0, 1.0, 0.0]
+        rim *= shape.radius() / np.linalg.norm(rim, axis=1, keepdims=True)
+        end = [0.0, 0.0, shape.length() / 2]
+        points = np.vstack([rim - end, rim + end])
+    elif isinstance(shape, HalfSpace):
+        return np.zeros((0, 3))
+    else:
+        box = inspector.GetObbInGeometryFrame(geometry)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+        points = (box.pose() @ (corners * box.half_width()).T).T
+    return (inspector.GetPoseInFrame(geometry) @ points.T).T
+
+
+def _unit_sphere() -> Array:
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
+    longitude = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    rings = [
+        np.column_stack([c * np.cos(longitude), c * np.sin(longitude), np.full(_SIDES, s)])
+        for c, s in zip(np.cos(latitude), np.sin(latitude), strict=True)
+    ]
+    return np.vstack(rings)

@@ -1,0 +1,196 @@
+"""Start postures that `new` chooses: elbow up, shapes apart and above the base, any side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.lab.new_station.place import find_place
+from drake_teleop.lab.new_station.plan import plan_station
+from drake_teleop.lab.new_station.random_postures import (
+    degrees_of_freedom,
+    elbow_up,
+    joint_margins,
+    postures_at,
+    random_postures,
+)
+from drake_teleop.lab.new_station.text import wall_of
+from drake_teleop.station.environment.solids import Wall
+from drake_teleop.station.slave.arm import pose_into
+from drake_teleop.station.slave.posture_shapes import PostureShapes, start_overlaps
+from drake_teleop.station.slave.slave_config import Slave
+
+pytestmark = pytest.mark.slow
+_HALF = 0.5 * np.pi
+
+
+def write_arm(path, *, base="0 0 0 0 0 0", ranges=()):
+    """Write an arm with six joints; its shapes are boxes.
+
+    Args:
+        base: pose of the arm in the world.
+        ranges: limits (lower, upper) of the joints by number [rad], where not +-pi.
+    """
+    limits = {k: (-np.pi, np.pi) for k in range(1, 7)} | dict(ranges)
+    # Axis, origin of each joint, and length of its link along z.
+    chain = [
+        ("0 0 1", "0 0 0.1", 0.2),
+        ("0 1 0", "0 0 0.2", 0.4),
+        ("0 1 0", "0 0 0.4", 0.35),
+        ("0 0 1", "0 0 0.2", 0.15),
+        ("0 1 0", "0 0 0.15", 0.08),
+        ("0 0 1", "0 0 0.08", 0.04),
+    ]
+    x, y, z, roll, pitch, yaw = base.split()
+    links = [_link("base", 0.1, "0.3 0.3 0.02")]
+    joints = [_joint("anchor", "fixed", "world", "base", f"{x} {y} {z}", f"{roll} {pitch} {yaw}")]
+    for k, (axis, origin, length) in enumerate(chain, 1):
+        links.append(_link(f"link{k}", length))
+        parent = f"link{k - 1}" if k > 1 else "base"
+        lower, upper = limits[k]
+        motion = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}" velocity="3"'
+        joints.append(
+            _joint(
+                f"j{k}", "revolute", parent, f"link{k}", origin, "0 0 0", f'{motion} effort="300"/>'
+            )
+        )
+    links.append('<link name="ft"/>')
+    joints.append(_joint("flange", "fixed", "link6", "ft", "0 0 0.04"))
+    path.write_text(
+        f'<robot name="arm"><link name="world"/>{"".join(links)}{"".join(joints)}</robot>'
+    )
+    return path
+
+
+def _link(name, length, plate=""):
+    mass = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
+    inertial = f'<inertial><origin xyz="0 0 {length / 2}"/>{mass}</inertial>'
+    boxed = [(f"0.06 0.06 {length - 0.05 if length > 0.08 else 0.03}", length / 2)]
+    boxed += [(plate, 0.01)] if plate else []
+    shapes = "".join(
+        f'<collision><origin xyz="0 0 {z}"/><geometry><box size="{size}"/></geometry></collision>'
+        for size, z in boxed
+    )
+    return f'<link name="{name}">{inertial}{shapes}</link>'
+
+
+def _joint(name, kind, parent, child, xyz, rpy="0 0 0", more=""):
+    origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+    links = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{links}{origin}{more}</joint>'
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """Return file and plan of an arm with boxes."""
+    path = write_arm(tmp_path_factory.mktemp("plain") / "arm.urdf")
+    return path, plan_station(path, "ft")
+
+
+def elbow_of(plan):
+    return elbow_up(postures_at(plan.shapes.arm, plan.place.q[np.newaxis]), 1.0)[0]
+
+
+def slave_of(plan, path):
+    return Slave(model=str(path), sensor_frame="ft", tool=plan.tool, home=plan.place.q.tolist())
+
+
+def test_elbow_is_up_although_the_middle_of_the_ranges_is_elbow_down(tmp_path):
+    """The shoulder leans forward and the forearm back up in the middle of the ranges."""
+    trap = {2: (-1.2, 2.8), 3: (-2.9, 2.6), 5: (-2.9, 2.9)}
+    path = write_arm(tmp_path / "arm.urdf", ranges=trap)
+    plan = plan_station(path, "ft")
+    assert elbow_of(plan) > 0.5
+    plan.shapes.move_to(plan.place.q)
+    # The base link has a plate on the plane; everything that moves is above it.
+    assert plan.plane == pytest.approx(0.0, abs=1e-9)
+    assert plan.shapes.points(plan.shapes.moving())[:, 2].min() > 0.02
+    assert start_overlaps(slave_of(plan, path), wall_of(plan)) == ()
+    assert wall_of(plan).position[2] < plan.lowest[2] - 0.01
+
+
+def test_arm_that_can_only_face_minus_y_starts_there(tmp_path):
+    facing = {1: (-1.9, -1.2), 2: (0.0, 1.5), 3: (0.0, 2.6), 5: (0.0, 2.6)}
+    path = write_arm(tmp_path / "arm.urdf", ranges=facing)
+    x, y, _ = plan_station(path, "ft").place.position
+    assert y < -0.2 and abs(x) < -y
+
+
+@pytest.mark.parametrize("height", [0.0, 1.0])
+def test_arm_on_a_torso_works_around_its_own_height(height, tmp_path):
+    path = write_arm(tmp_path / "arm.urdf", base=f"0.4 -0.5 {height} 0 0 0")
+    plan = plan_station(path, "ft")
+    assert plan.plane == pytest.approx(height, abs=1e-6)
+    assert height < plan.place.position[2] < height + 0.9
+    assert np.hypot(*(plan.place.position[:2] - [0.4, -0.5])) > 0.25
+
+
+def test_wall_of_a_start_is_free_of_the_arm_and_another_wall_is_reported(plain):
+    path, plan = plain
+    slave = slave_of(plan, path)
+    assert start_overlaps(slave, wall_of(plan)) == ()
+    elbow = postures_at(plan.shapes.arm, plan.place.q[np.newaxis]).origins[0, 2]
+    (said,) = [
+        text for text in start_overlaps(slave, Wall(position=list(elbow))) if "link3" in text
+    ]
+    assert said.startswith("link3 and wall overlap by ") and " mm at the start" in said
+    assert said.endswith("move the object in environment, or give another start in slave.home")
+
+
+def test_joints_without_limits_are_sampled_once_round_and_have_full_margin(plain):
+    arm = plain[1].shapes.arm
+    endless = replace(
+        arm,
+        lower=np.array([-np.inf, *arm.lower[1:5], -np.inf]),
+        upper=np.array([np.inf, *arm.upper[1:5], np.inf]),
+    )
+    drawn = random_postures(endless, 0).q
+    assert np.isfinite(drawn).all() and np.abs(drawn).max() <= np.pi
+    assert joint_margins(endless, np.array([[9.0, 0, 0, 0, 0, -9.0]]))[0] == 1.0
+    assert joint_margins(endless, np.array([[0.0, _HALF, 0, 0, 0, 0]]))[0] == pytest.approx(0.5)
+    found = find_place(endless)
+    assert found.half > 0.0 and np.isfinite(found.q).all()
+
+
+def test_reason_of_a_failure_counts_the_postures_of_each_condition(plain):
+    arm = plain[1].shapes.arm
+    tilted = replace(arm, lower=arm.lower * 0.0 - 0.2, upper=arm.upper * 0.0 + 0.2)
+    with pytest.raises(DrakeTeleopError, match=r"in 20000 z_S is more than 40 degrees from down"):
+        find_place(tilted)
+    with pytest.raises(DrakeTeleopError, match=r"in \d+ S is too near .*; 0 are left"):
+        find_place(arm, plane=5.0)
+
+
+def test_frames_and_degrees_of_freedom_follow_the_joints(plain):
+    arm = plain[1].shapes.arm
+    at_random = random_postures(arm, 3)
+    for k in (0, 17, 4000):
+        pose = np.empty(7)
+        pose_into(arm.table, at_random.q[k], pose)
+        np.testing.assert_allclose(at_random.p_WS[k], pose[4:], atol=1e-12)
+        z = 1 - 2 * (pose[1] ** 2 + pose[2] ** 2)
+        assert at_random.R_WS[k, 2, 2] == pytest.approx(z, abs=1e-12)
+    assert degrees_of_freedom(arm, at_random) == 6
+    # With two wrist joints at rest, the sensor moves in four directions.
+    table = np.delete(arm.table, [3, 5], axis=0)
+    names = ("joint_names", "lower", "upper", "velocity_limit", "effort_limit")
+    fewer = {n: tuple(getattr(arm, n)[k] for k in (0, 1, 2, 4)) for n in names}
+    short = replace(
+        arm, table=table, **{n: v if n == names[0] else np.array(v) for n, v in fewer.items()}
+    )
+    assert degrees_of_freedom(short, random_postures(short, 0)) == 4
+
+
+def test_bodies_that_overlap_by_design_are_not_reported(plain, tmp_path):
+    path = write_arm(tmp_path / "arm.urdf")
+    # The hull of the forearm encloses the wrist, two joints further, in all postures.
+    text = path.read_text().replace('<box size="0.06 0.06 0.3"/>', '<box size="0.3 0.3 0.9"/>', 1)
+    path.write_text(text)
+    shapes = PostureShapes(Slave(model=str(path), sensor_frame="ft", tool=plain[1].tool))
+    shapes.move_to(np.full(6, 0.3))
+    assert not any(
+        {each.first.name(), each.second.name()} == {"link3", "link5"} for each in shapes.near()
+    )
