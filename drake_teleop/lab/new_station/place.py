@@ -33,7 +33,7 @@ from drake_teleop.lab.new_station.random_postures import (
     with_tool_axis,
 )
 from drake_teleop.station.environment.environment import Environment, LetFloat, NewInstance
-from drake_teleop.station.slave.arm import ArmModel, pose_into
+from drake_teleop.station.slave.arm import ArmModel, holding_torque, pose_into
 from drake_teleop.station.slave.home import R_WS_HOME, tool_down
 from drake_teleop.station.slave.inverse_kinematics import IkStatus, has_closed_form
 from drake_teleop.station.slave.numeric_inverse_kinematics import find_posture
@@ -56,6 +56,7 @@ _NUM_CANDIDATES, _NUM_FINALISTS, _NUM_CUBES = 40, 12, 60
 _SCORE_TOLERANCE = 0.3  # largest disadvantage of a start with a larger cube
 _TOOL_YAWS_DEG = (0.0, 90.0, -90.0, 180.0)  # tested rotations of the tool about z_W [deg]
 _MAX_RELATIVE_ERROR = 0.1  # error of an arm with few joints, over displacement
+_MAX_TORQUE_USE = 0.9  # largest torque at rest, over its limit
 _SUFFICIENT_MARGIN = 0.1  # sufficient distance to a joint limit, over half the range
 _MAX_TURN = 2.0  # largest joint displacement to a corner of the cube [rad, m]
 _SUFFICIENT_HALF_M = 0.15  # sufficient half edge of the cube [m]
@@ -154,6 +155,7 @@ def find_place(
     pointed = with_tool_axis(arm, R_SA.matrix())
     length = 0.0 if shapes is None else extent(shapes, shapes.tool_bodies, axis)
     postures, region = suitable(random_postures(pointed, seed), plane, length)
+    postures = _strong_ones(pointed, postures)
     is_free = len(postures.q) > 0 and degrees_of_freedom(pointed, postures) == 6
     found = [
         _examined(shapes, place, region)
@@ -178,6 +180,13 @@ def find_place(
     if axis == "z":
         pose = best.pose
     return best._replace(pose=pose, by_position=best.by_position and axis == "z")
+
+
+def _strong_ones(arm: ArmModel, postures: Postures) -> Postures:
+    """Return the postures that the motors can hold; all if none can be held."""
+    held = [np.abs(holding_torque(arm, q)) < _MAX_TORQUE_USE * arm.effort_limit for q in postures.q]
+    strong = np.flatnonzero(np.all(held, axis=1)) if held else np.empty(0, np.intp)
+    return postures[strong] if len(strong) else postures
 
 
 def _removals(region: Region, left: int) -> str:

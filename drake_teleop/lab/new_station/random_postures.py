@@ -62,6 +62,7 @@ class Region:
         tool_length: distance of the tool's end from S [m].
         first: (3,) origin of the first joint, p_W [m].
         reach: radius that the arm reaches about its first joint [m].
+        raised: (n,) True for joints that belong above the base plane, and not to a mobile base.
         side: direction of the region about z_W, from x_W [rad].
         removed: number of random postures that each condition removed, in this order.
     """
@@ -70,6 +71,7 @@ class Region:
     tool_length: float
     first: Array
     reach: float
+    raised: NDArray[np.bool_]
     side: float = 0.0
     removed: tuple[tuple[str, int], ...] = ()
 
@@ -120,6 +122,9 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
     radius = np.hypot(from_first[:, 0], from_first[:, 1])
     reach = float(np.quantile(radius, 0.98))
     tool_height = postures.p_WS[:, 2] - plane - tool_length
+    lowest_origin = plane + _MIN_ORIGIN_HEIGHT_M
+    raised = postures.origins[:, :, 2].max(axis=0) > lowest_origin
+    raised[0] = False
     conditions: tuple[tuple[str, Any], ...] = (
         ("z_S is more than 40 degrees from downwards", postures.R_WS[:, 2, 2] < -_MIN_COS_TILT),
         (
@@ -131,7 +136,7 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
         ),
         (
             "a joint is below the base plane",
-            (postures.origins[:, 1:, 2] > plane + _MIN_ORIGIN_HEIGHT_M).all(axis=1),
+            (postures.origins[:, raised, 2] > lowest_origin).all(axis=1),
         ),
     )
     rows, removed = np.arange(len(radius)), list[tuple[str, int]]()
@@ -143,7 +148,7 @@ def suitable(postures: Postures, plane: float, tool_length: float) -> tuple[Post
     counts = np.array([float(_on_side(angle, side).sum()) for side in sides])
     counts[0] *= _FRONT_ADVANTAGE
     side = float(sides[int(np.argmax(counts))])
-    region = Region(plane, tool_length, first, reach, side, tuple(removed))
+    region = Region(plane, tool_length, first, reach, raised, side, tuple(removed))
     return postures[rows[_on_side(angle, side)]], region
 
 
@@ -166,7 +171,8 @@ def scores(arm: ArmModel, postures: Postures, region: Region) -> Array:
     L = orientation_length(arm)
     sigma = np.minimum(smallest_singular_values(arm, postures) / (_GOOD_SINGULAR_VALUE * L), 1.0)
     elbow = np.minimum(elbow_up(postures, region.reach), _GOOD_ELBOW) / _GOOD_ELBOW
-    low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - postures.origins[:, 1:, 2], 0.0)
+    origins = postures.origins[:, region.raised, 2]
+    low = np.maximum(region.plane + _MIN_ORIGIN_HEIGHT_M - origins, 0.0)
     away = np.linalg.norm(postures.p_WS - region.preferred, axis=1) / region.reach
     total: Array = margin + sigma + elbow - 30.0 * low.max(axis=1, initial=0.0) - 0.5 * away
     return total
