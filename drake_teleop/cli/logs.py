@@ -103,6 +103,8 @@ def eliminate_command(
     sigma_object: float | None = None,
     gamma: float = 1.0,
     eta: float | None = None,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
     causal: str | None = None,
     causal_tare_s: float | None = None,
     free: Path | None = None,
@@ -119,6 +121,7 @@ def eliminate_command(
     """
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
+    scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
     found = eliminate_log(
         log,
         load_file,
