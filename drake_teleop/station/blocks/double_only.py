@@ -10,6 +10,8 @@ from drake_teleop.common.errors import DrakeTeleopError
 class DoubleOnly:
     """Base class of blocks for double only; a conversion raises one clear error."""
 
+    __slots__ = ()
+
     def _refuse(self, *_: Any) -> NoReturn:
         raise DrakeTeleopError(
             "computes with compiled code for double only",
