@@ -164,7 +164,7 @@ def pressed(scenario: Scenario, grip: str, stiffness: float, share: float) -> fl
     simulator = MakeSimulator(station, held.simulation)
     context, scaling = simulator.get_mutable_context(), GetBlock(station, "force_scaling")
     simulator.AdvanceTo(_CHANGE)
-    sigma, sigma_object, gamma = held.force_scaling.scales()
+    sigma, sigma_object, gamma = held.force_scaling.scales()[:3]
     scaling.SetScales(
         scaling.GetMyMutableContextFromRoot(context),
         sigma_gripper=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale,

@@ -199,6 +199,22 @@ def test_apparent_mass_is_device_plus_sigma_times_load(felt, sigma):
 
 
 @pytest.mark.slow
+def test_weight_and_inertia_of_the_tool_are_displayed_apart(slave):
+    """Half of the weight at rest, and of the mass under acceleration a tenth."""
+    scenario = vertical(
+        0.03, 1.0, force_scaling__sigma_weight=0.5, force_scaling__sigma_inertia=0.1
+    )
+    found = simulate(
+        MakeTeleopStation(scenario, load_estimate=true_estimate(slave)), scenario.simulation
+    )
+    force, s = found["force_to_master"][:, 2] / FORCE_SCALE, found["specific_force_S"][:, 2]
+    mass, weight = np.polyfit(-s - 9.81, -force, 1)  # z_S points down
+    assert np.ptp(s) > 1.0
+    assert weight == pytest.approx(0.5 * MASS * 9.81, rel=0.01)
+    assert mass == pytest.approx(0.1 * MASS, rel=0.01)
+
+
+@pytest.mark.slow
 def test_apparent_mass_is_the_device_with_sigma_0(felt):
     """Mass of the device from closed forms, plus the hand's."""
     hand, acceleration, _ = felt[0.0]

@@ -105,6 +105,8 @@ def eliminate_command(
     eta: float | None = None,
     offsets: str = "record",
     untouched_s: tuple[float, float] | None = None,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
     causal: str | None = None,
     causal_tare_s: float | None = None,
     free: Path | None = None,
@@ -121,6 +123,7 @@ def eliminate_command(
     """
     load_file = Identification.load(load)
     scales: dict[str, Any] = dict(sigma=sigma, sigma_object=sigma_object, gamma=gamma, eta=eta)
+    scales |= dict(sigma_weight=sigma_weight, sigma_inertia=sigma_inertia)
     found = eliminate_log(
         log,
         load_file,

@@ -218,6 +218,7 @@ def identify(log: Path, out: Path, **options: Any) -> None:
     type=option.SCALE,
     help="Scale of the object's non-contact wrench, with --gripper.  [default: sigma]",
 )
+@option.separate_sigmas
 @option.gamma
 @click.option(
     "--eta", type=option.Number(0, 1), help="Share of a gripped object's wrench that is kept."
@@ -313,6 +314,7 @@ def inspect(log: Path, others: tuple[Path, ...], out: Path, quiet: bool) -> None
 @option.load(required=True)
 @click.option("--out", "sink", default="-", metavar="SINK", help="Destination.  [default: stdout]")
 @option.sigma("Scale of the non-contact wrench.")
+@option.separate_sigmas
 @option.gamma
 @click.option(
     "--rate",

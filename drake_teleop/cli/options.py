@@ -250,6 +250,15 @@ def sigma(text: str) -> Callable[[Any], Any]:
     return click.option("--sigma", type=SCALE, default=0.0, show_default=True, help=text)
 
 
+def separate_sigmas(command: Any) -> Any:
+    """Add the options `--sigma-weight` and `--sigma-inertia`."""
+    text = "Scale of the load's {} alone.  [default: sigma]"
+    for part in ("inertia", "weight"):
+        option = click.option(f"--sigma-{part}", type=SCALE, help=text.format(part))
+        command = option(command)
+    return command
+
+
 def sensor_frame(*, required: bool = False) -> Callable[[Any], Any]:
     """Return the option `--sensor-frame`."""
     text = "Frame or link of the model at which the wrist sensor measures."

@@ -100,7 +100,7 @@ class Inputs:
     def of(cls, scenario: Scenario) -> Inputs:
         """Return the initial inputs of a scenario."""
         sigma, sigma_object, gamma = (
-            round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()
+            round(s / _SHARE_UNIT) for s in scenario.force_scaling.scales()[:3]
         )
         scale = round(scenario.force_scaling.force_scale / _SCALE_UNIT)
         started = cls(sigma=sigma, sigma_object=sigma_object, gamma=gamma, force_scale=scale)

@@ -4,18 +4,65 @@
     F'  = gamma F_c + V (sigma_gr phi_gr + sigma_obj phi_obj)      (T7)
 
 F is the measured wrench, F_o the sensor offsets, V phi the wrench of weight and inertia. Wrenches
-act on the load, about the sensor origin So, in S.
+act on the load, about the sensor origin So, in S. V(a - g) = V(-g) + V(a) is linear in the specific
+force, so weight and inertia can have different scales sigma.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, checked, checked_rows, number
-from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.common.vectors import add_into, cross, minus, plus, three, times
+from drake_teleop.load.regressor import wrench_of_load
+
+
+@register_jitable
+def wrench_of_scales(
+    wrench,
+    offsets,
+    s,
+    omega,
+    alpha,
+    phi_gripper,
+    phi_object,
+    sigma_gripper,
+    sigma_object,
+    gamma,
+):
+    """Return force and torque of `scaled_wrench` as tuples, for scalars of any type."""
+    a, b = sigma_gripper - gamma, sigma_object - gamma
+    phi = (
+        a * phi_gripper[0] + b * phi_object[0],
+        a * phi_gripper[1] + b * phi_object[1],
+        a * phi_gripper[2] + b * phi_object[2],
+        a * phi_gripper[3] + b * phi_object[3],
+        a * phi_gripper[4] + b * phi_object[4],
+        a * phi_gripper[5] + b * phi_object[5],
+        a * phi_gripper[6] + b * phi_object[6],
+        a * phi_gripper[7] + b * phi_object[7],
+        a * phi_gripper[8] + b * phi_object[8],
+        a * phi_gripper[9] + b * phi_object[9],
+    )
+    force, torque = wrench_of_load(s, omega, alpha, phi)
+    force = plus(force, times(gamma, minus(three(wrench, 0), three(offsets, 0))))
+    return force, plus(torque, times(gamma, minus(three(wrench, 3), three(offsets, 3))))
+
+
+@register_jitable
+def weight_of_scales(gravity, phi_gripper, phi_object, excess_gripper, excess_object):
+    """Return force and torque of V(-g) (excess_gripper phi_gripper + excess_object phi_object).
+
+    They are added to `wrench_of_scales` for shares of the weight that exceed those of the inertia.
+    """
+    a, b = excess_gripper, excess_object
+    up = times(-1.0, three(gravity, 0))
+    h = plus(times(a, three(phi_gripper, 1)), times(b, three(phi_object, 1)))
+    return times(a * phi_gripper[0] + b * phi_object[0], up), cross(h, up)
 
 
 @njit(cache=True)
@@ -36,22 +83,30 @@ def scaled_wrench_into(
 
     For sigma = gamma the result does not depend on errors of the load parameters.
     """
-    a, b = sigma_gripper - gamma, sigma_object - gamma
-    phi = (
-        a * phi_gripper[0] + b * phi_object[0],
-        a * phi_gripper[1] + b * phi_object[1],
-        a * phi_gripper[2] + b * phi_object[2],
-        a * phi_gripper[3] + b * phi_object[3],
-        a * phi_gripper[4] + b * phi_object[4],
-        a * phi_gripper[5] + b * phi_object[5],
-        a * phi_gripper[6] + b * phi_object[6],
-        a * phi_gripper[7] + b * phi_object[7],
-        a * phi_gripper[8] + b * phi_object[8],
-        a * phi_gripper[9] + b * phi_object[9],
+    force, torque = wrench_of_scales(
+        wrench, offsets, s, omega, alpha, phi_gripper, phi_object, sigma_gripper, sigma_object,
+        gamma,
+    )  # fmt: skip
+    out[0], out[1], out[2] = force
+    out[3], out[4], out[5] = torque
+
+
+@njit(cache=True)
+def add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
+    """Add the result of `weight_of_scales` to out (6,), for one sample."""
+    force, torque = weight_of_scales(
+        gravity, phi_gripper, phi_object, excess_gripper, excess_object
     )
-    non_contact_wrench_into(s, omega, alpha, phi, out)
-    for i in range(6):
-        out[i] += gamma * (wrench[i] - offsets[i])
+    add_into(out, 0, force)
+    add_into(out, 3, torque)
+
+
+@njit(cache=True)
+def _add_weights(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out):
+    for i in range(out.shape[0]):
+        add_weight_into(
+            gravity[i], phi_gripper, phi_object, excess_gripper, excess_object, out[i]
+        )
 
 
 @njit(cache=True)
@@ -117,6 +172,9 @@ def scaled_wrench(
     sigma_gripper: float,
     sigma_object: float,
     gamma: float,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
+    gravity: ArrayLike | None = None,
 ) -> Array:
     """Return F' = gamma F_c + V (sigma_gripper phi_gripper + sigma_object phi_object) (..., 6).
 
@@ -126,22 +184,56 @@ def scaled_wrench(
         wrench, offsets, s, omega, alpha: as for `contact_wrench`.
         phi_gripper, phi_object: (10,) loads about So in S; zeros for a missing part.
         sigma_gripper, sigma_object, gamma: scales >= 0.
+        sigma_weight, sigma_inertia: scales >= 0 of weight and inertia of both parts; None:
+            sigma_gripper and sigma_object.
+        gravity: (3,) or (..., 3) g in S [m/s^2]; needed if weight and inertia have other scales.
 
     Raises:
-        DrakeTeleopError: for a negative scale.
+        DrakeTeleopError: for a negative scale, or a missing gravity.
     """
-    scales = [
-        _scale("sigma_gripper", sigma_gripper),
-        _scale("sigma_object", sigma_object),
-        _scale("gamma", gamma),
-    ]
+    given = {
+        "sigma_gripper": sigma_gripper,
+        "sigma_object": sigma_object,
+        "sigma_weight": sigma_weight,
+        "sigma_inertia": sigma_inertia,
+    }
+    for name, value in given.items():
+        if value is not None:
+            _scale(name, value)
+    weights, inertias = weight_and_inertia_scales(**given)
+    scales = [*inertias, _scale("gamma", gamma)]
+    if weights != inertias and gravity is None:
+        raise unknown_gravity("gravity", "pass gravity, g in S, for each sample")
     phis = checked("phi_gripper", phi_gripper, 10), checked("phi_object", phi_object, 10)
     leading, rows = checked_rows(
         wrench=(wrench, 6), offsets=(offsets, 6), s=(s, 3), omega=(omega, 3), alpha=(alpha, 3)
     )
     out = np.empty_like(rows[0])
     _scaled_wrenches(*rows, *phis, *scales, out)
+    if weights != inertias and gravity is not None:
+        _, (down, _) = checked_rows(gravity=(gravity, 3), wrench=(rows[0].reshape(*leading, 6), 6))
+        excess = [weight - inertia for weight, inertia in zip(weights, inertias, strict=True)]
+        _add_weights(down, *phis, *excess, out)
     return out.reshape(*leading, 6)
+
+
+def weight_and_inertia_scales(
+    sigma_gripper: float,
+    sigma_object: float,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the scales of the weight of gripper and object, and those of their inertia."""
+    both = sigma_gripper, sigma_object
+    weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
+    return weights, both if sigma_inertia is None else (sigma_inertia, sigma_inertia)
+
+
+def unknown_gravity(where: str, remedy: str) -> DrakeTeleopError:
+    """Return the error for different scales of weight and inertia without known gravity."""
+    return DrakeTeleopError(
+        "is unknown, and sigma_weight differs from sigma_inertia", where=where, remedy=remedy
+    )
 
 
 def scales_from_eta(eta: float) -> tuple[float, float, float]:

@@ -11,6 +11,7 @@ g). Functions `..._into` are compiled and do not check their input. A sample is 
 from __future__ import annotations
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import ArrayLike
 
 from drake_teleop.common.compiled import njit
@@ -55,14 +56,20 @@ def regressor_into(s, omega, alpha, V):
     V[5, 4], V[5, 5], V[5, 6], V[5, 7], V[5, 8], V[5, 9] = -xy, xx - yy, ax - yz, xy, ay + xz, az
 
 
-@njit(cache=True)
-def non_contact_wrench_into(s, omega, alpha, phi, out):
-    """Write the wrench V phi (6,) of `non_contact_wrench` into out. phi may be a tuple."""
+@register_jitable
+def wrench_of_load(s, omega, alpha, phi):
+    """Return the force and the torque of V phi as tuples, for scalars of any type."""
     s, omega, alpha = three(s, 0), three(omega, 0), three(alpha, 0)
     m, h, inertia = phi[0], three(phi, 1), symmetric(phi, 4)  # h = m c
     force = plus(plus(times(m, s), cross(alpha, h)), cross(omega, cross(omega, h)))
     torque = plus(apply(inertia, alpha), cross(omega, apply(inertia, omega)))
-    torque = plus(torque, cross(h, s))
+    return force, plus(torque, cross(h, s))
+
+
+@njit(cache=True)
+def non_contact_wrench_into(s, omega, alpha, phi, out):
+    """Write the wrench V phi (6,) of `non_contact_wrench` into out. phi may be a tuple."""
+    force, torque = wrench_of_load(s, omega, alpha, phi)
     out[0], out[1], out[2] = force
     out[3], out[4], out[5] = torque
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,13 @@ from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.numeric import Array, number, one_blas_thread
 from drake_teleop.load.batch.methods import DEFAULT_METHOD, check_method, identify_batch
 from drake_teleop.load.batch.uncertainty import BaseParameters, base_parameters
-from drake_teleop.load.compensation import contact_wrench, scaled_wrench, scales_from_eta
+from drake_teleop.load.compensation import (
+    contact_wrench,
+    scaled_wrench,
+    scales_from_eta,
+    unknown_gravity,
+    weight_and_inertia_scales,
+)
 from drake_teleop.load.contact.noise_floor import finite_covariance, statistic_index
 from drake_teleop.load.identification import PARAMETERS, Identification, identified_object
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
@@ -52,6 +59,7 @@ _CONSTANT_SHARE = 1e-6  # largest relative change of a constant channel
 _MIN_TARE_SAMPLES = 10
 _SIGNIFICANT_DELAY = 5.0  # standard deviations
 _LARGEST_SCALE = 100.0  # as in `ForceScalingConfig`
+_NOT_WITH_ETA = ("sigma_object", "sigma_weight", "sigma_inertia")
 
 
 @dataclass(frozen=True, repr=False)
@@ -297,6 +305,8 @@ def eliminate_log(
     sigma_object: float | None = None,
     gamma: float = 1.0,
     eta: float | None = None,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
     cutoff_hz: float | None = 30.0,
     delay: str | float = "auto",
     tare: bool = True,
@@ -318,6 +328,8 @@ def eliminate_log(
         gamma: scale of the contact wrench.
         eta: kept share of the object's wrench, Eq. (14), instead of the other scales; the gripper's
             is removed.
+        sigma_weight, sigma_inertia: kept shares of weight and inertia, instead of sigma and
+            sigma_object. They may differ if the log has an orientation.
         cutoff_hz: zero-phase low-pass on all outputs; None for no filter.
         tare: estimate the offsets from this record (`robust_offsets`), not from `load`.
         untouched_s: start and end of a time span without contact, which determines the offsets
@@ -333,7 +345,8 @@ def eliminate_log(
             with static poses, or an unknown statistic.
     """
     identification = load if isinstance(load, Identification) else Identification.load(load)
-    scales = _scales(sigma, sigma_object, gamma, eta, gripper is not None)
+    separate = {"sigma_weight": sigma_weight, "sigma_inertia": sigma_inertia}
+    scales = _scales(sigma, sigma_object, gamma, eta, separate, gripper is not None)
     statistic_index(statistic)  # raises an error for an unknown name before the long computation
     # Without a gripper the load is the object.
     phi_gripper = np.zeros(10)
@@ -388,7 +401,7 @@ def _eliminated(
     path: str | Path,
     identification: Identification,
     phi_gripper: Array,
-    scales: dict[str, float],
+    scales: dict[str, Any],
     *,
     cutoff_hz: float | None,
     delay: str | float,
@@ -434,15 +447,18 @@ def _eliminated(
     offsets, fraction = offsets_of(smooth(residual))
     motion = log.motion
     gravity_only = None
+    removed = identification.weight_removed or "weight" in log.free
+    _check_gravity(log, removed, scales)
     if log.gravity is not None:
         rest = np.zeros_like(log.gravity)
-        removed = identification.weight_removed or "weight" in log.free
         gravity = rest if removed else log.gravity
         weightless = contact_wrench(log.wrench, np.zeros(6), -gravity, rest, rest, phi)
         weightless = smooth(weightless)
         gravity_only = weightless - offsets_of(weightless)[0]
     contact = contact_wrench(log.wrench, offsets, *motion, phi)
-    scaled = scaled_wrench(log.wrench, offsets, *motion, phi_gripper, phi_object, **scales)
+    parts = phi_gripper, phi_object
+    scales = scales | {"gravity": log.gravity}
+    scaled = scaled_wrench(log.wrench, offsets, *motion, *parts, **scales)
     causal_wrench = None
     if causal is not None and aligned.differentiated is not None:
         causal_offsets, motion = identification.offsets, aligned.differentiated.motion
@@ -451,7 +467,7 @@ def _eliminated(
             causal_offsets = _start_samples(log, causal_tare_s, untouched).mean(axis=0)
         causal_wrench = causal_wrenches(
             contact_wrench(log.wrench, causal_offsets, *motion, phi),
-            scaled_wrench(log.wrench, causal_offsets, *motion, phi_gripper, phi_object, **scales),
+            scaled_wrench(log.wrench, causal_offsets, *motion, *parts, **scales),
             log.dt,
             cutoff_hz=cutoff_hz,
             delay_s=delay_s,
@@ -532,10 +548,38 @@ def _suspected_errors(
     return tuple(x for x in check_log(path).findings if x.name not in ignored)
 
 
+def removed_weight(where: str) -> DrakeTeleopError:
+    """Return the error for different scales of weight and inertia of a removed weight."""
+    return DrakeTeleopError(
+        "the robot has removed the weight, so that sigma_weight has no effect",
+        where=where,
+        remedy="use sigma alone; it scales the inertia",
+    )
+
+
+def _check_gravity(log: Log, removed: bool, scales: dict[str, Any]) -> None:
+    sigmas = {name: value for name, value in scales.items() if name != "gamma"}
+    weights, inertias = weight_and_inertia_scales(**sigmas)
+    if weights == inertias:
+        return
+    if removed:
+        raise removed_weight(log.source)
+    if log.gravity is None:
+        raise unknown_gravity(
+            f"{log.source}: gravity in the sensor frame", "add an orientation, or use sigma alone"
+        )
+
+
 def _scales(
-    sigma: float, sigma_object: float | None, gamma: float, eta: float | None, split: bool
-) -> dict[str, float]:
-    for name, value in (("sigma", sigma), ("sigma_object", sigma_object), ("gamma", gamma)):
+    sigma: float,
+    sigma_object: float | None,
+    gamma: float,
+    eta: float | None,
+    separate: dict[str, float | None],
+    split: bool,
+) -> dict[str, float | None]:
+    given = {"sigma": sigma, "sigma_object": sigma_object, "gamma": gamma, **separate}
+    for name, value in given.items():
         if value is not None and not 0.0 <= number(name, value) <= _LARGEST_SCALE:
             raise DrakeTeleopError(f"{value:g} is outside 0 to {_LARGEST_SCALE:g}", where=name)
     if sigma_object is not None and not split:
@@ -546,12 +590,12 @@ def _scales(
         )
     if eta is None:
         kept = sigma if sigma_object is None else sigma_object
-        return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma}
-    if sigma != 0 or gamma != 1 or sigma_object is not None:
+        return {"sigma_gripper": sigma, "sigma_object": kept, "gamma": gamma, **separate}
+    if sigma != 0 or gamma != 1 or any(given[name] is not None for name in _NOT_WITH_ETA):
         raise DrakeTeleopError(
             "eta requires sigma = 0 and gamma = 1 (Eq. 14)",
             where="eta",
-            remedy="leave sigma, sigma_object and gamma out",
+            remedy="leave all scales but eta out",
         )
     sigma_gripper, kept, gamma = scales_from_eta(eta)
-    return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma}
+    return {"sigma_gripper": sigma_gripper, "sigma_object": kept, "gamma": gamma, **separate}

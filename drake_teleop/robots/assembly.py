@@ -157,7 +157,8 @@ class MotionWindow:
     def take(self, part: Part, now: float) -> list[tuple[float, Array]]:
         """Return the motions that a part, received at time `now` [s], completes.
 
-        Each is a time [s] with specific force, angular velocity and acceleration (9,) in S.
+        Each is a time [s] with specific force, angular velocity and acceleration in S; from poses
+        also with gravity in S: (9,) or (12,).
         """
         row = self._row(part)
         if row is None:
@@ -203,7 +204,7 @@ class MotionWindow:
         R_WS = rows[self._size // 2, :9].reshape(3, 3)
         omega, alpha = R_WS.T @ first[:9].reshape(3, 3), R_WS.T @ (2.0 * second[:9]).reshape(3, 3)
         s = R_WS.T @ (2.0 * second[9:] - self._gravity_W)
-        return np.concatenate([s, _axis(omega), _axis(alpha)])
+        return np.concatenate([s, _axis(omega), _axis(alpha), R_WS.T @ self._gravity_W])
 
 
 def _axis(A: Array) -> Array:
@@ -319,10 +320,11 @@ class Assembly:
         if part.t < before[0] or after[0] - before[0] > STALE_S:
             return Reading(part.number, part.t, values, flags | Flag.STALE)
         share = (part.t - before[0]) / max(after[0] - before[0], 1e-9)
-        values[6:] = before[1] + share * (after[1] - before[1])
+        motion = before[1] + share * (after[1] - before[1])
+        values[6:] = motion[:9]
         if self._tracker is not None and not flags and np.isfinite(part.values).all():
             self._tracker.take((part.t, values[6:]), part.values, before, after)
-        return Reading(part.number, part.t, values, flags)
+        return Reading(part.number, part.t, values, flags, motion[9:] if len(motion) > 9 else None)
 
     def close(self) -> None:
         """See `Source`."""

@@ -112,6 +112,8 @@ def compensate_command(
     *,
     sigma: float = 0.0,
     gamma: float = 1.0,
+    sigma_weight: float | None = None,
+    sigma_inertia: float | None = None,
     cutoff_hz: float | None = 30.0,
     largest: tuple[float, float] | None = None,
     predicted: bool = False,
@@ -124,7 +126,7 @@ def compensate_command(
     """Run the command `compensate`; messages go to stderr.
 
     Args:
-        sigma, gamma, cutoff_hz, predicted: see `Compensator`.
+        sigma, gamma, sigma_weight, sigma_inertia, cutoff_hz, predicted: see `Compensator`.
         largest: range of the sensor: force [N], torque [N m].
         free: log of free motion, see `Detector`.
         control: UDP port of `Control`.
@@ -140,6 +142,8 @@ def compensate_command(
         readings.dt,
         sigma=sigma,
         gamma=gamma,
+        sigma_weight=sigma_weight,
+        sigma_inertia=sigma_inertia,
         cutoff_hz=cutoff_hz,
         wait=getattr(readings, "wait", 0),
         predicted=predicted,

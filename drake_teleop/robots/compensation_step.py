@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from drake_teleop.common.compiled import njit
-from drake_teleop.load.compensation import scaled_wrench_into
+from drake_teleop.load.compensation import add_weight_into, scaled_wrench_into
 
 NOT_FINITE, TOO_LARGE, AT_RANGE = 1, 2, 4
 
@@ -52,14 +52,17 @@ def low_pass_into(x, low_pass, memory):
 
 
 @njit(cache=True)
-def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest, at, out):
+def eliminate_into(
+    values, gravity, offsets, phi, nothing, scales, low_pass, memory, rest, at, out
+):
     """Write the contact wrench and scaled wrench of a valid reading to out (12,).
 
     Args:
         values: (15,) reading.
+        gravity: (3,) gravity in S, used only for different scales of weight and inertia.
         offsets: (6,) sensor offsets.
         phi, nothing: (10,) the load, and zeros.
-        scales: (3,) see `scaled_wrench_into`.
+        scales: (4,) see `scaled_wrench_into`; then scale of the weight minus that of the inertia.
         low_pass, memory: see `low_pass_into`; low_pass may be empty.
         rest: (rows, 21); row `at` receives the reading and its unfiltered contact wrench.
     """
@@ -68,6 +71,8 @@ def eliminate_into(values, offsets, phi, nothing, scales, low_pass, memory, rest
     scaled_wrench_into(wrench, offsets, s, omega, alpha, phi, nothing, 0.0, 0.0, 1.0, contact)
     a, b, c = scales[0], scales[1], scales[2]
     scaled_wrench_into(wrench, offsets, s, omega, alpha, nothing, phi, a, b, c, scaled)
+    if scales[3] != 0.0:
+        add_weight_into(gravity, nothing, phi, 0.0, scales[3], scaled)
     rest[at, :15] = values
     rest[at, 15:] = contact
     if len(low_pass) > 0:

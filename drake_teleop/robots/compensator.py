@@ -13,9 +13,10 @@ from collections import deque
 import numpy as np
 
 from drake_teleop.common.numeric import Array
+from drake_teleop.load.compensation import unknown_gravity
 from drake_teleop.load.identification import Identification
 from drake_teleop.logs.causal import filter_lag, low_pass_coefficients
-from drake_teleop.logs.processing import usable_phi
+from drake_teleop.logs.processing import removed_weight, usable_phi
 from drake_teleop.robots.compensation_step import (
     AT_RANGE,
     NOT_FINITE,
@@ -41,6 +42,7 @@ MAX_OFFSET_DRIFT = np.repeat([5.0, 0.25], 3)
 """Maximum drift of the offsets [N, N m]."""
 _RATE_READINGS, _RATE_S = 200, 0.4  # readings, and [s]; longer than a burst of packets
 _MAX_TIME_S = 1e12  # [s]
+_NO_GRAVITY = np.zeros(3)
 _MAX_VALUES = np.repeat([1e5, 1e4, 1e4, 1e3, 1e6], 3)
 # Integers, because each operation on a `Flag` takes a microsecond.
 _DAMAGED, _STALE, _CLIPPED = int(Flag.DAMAGED), int(Flag.STALE), int(Flag.CLIPPED)
@@ -82,6 +84,7 @@ class Compensator:
 
     Args:
         sigma, gamma: scales of load wrench and contact wrench in the scaled wrench.
+        sigma_weight, sigma_inertia: scales of the load's weight and inertia; None: sigma.
         wait: delay of the motion, in readings, for which the source has corrected.
         predicted: extrapolate over `wait` and the delay of the low-pass.
         largest: (6,) range of the sensor [N, N m].
@@ -100,6 +103,8 @@ class Compensator:
         *,
         sigma: float = 0.0,
         gamma: float = 1.0,
+        sigma_weight: float | None = None,
+        sigma_inertia: float | None = None,
         cutoff_hz: float | None = 30.0,
         wait: int = 0,
         predicted: bool = False,
@@ -108,7 +113,11 @@ class Compensator:
         detector: Detector | None = None,
     ) -> None:
         self._phi, self._zero_phi = usable_phi(load)[0], np.zeros(10)
-        self._scales, self._dt = np.array([sigma, sigma, gamma], float), dt
+        weight = sigma if sigma_weight is None else sigma_weight
+        inertia = sigma if sigma_inertia is None else sigma_inertia
+        if weight != inertia and load.weight_removed:
+            raise removed_weight("load")
+        self._scales, self._dt = np.array([inertia, inertia, gamma, weight - inertia], float), dt
         self.offsets = load.offsets.copy()
         self.lag_s = wait * dt + filter_lag(dt, cutoff_hz)
         self._low_pass, self._watch, self._detector = np.empty(0), watch, detector
@@ -130,7 +139,7 @@ class Compensator:
         self.good_count = 0
         # Load compiled code now; otherwise the first readings would be stale.
         value_problem(np.zeros(VALUES), self._largest, self._range)
-        clip(self._eliminate(np.zeros(VALUES)), self._range)
+        clip(self._eliminate(np.zeros(VALUES), np.zeros(3)), self._range)
         self._reset_filters()
         self.good_count = 0
 
@@ -143,7 +152,7 @@ class Compensator:
         if now - self._now > STALE_S:
             self._reset_filters()
         self._now, self._number, self._t = now, reading.number, reading.t
-        self._delay_line.append(self._eliminate(reading.values))
+        self._delay_line.append(self._eliminate(reading.values, reading.gravity))
         if invalid:
             return self._zero(flags)
         if self._watch is not None:
@@ -241,12 +250,19 @@ class Compensator:
             self._detector.restart()
         self._delay_line.clear()
 
-    def _eliminate(self, values: Array) -> Array:
+    def _eliminate(self, values: Array, gravity: Array | None) -> Array:
+        if gravity is None:
+            if self._scales[3] != 0.0:
+                remedy = "use a source with poses or joint positions, or --sigma alone"
+                raise unknown_gravity("gravity in the sensor frame", remedy)
+            gravity = _NO_GRAVITY
         out = np.empty(12)
         at = self.good_count % len(self._tare_rows)
         phi, zero, scales = self._phi, self._zero_phi, self._scales
         filters = self._low_pass, self._memory
-        eliminate_into(values, self.offsets, phi, zero, scales, *filters, self._tare_rows, at, out)
+        eliminate_into(
+            values, gravity, self.offsets, phi, zero, scales, *filters, self._tare_rows, at, out
+        )
         self.good_count += 1
         return out
 

@@ -55,6 +55,7 @@ class LogSource(Source[Reading]):
         self.dt, self.live = log.dt, real_time
         self.wait = max(0, math.ceil(delay_s / log.dt - 1e-6))
         self._t, self._values = log.t, np.hstack([log.wrench, *log.motion])
+        self._gravity = log.gravity
         self._flags = np.where(measured(log, cutoff_hz), 0, int(Flag.GAP))
         self._at, self._chunk, self._start = 0, chunk, math.nan
 
@@ -72,7 +73,9 @@ class LogSource(Source[Reading]):
             here = time.monotonic() - self._start
             stop = min(stop, int(np.searchsorted(self._t, here, side="right")))
         self._at = max(first, stop)
-        return [
-            Reading(k, float(self._t[k]), self._values[k], int(self._flags[k]))
-            for k in range(first, self._at)
-        ]
+        found = []
+        for k in range(first, self._at):
+            gravity = None if self._gravity is None else self._gravity[k]
+            flags = int(self._flags[k])
+            found.append(Reading(k, float(self._t[k]), self._values[k], flags, gravity))
+        return found

@@ -43,13 +43,14 @@ class Reading(NamedTuple):
     """Sample of wrench and motion: number, time [s] on the source's clock, values (15,), flags.
 
     Values: wrench of sensor on load (6) [N, N m], specific force, angular velocity and acceleration
-    (3 each), in the sensor frame S.
+    (3 each), in the sensor frame S. Gravity (3,) [m/s^2] in S is None without an orientation.
     """
 
     number: int
     t: float
     values: Array
     flags: int = 0
+    gravity: Array | None = None
 
 
 class Part(NamedTuple):

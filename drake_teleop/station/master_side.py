@@ -117,7 +117,7 @@ def _make_operator(scenario: Scenario, start_B: NDArray[np.float64]) -> Operator
     training = Training(
         RollPitchYaw(scaling.alignment).ToRotationMatrix().matrix(),
         scaling.translation_scale,
-        forces.scales()[2] * forces.force_scale,
+        forces.scales().gamma * forces.force_scale,
         forward,
         backward,
         scenario.simulation.seed,

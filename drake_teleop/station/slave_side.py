@@ -318,8 +318,8 @@ def _check_load_is_known(scenario: Scenario, estimate: Array | None) -> None:
         estimate = checked("load_estimate", estimate, 16)
         if not scenario.load_estimator.enabled:
             check_identified("load_estimate", estimate[6:])
-    sigma_gripper, sigma_object, gamma = scenario.force_scaling.scales()
-    needed = not sigma_gripper == sigma_object == gamma
+    scales = scenario.force_scaling.scales()
+    needed = {*scales.shares} != {scales.gamma}
     if needed and not _has_load_estimate(scenario, estimate):
         raise DrakeTeleopError(
             "sigma and gamma differ, but there is no load estimate",

@@ -28,7 +28,7 @@ def test_axis_has_the_parameters_of_the_scenario():
         Scenario(),
         channel=Channel(delay=0.02, backward=NetworkConfig(delay=0.04)),
         sheet_spring=SheetSpring(thickness=0.001),
-        force_scaling__sigma=0.5,
+        force_scaling__sigma_inertia=0.5,
         kinematic_scaling__translation_scale=2.0,
         operator__grip="firm",
     )

@@ -105,3 +105,62 @@ def test_bad_input_is_named():
         contact_wrench(np.zeros(5), OFFSETS, *np.zeros((3, 3)), TOOL)
     with pytest.raises(DrakeTeleopError, match=r"^offsets: is not finite"):
         contact_wrench(np.zeros(6), np.full(6, np.nan), *np.zeros((3, 3)), TOOL)
+
+
+GRAVITY = np.array([1.2, -7.5, 6.1])
+
+
+@given(vectors(6, 100.0), motions(), loads(), loads(), vectors(3, 10.0), scales, scales, scales)
+def test_weight_and_inertia_have_separate_scales(F, motion, gripper, thing, g, weight, inertia, c):
+    s, omega, alpha = motion
+    phi, rest = gripper + thing, np.zeros(3)
+    parts = (
+        c * contact_wrench(F, OFFSETS, *motion, phi)
+        + weight * non_contact_wrench(-g, rest, rest, phi)
+        + inertia * non_contact_wrench(s + g, omega, alpha, phi)
+    )
+    found = scaled_wrench(
+        F, OFFSETS, *motion, gripper, thing, **named(0.3, 0.4, c),
+        sigma_weight=weight, sigma_inertia=inertia, gravity=g,
+    )  # fmt: skip
+    np.testing.assert_allclose(found, parts, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("given", ["sigma_weight", "sigma_inertia"])
+def test_the_other_share_is_that_of_each_part(given):
+    motion, thing, g = rich_motion(5), 0.1 * TOOL, np.tile(GRAVITY, (5, 1))
+    rest, F = np.zeros((5, 3)), np.ones((5, 6))
+    free = {"sigma_gripper": 0.3, "sigma_object": 0.8, "gamma": 1.5, "gravity": GRAVITY}
+    found = scaled_wrench(F, OFFSETS, *motion, TOOL, thing, **free, **{given: 0.5})
+    weight = non_contact_wrench(-g, rest, rest, TOOL), non_contact_wrench(-g, rest, rest, thing)
+    same = scaled_wrench(F, OFFSETS, *motion, TOOL, thing, **named(0.3, 0.8, 1.5))
+    if given == "sigma_weight":
+        expected = same + (0.5 - 0.3) * weight[0] + (0.5 - 0.8) * weight[1]
+    else:
+        halves = scaled_wrench(F, OFFSETS, *motion, TOOL, thing, **named(0.5, 0.5, 1.5))
+        expected = halves + (0.3 - 0.5) * weight[0] + (0.8 - 0.5) * weight[1]
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("gravity", [None, GRAVITY])
+def test_equal_shares_are_sigma_to_the_last_bit(gravity):
+    motion, F = rich_motion(20), np.ones((20, 6))
+    sigma = scaled_wrench(F, OFFSETS, *motion, TOOL, 0 * TOOL, **named(0.3, 0.3, 1.2))
+    apart = scaled_wrench(
+        F, OFFSETS, *motion, TOOL, 0 * TOOL, **named(2.0, 4.0, 1.2),
+        sigma_weight=0.3, sigma_inertia=0.3, gravity=gravity,
+    )  # fmt: skip
+    assert sigma.tobytes() == apart.tobytes()
+
+
+def test_different_shares_need_gravity():
+    with pytest.raises(DrakeTeleopError, match="gravity: is unknown.*; pass gravity"):
+        scaled_wrench(
+            np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **named(1.0, 1.0, 1.0),
+            sigma_weight=0.5,
+        )  # fmt: skip
+    with pytest.raises(DrakeTeleopError, match="sigma_inertia: .* is not a finite number >= 0"):
+        scaled_wrench(
+            np.zeros(6), OFFSETS, *np.zeros((3, 3)), TOOL, TOOL, **named(1.0, 1.0, 1.0),
+            sigma_inertia=-0.5,
+        )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from known_motion import motion_at
 from planted import good, written
+from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from drake_teleop.cli.logs import eliminate_command, identify_command
@@ -21,6 +22,7 @@ from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.logs.contact import robust_offsets
 from drake_teleop.logs.processing import eliminate_log, identify_log
 from drake_teleop.logs.read.canonical import WRENCH, Log, write_log
+from drake_teleop.logs.read.description import STANDARD_GRAVITY
 from drake_teleop.logs.read.reading import read_log
 
 PHI = phi_from_mass_com_inertia(3.13, [0.01, -0.02, 0.12], np.diag([0.02, 0.018, 0.006]))
@@ -209,6 +211,43 @@ def test_scaling_law_on_a_log(tmp_path: Path, load: Path, sigma: float, gamma: f
     expected = gamma * found.contact + sigma * found.non_contact
     np.testing.assert_allclose(found.scaled, expected, atol=1e-9)
     np.testing.assert_allclose(found.contact + found.non_contact, found.measured, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_separate_scales_of_weight_and_inertia_on_a_log(tmp_path: Path, load: Path) -> None:
+    t = np.arange(0, 4, 1e-3)
+    now = motion_at(t)
+    gravity = np.einsum("nji,j->ni", now.R_WS, [0.0, 0.0, -STANDARD_GRAVITY])
+    wrench = non_contact_wrench(now.specific_force, now.omega, now.alpha, PHI) + OFFSETS
+    log = tmp_path / "log.parquet"
+    write_log(Log(t, wrench, now.specific_force, now.omega, now.alpha), log)
+    turn = Rotation.from_matrix(now.R_WS).as_quat(scalar_first=True).T
+    columns = [pl.Series(f"q_{axis}", values) for axis, values in zip("wxyz", turn, strict=True)]
+    pl.read_parquet(log).with_columns(columns).write_parquet(log)
+    options = {"cutoff_hz": None, "delay": 0.0}
+    found = eliminate_log(log, load, sigma=0.5, sigma_weight=0.2, gamma=2.0, **options)
+    rest = np.zeros_like(gravity)
+    weight = non_contact_wrench(-gravity, rest, rest, found.phi)
+    expected = 2.0 * found.contact + 0.5 * found.non_contact - 0.3 * weight
+    np.testing.assert_allclose(found.scaled, expected, atol=1e-9)
+    both = eliminate_log(log, load, sigma_weight=0.5, sigma_inertia=0.5, gamma=2.0, **options)
+    same = eliminate_log(log, load, sigma=0.5, gamma=2.0, **options)
+    np.testing.assert_array_equal(both.scaled, same.scaled)
+
+
+@pytest.mark.parametrize(
+    ("scales", "message"),
+    [
+        ({"sigma_weight": 0.5}, "gravity in the sensor frame: is unknown.*add an orientation"),
+        ({"sigma_inertia": 101.0}, "sigma_inertia: 101 is outside 0 to 100"),
+        ({"eta": 0.5, "sigma_weight": 0.0}, "eta requires sigma = 0"),
+    ],
+)
+def test_unusable_scales_of_weight_and_inertia_are_rejected(
+    tmp_path: Path, load: Path, scales: dict[str, float], message: str
+) -> None:
+    with pytest.raises(DrakeTeleopError, match=message):
+        eliminate_log(simulated(tmp_path / "log.parquet"), load, **scales)
 
 
 @pytest.mark.slow

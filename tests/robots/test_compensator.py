@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.identification import Identification
 from drake_teleop.load.inertia import phi_from_mass_com_inertia
 from drake_teleop.load.regressor import non_contact_wrench
@@ -77,12 +80,15 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "log.parquet"
     kept = (t < 1.5) | (t > 1.56)
     write_log(Log(t[kept], wrench[kept], *(x[kept] for x in moving(t - DELAY))), path)
+    turn = {"q_w": np.cos(t), "q_x": 0.6 * np.sin(t), "q_y": 0 * t, "q_z": 0.8 * np.sin(t)}
+    columns = [pl.Series(name, values[kept]) for name, values in turn.items()]
+    pl.read_parquet(path).with_columns(columns).write_parquet(path)
     return path
 
 
-@pytest.mark.parametrize("mode", ["delayed", "predicted"])
-def test_replayed_log_equals_eliminate(log: Path, mode: str) -> None:
-    options = {"sigma": 0.3, "gamma": 1.5}
+@pytest.mark.parametrize(("mode", "weight"), [("delayed", None), ("predicted", 0.9)])
+def test_replayed_log_equals_eliminate(log: Path, mode: str, weight: float | None) -> None:
+    options = {"sigma": 0.3, "gamma": 1.5, "sigma_weight": weight}
     wanted = eliminate_log(log, load(), **options, causal=mode, delay=DELAY)
     assert wanted.causal is not None and len(wanted.log) < 960
 
@@ -101,6 +107,26 @@ def test_replayed_log_equals_eliminate(log: Path, mode: str) -> None:
         assert all(not row.contact.any() for row in kept.rows if row.flags)
 
     at()
+
+
+def test_weight_and_inertia_have_separate_scales() -> None:
+    (reading,) = readings(1, touched=4.0)
+    gravity, rest = np.array([3.0, -5.0, 7.0]), np.zeros(3)
+    options = {"sigma": 9.0, "sigma_weight": 0.8, "sigma_inertia": 0.3, "gamma": 2.0}
+    compensator = Compensator(load(), DT, **options, cutoff_hz=None)
+    found = compensator.step(reading._replace(gravity=gravity), 0.0).scaled
+    s, omega, alpha = np.split(reading.values[6:], 3)
+    expected = 0.8 * non_contact_wrench(-gravity, rest, rest, PHI)
+    expected += 0.3 * non_contact_wrench(s + gravity, omega, alpha, PHI) + 2.0 * 4.0 * np.eye(6)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_separate_scales_need_gravity_in_the_readings() -> None:
+    compensator = Compensator(load(), DT, sigma_weight=0.5)
+    with pytest.raises(DrakeTeleopError, match="gravity in the sensor frame: is unknown"):
+        compensator.step(readings(1)[0], 0.0)
+    with pytest.raises(DrakeTeleopError, match="the robot has removed the weight"):
+        Compensator(replace(load(), weight_removed=True), DT, sigma_inertia=0.5)
 
 
 def bad(reading: Reading, name: str) -> Reading:

@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.load.regressor import non_contact_wrench
 from drake_teleop.station.scaling.force_scaling import ForceScaling, ForceScalingConfig
+from drake_teleop.station.slave.arm import acceleration_into
 from drake_teleop.station.slave.plant import AddSlavePlant
 from drake_teleop.station.slave.slave_config import Slave
 
@@ -32,8 +33,7 @@ def outputs(
     measured = non_contact_wrench(*motion, arm.phi_load) + offsets + contact
     block = ForceScaling(config, arm, np.eye(3))
     context = block.CreateDefaultContext()
-    q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
-    sample = np.concatenate([measured, *motion, [0.0], q, [0.0]])
+    sample = np.concatenate([measured, *motion, [0.0], Q, [0.0]])
     block.GetInputPort("sample").FixValue(context, sample)
     block.GetInputPort("load_estimate").FixValue(context, np.concatenate([offsets, arm.phi_load]))
     if scales is not None:
@@ -88,6 +88,40 @@ def test_each_scale_that_is_set_while_running_scales_its_own_part(arm):
     assert np.linalg.norm(gripper) > 1.0
 
 
+Q = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0])
+
+
+def weight_wrench(arm, phi) -> np.ndarray:
+    """The wrench V(-g) phi in the pose of `outputs`."""
+    gravity = np.empty(3)
+    acceleration_into(arm.table, Q, np.zeros(3), gravity)
+    assert np.linalg.norm(gravity) == pytest.approx(9.81, rel=1e-3)
+    return non_contact_wrench(-gravity, np.zeros(3), np.zeros(3), phi)
+
+
+def test_weight_and_inertia_have_separate_scales(arm):
+    contact = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])
+    config = ForceScalingConfig(sigma=7.0, sigma_weight=0.3, sigma_inertia=0.8, gamma=3.0)
+    out = outputs(config, arm, contact)
+    expected = 3.0 * contact + 0.8 * out["non_contact_wrench_S"]
+    expected += (0.3 - 0.8) * weight_wrench(arm, arm.phi_load)
+    np.testing.assert_allclose(out["scaled_wrench_S"], expected, atol=1e-12)
+    rest = outputs(ForceScalingConfig(sigma=0.0, gamma=3.0), arm, contact)["wrench_B"]
+    np.testing.assert_allclose(out["load_wrench_B"], out["wrench_B"] - rest, atol=1e-12)
+
+
+def test_weight_that_is_set_while_running_is_that_of_both_parts(arm):
+    scales = dict(sigma_gripper=0.2, sigma_object=0.7, gamma=1.0, force_scale=0.05)
+    config = ForceScalingConfig(gripper_phi=GRIPPER)
+    same, apart = (
+        outputs(config, arm, scales=scales | more)["scaled_wrench_S"]
+        for more in ({}, {"sigma_weight": 1.5})
+    )
+    gripper = weight_wrench(arm, np.array(GRIPPER))
+    thing = weight_wrench(arm, arm.phi_load) - gripper
+    np.testing.assert_allclose(apart - same, 1.3 * gripper + 0.8 * thing, atol=1e-12)
+
+
 def test_rendered_wrench_is_the_scaled_reaction(arm):
     out = outputs(ForceScalingConfig(sigma=1.0), arm)
     force_S, force_B = out["scaled_wrench_S"][:3], out["wrench_B"][:3]
@@ -112,6 +146,7 @@ def test_load_wrench_is_the_rest_beside_the_contact(arm):
         ForceScalingConfig(sigma=0.5, eta=0.5, gripper_phi=GRIPPER),
         ForceScalingConfig(sigma=0.0, gamma=2.0, eta=0.5, gripper_phi=GRIPPER),
         ForceScalingConfig(sigma=0.0, eta=0.5),
+        ForceScalingConfig(sigma=0.0, eta=0.5, gripper_phi=GRIPPER, sigma_weight=0.0),
     ],
 )
 def test_eta_requires_sigma_0_gamma_1_and_a_gripper(config, arm):

@@ -24,7 +24,8 @@ Complex = NDArray[np.complex128]
 class Axis:
     """Parameters of all models of one direction; default: the paper's station with medium grip.
 
-    sigma and gamma are the displayed shares of the tool's inertial force and of the contact force.
+    sigma and gamma are the displayed shares of the tool's inertial force and of the contact force:
+    sigma is `sigma_inertia` of a scenario, and the constant weight has no effect.
     """
 
     hand_mass: float = 0.25  #: kg

@@ -79,7 +79,7 @@ def task_direction(
     n_W = checked("direction", direction, 3)
     if not np.linalg.norm(n_W) > 0.0:
         raise DrakeTeleopError("a direction of length zero", where="direction")
-    sigma, sigma_object, gamma = scenario.force_scaling.scales()
+    sigma, sigma_object, gamma = scenario.force_scaling.scales()[:3]
     if sigma != sigma_object:
         raise DrakeTeleopError(
             "gripper and object have different scales; one axis needs one sigma",

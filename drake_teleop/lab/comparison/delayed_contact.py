@@ -119,7 +119,7 @@ def energy_between(result: SimulationResult, scenario: Scenario) -> NDArray[np.f
     Negative: the station is active between the hand and the slave's actual motion.
     """
     accounts = station_accounts(result, scenario)[:, [HAND, ACTUAL]].sum(axis=1)
-    if any(scenario.force_scaling.scales()[:2]):
+    if any(scenario.force_scaling.scales().shares):
         accounts += load_work(result, scenario)
     return np.asarray(start_energy(scenario).sum() + accounts.sum(axis=1))
 

@@ -22,7 +22,13 @@ from drake_teleop.station.passivity import methods
 from drake_teleop.station.passivity.energy import ledger, port_work
 from drake_teleop.station.result import SimulationResult
 from drake_teleop.station.scenario import Scenario
-from drake_teleop.station.slave.arm import inverse_dynamics, jacobian, pose_into, sensor_motion
+from drake_teleop.station.slave.arm import (
+    GRAVITY,
+    inverse_dynamics,
+    jacobian,
+    pose_into,
+    sensor_motion,
+)
 
 Array = NDArray[np.float64]
 
@@ -53,7 +59,7 @@ def station_accounts(result: SimulationResult, scenario: Scenario) -> Array:
     if "true_contact_wrench_W" in result:
         force, torque = np.split(result["true_contact_wrench_W"], 2, axis=1)
         contact = np.hstack([force, torque - np.cross(poses[:, 4:], force)])
-    _, _, gamma = scenario.force_scaling.scales()
+    gamma = scenario.force_scaling.scales().gamma
     power = scenario.force_scaling.force_scale * gamma / _motion_scale(scenario)
     rates = scenario.rates
     accounts = np.empty((len(t), 4, 2))
@@ -84,12 +90,18 @@ def load_work(result: SimulationResult, scenario: Scenario) -> Array:
     for k in range(len(t)):
         pose_into(arm.table, q[k], poses[k])
         sensor_motion(arm.table, q[k], v[k], a[k], motion[k])
-    gripper, rest, _ = scenario.force_scaling.scales()
     held = scenario.force_scaling.gripper_phi
     of_gripper = arm.phi_load if held is None else np.asarray(held)
-    felt = gripper * of_gripper + rest * (arm.phi_load - of_gripper)
-    wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], felt)
     R_WS = motion[:, np.newaxis, 12:].reshape(-1, 1, 3, 3)
+    gravity = arm.table[-1, GRAVITY : GRAVITY + 3] @ R_WS[:, 0]
+    inertias, weights = np.split(np.array(scenario.force_scaling.scales().shares), 2)
+    kept, excess = (
+        part[0] * of_gripper + part[1] * (arm.phi_load - of_gripper)
+        for part in (inertias, weights - inertias)
+    )
+    rest = np.zeros_like(gravity)
+    wrench = -non_contact_wrench(motion[:, :3], motion[:, 3:6], motion[:, 6:9], kept)
+    wrench -= non_contact_wrench(-gravity, rest, rest, excess)
     at_So = (R_WS @ wrench.reshape(-1, 2, 3, 1)).reshape(-1, 6)
     power = scenario.force_scaling.force_scale / _motion_scale(scenario)
     return np.asarray(power * port_work(at_So, poses, "mean"))

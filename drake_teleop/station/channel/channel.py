@@ -191,47 +191,84 @@ def channel_step(
     """
     k = int(ends[_STEP])
     ends[_STEP] += 1.0
-    before_M, before_S = ends[_POSE_M], ends[_POSE_S]
-    held_M, held_S = ends[_WRENCH_M], ends[_WRENCH_S]
-    watch_M, watch_S = ends[_WATCH_M], ends[_WATCH_S]
-    memory_M, memory_S = ends[MEMORY_M], ends[MEMORY_S]
-    work_M, work_S = ports[_WORK_M], ports[_WORK_S]
-    dx, twist, hand, wrench = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-    limits, command, left = np.empty(2), np.empty(13), pose_received.copy()
     received, packet = np.zeros(PACKET_SIZE), np.empty(PACKET_SIZE)
+    _, fresh = network.receive(backward_parameters, backward, k, received)
+    master_end(
+        steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends,
+        ports[_WORK_M], packet, wrench_received,
+    )  # fmt: skip
+    network.send(forward_parameters, forward, k, packet)
+    _, fresh = network.receive(forward_parameters, forward, k + 1, received)
+    slave_end(
+        steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
+        parameters, ends, pose_received, ports, packet,
+    )  # fmt: skip
+    network.send(backward_parameters, backward, k, packet)
+    ports[_SILENCE][0], ports[_SILENCE][1] = ends[_WATCH_M][SILENT], ends[_WATCH_S][SILENT]
 
-    # The master's end.
-    valid = _increment_into(pose_command, before_M, dx)
+
+@njit(cache=True)
+def master_end(
+    steps, pose_command, hand_B, received, fresh, T, timeout, frame, parameters, ends, work, packet,
+    wrench_received,
+):  # fmt: skip
+    """Run one step of the master's end.
+
+    Args:
+        received: (PACKET_SIZE,) newest packet of the slave.
+        fresh: True if it is new.
+        work: (2,) energy input of the hand, updated.
+        packet: (PACKET_SIZE,) written: packet to the slave.
+        wrench_received: (7,) as the other arguments: see `channel_step`.
+    """
+    before, held = ends[_POSE_M], ends[_WRENCH_M]
+    watch, memory = ends[_WATCH_M], ends[MEMORY_M]
+    dx, twist, hand, limits = np.empty(6), np.empty(6), np.empty(6), np.empty(2)
+    valid = _increment_into(pose_command, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work_M[g] -= dot(held_M, dx, g)
+        work[g] -= dot(held, dx, g)
     hand[:] = 0.0
     if sound(hand_B):
         _to_world(hand_B, frame, hand)
     else:
         valid = False
-    _, fresh = network.receive(backward_parameters, backward, k, received)
     healthy = fresh and received[HEALTHY] > 0.5
     fault = (fresh and not healthy) or not valid
-    master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held_M, watch_M, limits)
+    master_limits_into(healthy, fault, T, timeout, parameters[LIMIT], held, watch, limits)
     methods.master_step(
-        steps, received, fresh, before_M[:7], twist, dx, hand, limits, T, parameters, memory_M,
-        held_M, packet,
+        steps, received, fresh, before[:7], twist, dx, hand, limits, T, parameters, memory, held,
+        packet,
     )  # fmt: skip
     if not valid:
         packet[HEALTHY] = 0.0
-    network.send(forward_parameters, forward, k, packet)
-    _to_master(held_M, frame, wrench_received[_RENDERED])
+    _to_master(held, frame, wrench_received[_RENDERED])
     wrench_received[_CONTACT_FLAG] = received[CONTACT]
 
-    # The slave's end.
-    valid = _increment_into(slave_pose, before_S, dx)
+
+@njit(cache=True)
+def slave_end(
+    steps, wrench_B, load_B, slave_pose, saturated, contact, received, fresh, T, timeout, frame,
+    parameters, ends, pose_received, ports, packet,
+):  # fmt: skip
+    """Run one step of the slave's end.
+
+    Args:
+        received: (PACKET_SIZE,) newest packet of the master.
+        fresh: True if it is new.
+        packet: (PACKET_SIZE,) written: packet to the master; other arguments: see `channel_step`.
+    """
+    before, held = ends[_POSE_S], ends[_WRENCH_S]
+    watch, memory, work = ends[_WATCH_S], ends[MEMORY_S], ports[_WORK_S]
+    dx, twist, wrench = np.empty(6), np.empty(6), np.empty(6)
+    command, left = np.empty(13), pose_received.copy()
+    valid = _increment_into(slave_pose, before, dx)
     for i in range(6):
         twist[i] = dx[i] / T
     for g in range(2):
-        work_S[g] += dot(held_S, dx, g)
-    load = memory_S[LOAD_WRENCH]
+        work[g] += dot(held, dx, g)
+    load = memory[LOAD_WRENCH]
     if not (sound(wrench_B) and sound(load_B)):
         valid = False
         ends[_VALID_TIME] = 0.0
@@ -242,29 +279,26 @@ def channel_step(
         _to_world(wrench_B, frame, wrench)
         share = T / max(STOP_TIME - ends[_VALID_TIME], T)
         for i in range(6):
-            held_S[i] = (1.0 - share) * held_S[i] + share * wrench[i]
+            held[i] = (1.0 - share) * held[i] + share * wrench[i]
         _to_world(load_B, frame, wrench)
         for i in range(6):
             load[i] = (1.0 - share) * load[i] + share * wrench[i]
         ends[_VALID_TIME] += T
-    put(wrench, 0, held_S, 0, 6)
-    _, fresh = network.receive(forward_parameters, forward, k + 1, received)
+    put(wrench, 0, held, 0, 6)
     healthy = fresh and received[HEALTHY] > 0.5
     methods.slave_step(
-        steps, received, fresh, before_S[:7], twist, dx, wrench, T, parameters, memory_S, command,
+        steps, received, fresh, before[:7], twist, dx, wrench, T, parameters, memory, command,
         packet,
     )  # fmt: skip
     if not valid:
         packet[HEALTHY] = 0.0
     packet[CONTACT] = contact
-    network.send(backward_parameters, backward, k, packet)
     fault, requested = (fresh and not healthy) or not valid, command[:7]
-    slave_command_into(healthy, fault, T, timeout, requested, watch_S, pose_received)
-    methods.command_sent(steps, requested, pose_received, before_S[:7], twist, parameters, memory_S)
+    slave_command_into(healthy, fault, T, timeout, requested, watch, pose_received)
+    methods.command_sent(steps, requested, pose_received, before[:7], twist, parameters, memory)
     difference_into(pose_received, left, dx)
     for g in range(2):
-        ports[_WORK_C][g] += dot(held_S, dx, g)
-    ports[_SILENCE][0], ports[_SILENCE][1] = watch_M[SILENT], watch_S[SILENT]
+        ports[_WORK_C][g] += dot(held, dx, g)
 
 
 @njit(cache=True)

@@ -2,6 +2,7 @@
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -9,6 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from drake_teleop.common.blocks import ONE_DICT, sound
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import choice, quantity, settings
+from drake_teleop.common.numeric import Array
 from drake_teleop.load.compensation import scaled_wrench_into
 from drake_teleop.load.contact.detection import FLAG, ContactDetector, flag_update
 from drake_teleop.load.contact.noise_floor import MARGIN, STATISTICS, NoiseFloor
@@ -45,13 +47,25 @@ class ContactDetectionConfig:
 
 @njit(cache=True)
 def _update_flag(memory, sample, estimate, arm, settings):
+    acceleration = np.empty(3)
+    acceleration_into(arm, sample[BEFORE_JOINTS:TIME], sample[SPECIFIC_FORCE], acceleration)
+    return update_flag(memory, sample, estimate, acceleration, settings)
+
+
+@njit(cache=True)
+def update_flag(memory, sample, estimate, acceleration, settings):
+    """Update the detector's memory with a sample; return whether there is contact.
+
+    Args:
+        acceleration: (3,) acceleration a of So, in S [m/s^2].
+        settings: those of a `load.contact.detection.ContactDetector`.
+    """
     if not (sound(sample) and sound(estimate)):
         return memory[FLAG] != 0.0
-    contact, acceleration = np.empty(6), np.empty(3)
+    contact = np.empty(6)
     s, omega, alpha = sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION]
     wrench, offset, phi = sample[WRENCH], estimate[:6], estimate[6:]
     scaled_wrench_into(wrench, offset, s, omega, alpha, phi, np.zeros(10), 0.0, 0.0, 1.0, contact)
-    acceleration_into(arm, sample[BEFORE_JOINTS:TIME], s, acceleration)
     return flag_update(memory, contact, s, omega, alpha, acceleration, *settings)
 
 
@@ -80,10 +94,9 @@ class ContactDetection(LeafSystem):
     __slots__ = ONE_DICT
 
     def __init__(
-        self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel, period: float
+        self, config: ContactDetectionConfig, floor: NoiseFloor, arm: ArmModel | None, period: float
     ) -> None:
         super().__init__()
-        self._arm = arm.table
         self._settings = ContactDetector(
             floor,
             floor.threshold(config.statistic, config.margin),
@@ -91,7 +104,7 @@ class ContactDetection(LeafSystem):
             hold=round(config.hold / period),
             following=period / config.drift_time,
         ).settings
-        self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+        self._sample = self._declare_sample(arm)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
         self._flag = self.DeclareDiscreteState(1)
         self._memory = self.DeclareDiscreteState(ContactDetector.initial_memory())
@@ -99,6 +112,14 @@ class ContactDetection(LeafSystem):
         self._blind_samples = self.DeclareDiscreteState(1)  # remaining samples without detection
         self.DeclareStateOutputPort("contact", self._flag)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _declare_sample(self, arm: ArmModel | None) -> Any:
+        assert arm is not None
+        self._arm = arm.table
+        return self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
+
+    def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
+        return bool(_update_flag(memory, sample, estimate, self._arm, self._settings))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)
@@ -112,4 +133,4 @@ class ContactDetection(LeafSystem):
         memory = discrete_state.get_mutable_value(self._memory)
         estimate = self._estimate.Eval(context)
         flag = discrete_state.get_mutable_value(self._flag)
-        flag[0] = _update_flag(memory, sample, estimate, self._arm, self._settings)
+        flag[0] = self._next_flag(context, memory, sample, estimate)

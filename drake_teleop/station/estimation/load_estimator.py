@@ -2,6 +2,7 @@
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -123,7 +124,7 @@ class LoadEstimator(LeafSystem):
         start = np.asarray(initial, dtype=float)
         memory = self._estimator.initial_memory(start)
         self._shape, self._watches, self._period = memory.shape, config.watch, period
-        self._sample = self.DeclareVectorInputPort("sample", sample_size)
+        self._sample = self._declare_sample(sample_size)
         estimate = self.DeclareDiscreteState(start)
         self.DeclareDiscreteState(memory.ravel())
         self.DeclareStateOutputPort("load_estimate", estimate)
@@ -145,6 +146,9 @@ class LoadEstimator(LeafSystem):
             )
         if config.enabled or config.watch:
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _declare_sample(self, size: int) -> Any:
+        return self.DeclareVectorInputPort("sample", size)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         sample = self._sample.Eval(context)

@@ -27,10 +27,10 @@ from drake_teleop.station.passivity.safe_state import (
 # of `master_limits_into`. Vector to the device: motor torques in place of the positions, and the
 # new memory.
 _slots = Slots(6 + 6 + 7 + 1 + 1 + MASTER_WATCH)
-_POSITIONS, _LAST_POSITIONS, _DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
+_POSITIONS, _LAST_POSITIONS, DISPLAYED = _slots.vector(6), _slots.vector(6), _slots.vector(6)
 _FAULT, _CHANGED, _TIME_SINCE_FAULT = _slots.number(), _slots.number(), _slots.number()
 _WATCH = _slots.vector(MASTER_WATCH)
-_DISPLAYED_AND_FAULT = slice(_DISPLAYED.start, _FAULT + 1)
+_DISPLAYED_AND_FAULT = slice(DISPLAYED.start, _FAULT + 1)
 _NO_FAULT, _WRENCH_FAULT, _HAND_FAULT, _RESUMING = map(
     int, (Fault.NONE, Fault.WRENCH, Fault.HAND, Fault.RESUMING)
 )
@@ -106,7 +106,7 @@ def display_into(wrench, device, numbers, period, J, drive):
         q, fault = device[_LAST_POSITIONS], _HAND_FAULT
     if not sound(wrench):
         fault = _WRENCH_FAULT
-    displayed, drive[_FAULT] = drive[_DISPLAYED], fault
+    displayed, drive[_FAULT] = drive[DISPLAYED], fault
     jacobian_into(q, numbers, J)
     limit_wrench_into(wrench, numbers, J, displayed)
     if fault != _NO_FAULT or device[_CHANGED] != 0.0:
@@ -116,7 +116,7 @@ def display_into(wrench, device, numbers, period, J, drive):
 
 @njit(cache=True)
 def _fade(device, numbers, period, drive):
-    displayed, last = drive[_DISPLAYED], device[_DISPLAYED]
+    displayed, last = drive[DISPLAYED], device[DISPLAYED]
     limits, full = np.empty(2), _peak_wrench(numbers)
     fault = drive[_FAULT] != _NO_FAULT
     drive[_TIME_SINCE_FAULT] = 0.0 if fault else device[_TIME_SINCE_FAULT] + period
@@ -189,7 +189,7 @@ class ForceDisplay(LeafSystem):
         )
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._drive.Eval(context)[_DISPLAYED])
+        output.SetFromVector(self._drive.Eval(context)[DISPLAYED])
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         output[0] = self._drive.Eval(context)[_FAULT]

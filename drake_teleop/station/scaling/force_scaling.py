@@ -2,7 +2,7 @@
 
 # No postponed annotations here: yaml_load_typed reads the types of the dataclass's fields.
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,12 @@ from drake_teleop.common.compiled import njit
 from drake_teleop.common.config import quantity, settings
 from drake_teleop.common.errors import DrakeTeleopError
 from drake_teleop.common.vectors import apply, rows, three, times, transposed
-from drake_teleop.load.compensation import scaled_wrench_into, scales_from_eta
+from drake_teleop.load.compensation import (
+    add_weight_into,
+    scaled_wrench_into,
+    scales_from_eta,
+    weight_and_inertia_scales,
+)
 from drake_teleop.load.regressor import (
     ANGULAR_ACCELERATION,
     ANGULAR_VELOCITY,
@@ -27,10 +32,11 @@ from drake_teleop.load.regressor import (
     non_contact_wrench_into,
     sample_size,
 )
-from drake_teleop.station.slave.arm import ArmModel, forward_kinematics
+from drake_teleop.station.slave.arm import ArmModel, acceleration_into, forward_kinematics
 
-#: sigma_gripper, sigma_object, gamma of the contact wrench alone, Eq. (13).
-_ELIMINATION = np.array([0.0, 0.0, 1.0])
+#: Scales of the contact wrench alone, Eq. (13); see `scales_at`.
+_ELIMINATION = np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+_NUM_SCALES = 6
 
 #: Largest valid age of a sample, and of a time stamp in the future [s].
 MAX_SAMPLE_AGE = 0.05
@@ -39,12 +45,33 @@ _NONE, _STALE, _READING, _JOINTS, _LOAD = map(
 )
 
 
+class Scales(NamedTuple):
+    """Scales of a wrench: shares of the inertia and weight of gripper and object, and of contact."""
+
+    sigma_gripper: float
+    sigma_object: float
+    gamma: float
+    weight_gripper: float
+    weight_object: float
+
+    @property
+    def shares(self) -> tuple[float, float, float, float]:
+        """Shares of the inertias and weights."""
+        return self.sigma_gripper, self.sigma_object, self.weight_gripper, self.weight_object
+
+
 @settings
 @dataclass
 class ForceScalingConfig:
     """Scales sigma, gamma, eta of the paper, and force scale from slave to master."""
 
     sigma: float = quantity(1.0, "1", 0.0, 100.0, "share of the non-contact wrench that is kept")
+    sigma_weight: float | None = quantity(
+        None, "1", 0.0, 100.0, "share of the load's weight that is kept; null: sigma"
+    )
+    sigma_inertia: float | None = quantity(
+        None, "1", 0.0, 100.0, "share of the load's inertia that is kept; null: sigma"
+    )
     gamma: float = quantity(1.0, "1", 0.0, 100.0, "scale of the contact wrench")
     eta: float | None = quantity(
         None, "1", 0.0, 1.0, "Eq. (14): share of the object kept; needs sigma = 0 and gamma = 1"
@@ -56,22 +83,27 @@ class ForceScalingConfig:
         1 / 17.5, "1", 0.0, 100.0, "force and torque, slave to master (VI-B)"
     )
 
-    def scales(self, where: str = "force_scaling") -> tuple[float, float, float]:
-        """Return the scales (sigma_gripper, sigma_object, gamma).
+    def scales(self, where: str = "force_scaling") -> Scales:
+        """Return the scales of gripper, object and contact.
 
         Raises:
             DrakeTeleopError: if eta is given without gripper_phi, sigma = 0 and gamma = 1 (section
-                V); `where` is the block's path.
+                V), or with another sigma; `where` is the block's path.
         """
+        separate = self.sigma_weight, self.sigma_inertia
         if self.eta is None:
-            return self.sigma, self.sigma, self.gamma
-        if self.sigma != 0 or self.gamma != 1 or self.gripper_phi is None:
+            weights, inertias = weight_and_inertia_scales(self.sigma, self.sigma, *separate)
+            return Scales(*inertias, self.gamma, *weights)
+        alone = self.sigma == 0 and self.gamma == 1 and separate == (None, None)
+        if not alone or self.gripper_phi is None:
             raise DrakeTeleopError(
                 "eta works on the object alone",
                 where=f"{where}.eta",
-                remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper)",
+                remedy="set sigma: 0, gamma: 1 and gripper_phi (section V of the paper), and leave "
+                "sigma_weight and sigma_inertia out",
             )
-        return scales_from_eta(self.eta)
+        gripper, thing, gamma = scales_from_eta(self.eta)
+        return Scales(gripper, thing, gamma, gripper, thing)
 
 
 @njit(cache=True)
@@ -114,22 +146,23 @@ def wrench_to_master(
 
 @njit(cache=True)
 def scales_at(change, time, scales):
-    """Write the four scales at `time`: a minimum-jerk blend from old to new scales.
+    """Write the six scales at `time`: a minimum-jerk blend from old to new scales.
 
     Args:
-        change: (10,) old scales (4), new scales (4), start of the change [s], duration [s].
+        change: (14,) old scales (6), new scales (6), start of the change [s], duration [s].
         time: present time [s].
-        scales: (4,) written: sigma_gripper, sigma_object, gamma, force scale.
+        scales: (6,) written: sigma_gripper, sigma_object (of the inertia), gamma, force scale,
+            shares of the weight of gripper and object.
     """
-    u = min(max((time - change[8]) / change[9], 0.0), 1.0) if change[9] > 0.0 else 1.0
+    u = min(max((time - change[12]) / change[13], 0.0), 1.0) if change[13] > 0.0 else 1.0
     share = u * u * u * (10.0 + u * (6.0 * u - 15.0))
-    for i in range(4):
+    for i in range(_NUM_SCALES):
         # Exact at both ends, so that unchanged scales equal the configured ones.
-        scales[i] = (1.0 - share) * change[i] + share * change[4 + i]
+        scales[i] = (1.0 - share) * change[i] + share * change[_NUM_SCALES + i]
 
 
 @njit(cache=True)
-def _scaled_into(sample, estimate, gripper, scales, out):
+def _scaled_into(sample, estimate, gripper, arm, scales, out):
     phi_gripper, phi_object = gripper[6:], np.empty(10)
     for i in range(10):
         phi_object[i] = estimate[6 + i] - phi_gripper[i]
@@ -138,6 +171,11 @@ def _scaled_into(sample, estimate, gripper, scales, out):
         sample[SPECIFIC_FORCE], sample[ANGULAR_VELOCITY], sample[ANGULAR_ACCELERATION],
         phi_gripper, phi_object, scales[0], scales[1], scales[2], out,
     )  # fmt: skip
+    excess_gripper, excess_object = scales[4] - scales[0], scales[5] - scales[1]
+    if excess_gripper != 0.0 or excess_object != 0.0:
+        gravity = np.empty(3)
+        acceleration_into(arm, sample[BEFORE_JOINTS:TIME], np.zeros(3), gravity)
+        add_weight_into(gravity, phi_gripper, phi_object, excess_gripper, excess_object, out)
 
 
 @njit(cache=True)
@@ -163,16 +201,16 @@ def fault_of(sample, estimate, time, valid_range):
 
 
 @njit(cache=True)
-def _scaled_now_into(sample, estimate, gripper, change, time, out):
-    scales = np.empty(4)
+def _scaled_now_into(sample, estimate, gripper, change, time, arm, out):
+    scales = np.empty(_NUM_SCALES)
     scales_at(change, time, scales)
-    _scaled_into(sample, estimate, gripper, scales, out)
+    _scaled_into(sample, estimate, gripper, arm, scales, out)
 
 
 @njit(cache=True, borrows=True)
-def _log_row_into(sample, estimate, gripper, change, time, elimination, valid_range, out):
-    _scaled_now_into(sample, estimate, gripper, change, time, out[:6])
-    _scaled_into(sample, estimate, gripper, elimination, out[6:12])
+def _log_row_into(sample, estimate, gripper, change, time, arm, elimination, valid_range, out):
+    _scaled_now_into(sample, estimate, gripper, change, time, arm, out[:6])
+    _scaled_into(sample, estimate, gripper, arm, elimination, out[6:12])
     out[12] = fault_of(sample, estimate, time, valid_range)
 
 
@@ -181,10 +219,10 @@ def _rendered_into(sample, estimate, gripper, change, time, arm, R_WB, valid_ran
     if fault_of(sample, estimate, time, valid_range) != _NONE:
         out[:] = np.nan
         return
-    scales, scaled_S, R_WS, p_WS = np.empty(4), np.empty(6), np.empty((3, 3)), np.empty(3)
+    scales, scaled_S, R_WS, p_WS = np.empty(6), np.empty(6), np.empty((3, 3)), np.empty(3)
     scales_at(change, time, scales)
     scales[2] *= contact
-    _scaled_into(sample, estimate, gripper, scales, scaled_S)
+    _scaled_into(sample, estimate, gripper, arm, scales, scaled_S)
     forward_kinematics(arm, sample[BEFORE_JOINTS:TIME], R_WS, p_WS)
     wrench_to_master_into(scaled_S, R_WS, R_WB, scales[3], scales[3], out)
 
@@ -236,7 +274,8 @@ class ForceScaling(LeafSystem):
             self._gripper = np.concatenate([np.zeros(6), config.gripper_phi])
         self._arm, self._R_WB = arm.table, np.ascontiguousarray(R_WB)
         # Old and new scales, start and length of the change; see `scales_at`.
-        scales = [*config.scales(), config.force_scale]
+        found = config.scales()
+        scales = [*found[:3], config.force_scale, *found[3:]]
         self._change = self.DeclareNumericParameter(BasicVector([*scales, *scales, 0.0, 0.0]))
         self._sample = self.DeclareVectorInputPort("sample", sample_size(arm.num_joints) + 1)
         self._estimate = self.DeclareVectorInputPort("load_estimate", 16)
@@ -263,40 +302,44 @@ class ForceScaling(LeafSystem):
         sigma_object: float,
         gamma: float,
         force_scale: float,
+        sigma_weight: float | None = None,
         duration: float = 0.25,
     ) -> None:
         """Change the scales, beginning now, on a minimum-jerk ramp of `duration` [s].
 
-        The ramp starts at the present scales, also during an earlier change.
+        The ramp starts at the present scales, also during an earlier change. `sigma_weight` is the
+        share of the weight of both parts; without it the other sigmas scale weight and inertia.
 
         Raises:
             DrakeTeleopError: for a scale or duration that is negative or not finite.
         """
-        requested = np.array(
-            [sigma_gripper, sigma_object, gamma, force_scale, duration], dtype=float
-        )
+        both = sigma_gripper, sigma_object
+        weights = both if sigma_weight is None else (sigma_weight, sigma_weight)
+        requested = np.array([*both, gamma, force_scale, *weights, duration], dtype=float)
         if not (requested >= 0.0).all() or not np.isfinite(requested).all():
             raise DrakeTeleopError(
                 "scales and duration are not finite or negative", where="SetScales"
             )
         parameter = context.get_mutable_numeric_parameter(self._change)
-        now, start = np.empty(4), context.get_time()
+        now, start = np.empty(_NUM_SCALES), context.get_time()
         scales_at(parameter.value(), start, now)
-        parameter.SetFromVector(np.concatenate([now, requested[:4], [start, requested[4]]]))
+        parameter.SetFromVector(np.concatenate([now, requested[:-1], [start, requested[-1]]]))
 
     def _calc_scaled(self, context: Context, output: BasicVector) -> None:
-        _scaled_now_into(*self._inputs(context), output.get_mutable_value())
+        _scaled_now_into(*self._inputs(context), self._arm, output.get_mutable_value())
 
     def _calc_log_row(self, context: Context, output: BasicVector) -> None:
         inputs = self._inputs(context)
-        _log_row_into(*inputs, _ELIMINATION, self._valid_range, output.get_mutable_value())
+        constants = self._arm, _ELIMINATION, self._valid_range
+        _log_row_into(*inputs, *constants, output.get_mutable_value())
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         sample, estimate, _, _, time = self._inputs(context)
         output[0] = fault_of(sample, estimate, time, self._valid_range)
 
     def _calc_contact(self, context: Context, output: BasicVector) -> None:
-        _scaled_into(*self._inputs(context)[:3], _ELIMINATION, output.get_mutable_value())
+        constants = self._arm, _ELIMINATION
+        _scaled_into(*self._inputs(context)[:3], *constants, output.get_mutable_value())
 
     def _calc_non_contact(self, context: Context, output: BasicVector) -> None:
         sample, phi = self._sample.Eval(context), self._estimate.Eval(context)[6:]

@@ -1,0 +1,31 @@
+"""Blocks of Fig. 4 with a named port for each signal, for a Diagram of a Drake user.
+
+They call the functions of the station's blocks, which join signals in one vector for speed
+(docs/blocks.md).
+"""
+
+from drake_teleop.station.blocks.ends import PassivityAtMaster, PassivityAtSlave
+from drake_teleop.station.blocks.force_display import ForceDisplay
+from drake_teleop.station.blocks.network_channel import NetworkChannel
+from drake_teleop.station.blocks.of_sample import ContactDetector, LoadEstimator
+from drake_teleop.station.blocks.wrenches import (
+    NonContactWrench,
+    NonContactWrench_,
+    WrenchScaling,
+    WrenchScaling_,
+)
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScaling
+
+__all__ = [
+    "ContactDetector",
+    "ForceDisplay",
+    "KinematicScaling",
+    "LoadEstimator",
+    "NetworkChannel",
+    "NonContactWrench",
+    "NonContactWrench_",
+    "PassivityAtMaster",
+    "PassivityAtSlave",
+    "WrenchScaling",
+    "WrenchScaling_",
+]

@@ -1,0 +1,182 @@
+"""The two ends of a passivity method, for any network between them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteStateIndex,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.numeric import checked
+from drake_teleop.station.blocks.double_only import DoubleOnly
+from drake_teleop.station.channel.channel import (
+    PORTS,
+    SHORTEST_TIMEOUT,
+    initial_ends,
+    master_end,
+    slave_end,
+)
+from drake_teleop.station.passivity import methods
+from drake_teleop.station.passivity.methods import PassivityConfig
+from drake_teleop.station.passivity.packet import PACKET_SIZE
+
+
+class _End(DoubleOnly, LeafSystem):
+    """Base class: one step of an end in a cache entry, whose results are the outputs.
+
+    Args:
+        passivity: the method and its parameters, equal at both ends.
+        period: time between packets [s].
+        start: (7,) pose X_WS of the slave at the start.
+        R_WB: (3, 3) alignment of the master's base with the world.
+        scales: (2,) scale of translation and rotation, slave over master.
+        force_scale: scale of force, slave to master.
+        timeout: silence that starts the safe state [s].
+    """
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        passivity: PassivityConfig,
+        period: float,
+        start: ArrayLike,
+        *,
+        R_WB: ArrayLike | None = None,
+        scales: ArrayLike = (1.0, 1.0),
+        force_scale: float = 1.0,
+        timeout: float = SHORTEST_TIMEOUT,
+    ) -> None:
+        super().__init__()
+        start, scales = checked("start", start, 7), checked("scales", scales, 2)
+        rotation = np.eye(3) if R_WB is None else checked("R_WB", R_WB, 3, 3)
+        parameters = methods.parameters(passivity, list(force_scale / scales), list(scales))
+        frame = np.concatenate([rotation.ravel(), scales])
+        self._method = methods.steps_of(passivity.method)
+        self._constants = period, timeout, frame, parameters
+        ends = initial_ends(passivity.method, parameters, start)
+        # Ends, command, port energies, rendered wrench and contact flag, packet.
+        results = [ends, start, np.zeros(PORTS), np.zeros(7), np.zeros(PACKET_SIZE)]
+        self._received = self.DeclareVectorInputPort("received", PACKET_SIZE + 1)
+        self._ports = [self.DeclareVectorInputPort(*port) for port in self._INPUTS]
+        self._groups = [int(self.DeclareDiscreteState(part)) for part in results[:3]]
+        step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make([np.array(part) for part in results]),
+                calc=weak_callback(self._calc_step),
+            ),
+            {self.all_input_ports_ticket(), self.xd_ticket()},
+        )
+        self._step = step.cache_index()
+        calculate = weak_callback(self._calc_packet)
+        self.DeclareVectorOutputPort("packet", PACKET_SIZE, calculate, {step.ticket()})
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self._declare_outputs(step.ticket())
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        parts = step.get_mutable_value()
+        for part, group in zip(parts, self._groups, strict=False):
+            part[:] = context.get_discrete_state(group).value()
+        received = self._received.Eval(context)
+        inputs = [
+            port.Eval(context) if port.HasValue(context) else np.zeros(port.size())
+            for port in self._ports
+        ]
+        self._run(inputs, np.ascontiguousarray(received[:-1]), bool(received[-1] > 0.5), *parts)
+
+    def _results(self, context: Context) -> list[Any]:
+        results: list[Any] = self.get_cache_entry(self._step).Eval(context)
+        return results
+
+    def _calc_packet(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._results(context)[-1])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for part, group in zip(self._results(context), self._groups, strict=False):
+            discrete_state.set_value(group, part)
+
+
+class PassivityAtMaster(_End):
+    """Master's end of a passivity method: renders a wrench, sends pose and energy.
+
+    .. pydrake_system::
+
+        name: PassivityAtMaster
+        input_ports:
+        - received: (39,) newest packet of the slave, and 1 if it is new
+        - pose_command: (7,) commanded pose X_WS, after kinematic scaling
+        - hand_wrench_E: (6,) wrench of the hand at E, in B [N, N m]; 0 if unconnected
+        output_ports:
+        - packet: (38,) for the slave
+        - wrench_to_master: (6,) F_E_B to render at the hand [N, N m]
+
+    Arguments as for the base class.
+    """
+
+    __slots__ = ()
+    _INPUTS = (("pose_command", 7), ("hand_wrench_E", 6))
+
+    def _declare_outputs(self, step: Any) -> None:
+        calculate = weak_callback(self._calc_wrench)
+        self.DeclareVectorOutputPort("wrench_to_master", 6, calculate, {step})
+
+    def _run(
+        self, inputs: Any, received: Any, fresh: bool, ends: Any, _: Any, ports: Any, wrench: Any,
+        packet: Any,
+    ) -> None:  # fmt: skip
+        work = ports[:2]
+        constants = *self._constants, ends, work, packet, wrench
+        master_end(self._method, *inputs, received, fresh, *constants)
+
+    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._results(context)[3][:6])
+
+
+class PassivityAtSlave(_End):
+    """Slave's end of a passivity method: commands a pose, sends wrench and energy.
+
+    .. pydrake_system::
+
+        name: PassivityAtSlave
+        input_ports:
+        - received: (39,) newest packet of the master, and 1 if it is new
+        - wrench_B: (6,) F_E_B to render, from force scaling [N, N m]
+        - load_wrench_B: (6,) part of wrench_B from the load, for `ledger`; 0 if unconnected
+        - pose_slave: (7,) actual X_WS of the slave
+        - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
+        - contact: (1,) flag of a contact detector; 0 if unconnected
+        output_ports:
+        - packet: (38,) for the master
+        - pose_to_slave: (7,) X_WS to follow
+
+    Arguments as for the base class.
+    """
+
+    __slots__ = ()
+    _INPUTS = (
+        *(("wrench_B", 6), ("load_wrench_B", 6), ("pose_slave", 7)),
+        *(("saturated", 1), ("contact", 1)),
+    )
+
+    def _declare_outputs(self, step: Any) -> None:
+        self.DeclareStateOutputPort("pose_to_slave", DiscreteStateIndex(self._groups[1]))
+
+    def _run(
+        self, inputs: Any, received: Any, fresh: bool, ends: Any, pose: Any, ports: Any, _: Any,
+        packet: Any,
+    ) -> None:  # fmt: skip
+        *values, saturated, contact = inputs
+        flags = bool(saturated[0] > 0.5), float(contact[0])
+        constants = *self._constants, ends, pose, ports, packet
+        slave_end(self._method, *values, *flags, received, fresh, *constants)

@@ -1,0 +1,89 @@
+"""Force display of a haptic device: J^T F within the device's limits, for any device model."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.numeric import Array, checked
+from drake_teleop.station.blocks.double_only import DoubleOnly
+from drake_teleop.station.master.dynamics import DisplayDevice
+from drake_teleop.station.master.force_display import DISPLAYED, display_into, initial_display
+
+
+class ForceDisplay(DoubleOnly, LeafSystem):
+    """Motor torques of a haptic device for a wrench, with the safe state of the station.
+
+    .. pydrake_system::
+
+        name: ForceDisplay
+        input_ports:
+        - wrench_command: (6,) F_E_B, [f; tau] to render at E, in B [N, N m]
+        - joint_position: (6,) of the device [rad]
+        output_ports:
+        - joint_torque: (6,) J^T F + gravity compensation [N m]
+        - force_to_master: (6,) displayed wrench F [N, N m]
+        - fault_at_hand: (1,) a `Fault`
+
+    Args:
+        device: such as `Master().device(0.0, 0.0)` (`station.master.device`).
+        period: sampling period [s].
+        start: (6,) joint positions before the first valid ones.
+    """
+
+    __slots__ = ()
+
+    def __init__(self, device: DisplayDevice, period: float, start: ArrayLike = (0.0,) * 6) -> None:
+        super().__init__()
+        self._period, self._numbers, self._jacobian = period, device.numbers, np.zeros((6, 6))
+        memory = initial_display(checked("start", start, 6), device.numbers)
+        self._command = self.DeclareVectorInputPort("wrench_command", 6)
+        self._position = self.DeclareVectorInputPort("joint_position", 6)
+        self.DeclareDiscreteState(memory)
+        step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make(memory.copy()),
+                calc=weak_callback(self._calc_step),
+            ),
+            {self.all_input_ports_ticket(), self.xd_ticket()},
+        )
+        self._step = step.cache_index()
+        for name, size, calc in (
+            ("joint_torque", 6, self._calc_torque),
+            ("force_to_master", 6, self._calc_force),
+            ("fault_at_hand", 1, self._calc_fault),
+        ):
+            self.DeclareVectorOutputPort(name, size, weak_callback(calc), {step.ticket()})
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        device = context.get_discrete_state(0).CopyToVector()
+        device[:6] = self._position.Eval(context)
+        drive, command = step.get_mutable_value(), self._command.Eval(context)
+        display_into(command, device, self._numbers, self._period, self._jacobian, drive)
+
+    def _drive(self, context: Context) -> Array:
+        drive: Array = self.get_cache_entry(self._step).Eval(context)
+        return drive
+
+    def _calc_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive(context)[:6])
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._drive(context)[DISPLAYED])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        output[0] = self._drive(context)[DISPLAYED.stop]
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(0, self._drive(context))

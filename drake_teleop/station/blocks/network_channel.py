@@ -1,0 +1,108 @@
+"""One direction of a network as a block: delay, jitter, loss and order of packets."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteStateIndex,
+    DiscreteValues,
+    LeafSystem,
+    ValueProducer,
+)
+
+from drake_teleop.common.blocks import weak_callback
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array
+from drake_teleop.station.blocks.double_only import DoubleOnly
+from drake_teleop.station.channel import network
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.passivity.packet import LOAD, PACKET_SIZE
+
+
+class NetworkChannel(DoubleOnly, LeafSystem):
+    """Network that transmits a vector in every period; a packet takes at least one period.
+
+    .. pydrake_system::
+
+        name: NetworkChannel
+        input_ports:
+        - packet: (N,) numbers to send
+        output_ports:
+        - received: (N + 1,) newest packet that has arrived, zeros before the first; 1 if it is new
+        - arriving: (N + 1,) the same at the next period; depends on the input
+
+    The packet of step k is in `received` at step k + 1 at the earliest. Connect `arriving` to a
+    block that updates at the same instants and whose output is a state.
+
+    Args:
+        size: N.
+        period: time between packets [s].
+        config: default: ideal network.
+        seed: of the random numbers.
+        direction: 0 or 1; other random numbers for the same seed.
+
+    Raises:
+        DrakeTeleopError: for a policy `silence` that needs packets of a passivity method.
+    """
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        size: int,
+        period: float,
+        config: NetworkConfig | None = None,
+        *,
+        seed: int = 0,
+        direction: int = 0,
+    ) -> None:
+        super().__init__()
+        config = NetworkConfig() if config is None else config
+        if config.silence != "hold" and size not in (LOAD.start, PACKET_SIZE):
+            raise DrakeTeleopError(
+                f"'{config.silence}' needs packets of a passivity method, not {size} numbers",
+                where="NetworkChannel.silence",
+                remedy="set silence: hold",
+            )
+        self._parameters = network.parameters(config, seed, direction, period, least=1)
+        parts = network.initial_state(self._parameters, np.zeros(size))
+        state = [*parts, np.zeros(1), np.zeros(size + 1)]
+        self._packet = self.DeclareVectorInputPort("packet", size)
+        self._groups = [int(self.DeclareDiscreteState(part)) for part in state]
+        step = self.DeclareCacheEntry(
+            "step",
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make([np.array(part) for part in state]),
+                calc=weak_callback(self._calc_step),
+            ),
+            {self.all_input_ports_ticket(), self.xd_ticket()},
+        )
+        self._step = step.cache_index()
+        self.DeclareStateOutputPort("received", DiscreteStateIndex(self._groups[-1]))
+        calculate = weak_callback(self._calc_arriving)
+        self.DeclareVectorOutputPort("arriving", size + 1, calculate, {step.ticket()})
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _calc_step(self, context: Context, step: AbstractValue) -> None:
+        parts = step.get_mutable_value()
+        for part, group in zip(parts, self._groups, strict=True):
+            part[:] = context.get_discrete_state(group).value()
+        receiver, in_transit, count, received = parts
+        k, line = int(count[0]), (receiver, in_transit)
+        network.send(self._parameters, line, k, self._packet.Eval(context))
+        _, fresh = network.receive(self._parameters, line, k + 1, received[:-1])
+        count[0], received[-1] = k + 1, fresh
+
+    def _parts(self, context: Context) -> list[Array]:
+        parts: list[Array] = self.get_cache_entry(self._step).Eval(context)
+        return parts
+
+    def _calc_arriving(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._parts(context)[-1])
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        for part, group in zip(self._parts(context), self._groups, strict=True):
+            discrete_state.set_value(group, part)

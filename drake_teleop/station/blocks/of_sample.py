@@ -1,0 +1,129 @@
+"""Load estimator and contact detector with a port for each signal of the wrist sensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import Context, LeafSystem
+
+from drake_teleop.common.numeric import Array, checked
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.regressor import BEFORE_JOINTS, SPECIFIC_FORCE, sample_parts
+from drake_teleop.station.blocks.double_only import DoubleOnly
+from drake_teleop.station.estimation import contact_detection, load_estimator
+
+
+class _SamplePorts:
+    """Ports of a sample's parts, in place of the port `sample`."""
+
+    def __init__(self, system: LeafSystem) -> None:
+        sizes = list(sample_parts(0).items())[:-1]
+        self._ports = [system.DeclareVectorInputPort(*each) for each in sizes]
+
+    def Eval(self, context: Context) -> Array:
+        sample, first = np.zeros(BEFORE_JOINTS), 0
+        for port in self._ports:
+            # Unconnected: `saturated` is 0.
+            if port.size() > 1 or port.HasValue(context):
+                sample[first : first + port.size()] = port.Eval(context)
+            first += port.size()
+        return sample
+
+
+class LoadEstimator(DoubleOnly, load_estimator.LoadEstimator):
+    """Estimator of load and sensor offsets, updated with every sample of the wrist sensor.
+
+    .. pydrake_system::
+
+        name: LoadEstimator
+        input_ports:
+        - measured_wrench_S: (6,) wrench of the sensor on the load [N, N m]
+        - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
+        - angular_velocity_S: (3,) [rad/s]
+        - angular_acceleration_S: (3,) [rad/s^2]
+        - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
+        output_ports:
+        - load_estimate: (16,) [offsets; phi]
+        - load_state: (1,) see `station.estimation.load_estimator.LoadEstimator`
+
+    Args:
+        noise_std: (6,) standard deviations of the wrench [N, N m].
+        motion_std: (9,) standard deviations of the motion, for method "rtls" and `watch`.
+        period: sampling period [s].
+        initial: (16,) initial estimate.
+        config: default: recursive least squares from the start.
+    """
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        noise_std: ArrayLike,
+        period: float,
+        *,
+        motion_std: ArrayLike | None = None,
+        initial: ArrayLike | None = None,
+        config: load_estimator.LoadEstimatorConfig | None = None,
+    ) -> None:
+        super().__init__(
+            load_estimator.LoadEstimatorConfig(enabled=True) if config is None else config,
+            checked("noise_std", noise_std, 6),
+            np.zeros(9) if motion_std is None else checked("motion_std", motion_std, 9),
+            period,
+            BEFORE_JOINTS,
+            np.zeros(16) if initial is None else checked("initial", initial, 16),
+        )
+
+    def _declare_sample(self, size: int) -> Any:
+        return _SamplePorts(self)
+
+
+class ContactDetector(DoubleOnly, contact_detection.ContactDetection):
+    """Detector of contact, from the wrench without the part of the load.
+
+    .. pydrake_system::
+
+        name: ContactDetector
+        input_ports:
+        - measured_wrench_S: (6,) wrench of the sensor on the load [N, N m]
+        - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
+        - angular_velocity_S: (3,) [rad/s]
+        - angular_acceleration_S: (3,) [rad/s^2]
+        - saturated: (1,) 1 while the wrench is invalid; 0 if unconnected
+        - load_estimate: (16,) [offsets; phi]
+        - R_WS: (9,) orientation of S, by rows
+        output_ports:
+        - contact: (1,) 1 in contact, else 0
+
+    Args:
+        floor: noise floor in free motion, fitted at the rate of this block.
+        period: sampling period [s].
+        gravity_W: (3,) [m/s^2].
+    """
+
+    __slots__ = ()
+
+    def __init__(
+        self,
+        floor: NoiseFloor,
+        period: float,
+        *,
+        config: contact_detection.ContactDetectionConfig | None = None,
+        gravity_W: ArrayLike = (0.0, 0.0, -9.81),
+    ) -> None:
+        config = contact_detection.ContactDetectionConfig() if config is None else config
+        super().__init__(config, floor, None, period)
+        self._gravity_W = checked("gravity_W", gravity_W, 3)
+        self._orientation = self.DeclareVectorInputPort("R_WS", 9)
+
+    def _declare_sample(self, arm: Any) -> Any:
+        return _SamplePorts(self)
+
+    def _next_flag(self, context: Context, memory: Array, sample: Array, estimate: Array) -> bool:
+        gravity = self._orientation.Eval(context).reshape(3, 3).T @ self._gravity_W
+        acceleration = sample[SPECIFIC_FORCE] + gravity
+        return bool(
+            contact_detection.update_flag(memory, sample, estimate, acceleration, self._settings)
+        )

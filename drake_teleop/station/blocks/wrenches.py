@@ -1,0 +1,201 @@
+"""Wrench of a load and scaling of a measured wrench, for double, AutoDiffXd and Expression.
+
+Frames as in `drake_teleop.load.compensation`. The mathematics is compiled for double and is the
+same Python source for the other scalar types.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.systems.framework import BasicVector_, LeafSystem_
+from pydrake.systems.scalar_conversion import TemplateSystem
+
+from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.common.numeric import Array, checked
+from drake_teleop.load.compensation import (
+    add_weight_into,
+    scaled_wrench_into,
+    unknown_gravity,
+)
+from drake_teleop.load.regressor import non_contact_wrench_into
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master_into
+
+_GRAVITY_W = (0.0, 0.0, -9.81)
+_MOTION = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+
+
+def _for_scalar(function: Any, T: Any) -> Callable[..., None]:
+    """Return the compiled function for double, its Python source for other scalar types."""
+    return function if T is float else function.py_func  # type: ignore[no-any-return]
+
+
+def _vector(T: Any, size: int) -> Any:
+    return np.zeros(size) if T is float else np.full(size, T(0.0), dtype=object)
+
+
+@TemplateSystem.define("NonContactWrench_")
+def NonContactWrench_(T: Any) -> Any:
+    """Return the class of the block for the scalar type T."""
+
+    class Impl(LeafSystem_[T]):  # type: ignore[misc, valid-type]
+        """Wrench V phi of a load's weight and inertia, Eq. (12).
+
+        .. pydrake_system::
+
+            name: NonContactWrench
+            input_ports:
+            - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
+            - angular_velocity_S: (3,) [rad/s]
+            - angular_acceleration_S: (3,) [rad/s^2]
+            - load: (10,) phi; unconnected: the parameter phi
+            output_ports:
+            - non_contact_wrench_S: (6,) wrench on the load [N, N m]
+
+        Args:
+            phi: (10,) load about So in S; a numeric parameter of the context.
+        """
+
+        __slots__ = ONE_DICT
+
+        def _construct(self, phi: ArrayLike | None = None, converter: Any = None) -> None:
+            LeafSystem_[T].__init__(self, converter)
+            self._phi = np.zeros(10) if phi is None else checked("phi", phi, 10)
+            self._parameter = self.DeclareNumericParameter(BasicVector_[T](self._phi))
+            self._motion = [self.DeclareVectorInputPort(name, 3) for name in _MOTION]
+            self._load = self.DeclareVectorInputPort("load", 10)
+            inputs = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
+            calculate = weak_callback(self._calc)
+            self.DeclareVectorOutputPort("non_contact_wrench_S", 6, calculate, inputs)
+
+        def _construct_copy(self, other: Any, converter: Any = None) -> None:
+            Impl._construct(self, other._phi, converter=converter)
+
+        def _calc(self, context: Any, output: Any) -> None:
+            if self._load.HasValue(context):
+                phi = self._load.Eval(context)
+            else:
+                phi = context.get_numeric_parameter(self._parameter).CopyToVector()
+            wrench = _vector(T, 6)
+            motion = [port.Eval(context) for port in self._motion]
+            _for_scalar(non_contact_wrench_into, T)(*motion, phi, wrench)
+            output.SetFromVector(wrench)
+
+    return Impl
+
+
+NonContactWrench = NonContactWrench_[float]
+
+
+@TemplateSystem.define("WrenchScaling_")
+def WrenchScaling_(T: Any) -> Any:
+    """Return the class of the block for the scalar type T."""
+
+    class Impl(LeafSystem_[T]):  # type: ignore[misc, valid-type]
+        """Contact wrench and scaled wrench of a measured wrench, Eqs. (13) and (T7).
+
+        .. pydrake_system::
+
+            name: WrenchScaling
+            input_ports:
+            - measured_wrench_S: (6,) wrench of the sensor on the load [N, N m]
+            - specific_force_S: (3,) a - g of the sensor's origin [m/s^2]
+            - angular_velocity_S: (3,) [rad/s]
+            - angular_acceleration_S: (3,) [rad/s^2]
+            - load_estimate: (16,) [offsets; phi]
+            - R_WS: (9,) orientation of S, by rows; for wrench_to_master and separate sigmas only
+            output_ports:
+            - contact_wrench_S: (6,) F_c [N, N m]
+            - scaled_wrench_S: (6,) F' [N, N m]
+            - wrench_to_master: (6,) F_E_B = -force_scale F', in the master's base B [N, N m]
+
+        Args:
+            config: scales; default: contact and load as measured.
+            R_WB: (3, 3) alignment of the master's base with the world.
+            gravity_W: (3,) [m/s^2].
+        """
+
+        __slots__ = ONE_DICT
+
+        def _construct(
+            self,
+            config: ForceScalingConfig | None = None,
+            R_WB: ArrayLike | None = None,
+            gravity_W: ArrayLike = _GRAVITY_W,
+            converter: Any = None,
+        ) -> None:
+            LeafSystem_[T].__init__(self, converter)
+            self._config = config = ForceScalingConfig() if config is None else config
+            self._R_WB = np.eye(3) if R_WB is None else checked("R_WB", R_WB, 3, 3)
+            self._gravity_W, self._scales = checked("gravity_W", gravity_W, 3), config.scales()
+            ports = [("measured_wrench_S", 6), *((name, 3) for name in _MOTION)]
+            ports += [("load_estimate", 16), ("R_WS", 9)]
+            inputs = [self.DeclareVectorInputPort(*port) for port in ports]
+            self._inputs, self._orientation = inputs[:-1], inputs[-1]
+            tickets = {port.ticket() for port in inputs[:-1]}
+            for name, calc, more in (
+                ("contact_wrench_S", self._calc_contact, set()),
+                ("scaled_wrench_S", self._calc_scaled, {self._orientation.ticket()}),
+                ("wrench_to_master", self._calc_to_master, {self._orientation.ticket()}),
+            ):
+                self.DeclareVectorOutputPort(name, 6, weak_callback(calc), tickets | more)
+
+        def _construct_copy(self, other: Any, converter: Any = None) -> None:
+            Impl._construct(
+                self, other._config, other._R_WB, other._gravity_W, converter=converter
+            )
+
+        def _scaled(self, context: Any, scales: tuple[float, float, float]) -> Any:
+            measured, s, omega, alpha, estimate = (port.Eval(context) for port in self._inputs)
+            wrench = _vector(T, 6)
+            _for_scalar(scaled_wrench_into, T)(
+                measured, estimate[:6], s, omega, alpha, *self._parts(estimate), *scales, wrench
+            )
+            return wrench
+
+        def _parts(self, estimate: Any) -> tuple[Any, Any]:
+            given = self._config.gripper_phi
+            gripper = estimate[6:] if given is None else np.asarray(given)
+            return gripper, estimate[6:] - gripper
+
+        def _R_WS(self, context: Any) -> Any:
+            return np.ascontiguousarray(self._orientation.Eval(context)).reshape(3, 3)
+
+        def _calc_contact(self, context: Any, output: Any) -> None:
+            output.SetFromVector(self._scaled(context, (0.0, 0.0, 1.0)))
+
+        def _calc_scaled(self, context: Any, output: Any) -> None:
+            output.SetFromVector(self._scaled_wrench(context))
+
+        def _scaled_wrench(self, context: Any) -> Any:
+            scales = self._scales
+            wrench = self._scaled(context, scales[:3])
+            excess = [w - i for w, i in zip(scales[3:], scales[:2], strict=True)]
+            if any(excess):
+                if not self._orientation.HasValue(context):
+                    raise unknown_gravity("WrenchScaling: gravity in S", "connect R_WS")
+                gravity = self._R_WS(context).T @ self._gravity_W
+                parts = self._parts(self._inputs[-1].Eval(context))
+                _for_scalar(add_weight_into, T)(gravity, *parts, *excess, wrench)
+            return wrench
+
+        def _calc_to_master(self, context: Any, output: Any) -> None:
+            if not self._orientation.HasValue(context):
+                raise DrakeTeleopError(
+                    "R_WS is not connected",
+                    where="WrenchScaling.wrench_to_master",
+                    remedy="connect the orientation of S",
+                )
+            wrench, k = _vector(T, 6), self._config.force_scale
+            scaled, R_WS = self._scaled_wrench(context), self._R_WS(context)
+            _for_scalar(wrench_to_master_into, T)(scaled, R_WS, self._R_WB, k, k, wrench)
+            output.SetFromVector(wrench)
+
+    return Impl
+
+
+WrenchScaling = WrenchScaling_[float]

@@ -1,0 +1,369 @@
+"""Blocks with plain ports give the numbers of the station's blocks."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
+from pydrake.symbolic import Evaluate, MakeVectorVariable
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from drake_teleop.common.errors import DrakeTeleopError
+from drake_teleop.load.compensation import contact_wrench, scaled_wrench
+from drake_teleop.load.contact.noise_floor import NoiseFloor
+from drake_teleop.load.regressor import non_contact_wrench, wrench_of_load
+from drake_teleop.station import blocks
+from drake_teleop.station.channel.channel import Channel, TeleopChannel
+from drake_teleop.station.channel.network import NetworkConfig
+from drake_teleop.station.estimation import contact_detection, load_estimator
+from drake_teleop.station.master.force_display import display_into, initial_display
+from drake_teleop.station.passivity.methods import METHODS, PassivityConfig
+from drake_teleop.station.passivity.packet import PACKET_SIZE
+from drake_teleop.station.scaling.force_scaling import ForceScalingConfig, wrench_to_master
+from drake_teleop.station.scenario import Scenario
+from drake_teleop.station.scaling.kinematic_scaling import KinematicScalingConfig
+from drake_teleop.station.slave.arm import forward_kinematics
+from drake_teleop.station.slave.plant import NominalSlave
+from drake_teleop.station.slave.slave_config import Slave
+
+T = 1e-3
+START = np.array([1.0, 0.0, 0.0, 0.0, 0.4, 0.0, 0.3])
+PHI = np.array([2.0, 0.02, -0.04, 0.3, 0.06, 0.001, -0.002, 0.06, 0.003, 0.01])
+OFFSETS = np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.1])
+GRAVITY_W = np.array([0.0, 0.0, -9.81])
+MOTION = ("specific_force_S", "angular_velocity_S", "angular_acceleration_S")
+CONFIG = ForceScalingConfig(sigma_weight=0.5, sigma_inertia=0.2, gamma=1.5, force_scale=0.1)
+
+
+def floor() -> NoiseFloor:
+    parts = np.full(6, 0.1), np.zeros((16, 16)), np.zeros((6, 2)), np.eye(6), np.zeros(6)
+    return NoiseFloor(*parts, reached=np.full(3, 30.0))
+
+
+EXAMPLES = {
+    "NonContactWrench": blocks.NonContactWrench,
+    "WrenchScaling": blocks.WrenchScaling,
+    "LoadEstimator": lambda: blocks.LoadEstimator(np.ones(6), T),
+    "ContactDetector": lambda: blocks.ContactDetector(floor(), T),
+    "KinematicScaling": lambda: blocks.KinematicScaling(KinematicScalingConfig(), T, START),
+    "NetworkChannel": lambda: blocks.NetworkChannel(2, T),
+    "PassivityAtMaster": lambda: blocks.PassivityAtMaster(PassivityConfig(), T, START),
+    "PassivityAtSlave": lambda: blocks.PassivityAtSlave(PassivityConfig(), T, START),
+    "ForceDisplay": lambda: blocks.ForceDisplay(Scenario().master.device(0.0, 0.0), T),
+}
+"""Each block, as a user makes it."""
+
+
+GENERIC = ("NonContactWrench", "WrenchScaling")
+
+
+def rotations(count: int, rng: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(rng.normal(size=(count, 3, 3)))
+    return q * np.linalg.det(q)[:, None, None]
+
+
+def fixed(block, **values):
+    """Return the context of a block with fixed inputs."""
+    context = block.CreateDefaultContext()
+    for name, value in values.items():
+        block.GetInputPort(name).FixValue(context, np.ravel(value))
+    return context
+
+
+def output(block, context, name):
+    return block.GetOutputPort(name).Eval(context)
+
+
+def random_inputs(rng, R_WS):
+    values = {name: 4 * rng.normal(size=3) for name in MOTION}
+    return values | {
+        "measured_wrench_S": 30 * rng.normal(size=6),
+        "load_estimate": np.concatenate([OFFSETS, PHI]),
+        "R_WS": R_WS,
+    }
+
+
+def test_wrench_blocks_equal_the_functions_for_all_scalar_types():
+    rng = np.random.default_rng(0)
+    for R_WS in rotations(20, rng):
+        values = random_inputs(rng, R_WS)
+        motion, wrench = [values[name] for name in MOTION], values["measured_wrench_S"]
+        only = dict(zip(MOTION, motion, strict=True))
+        scaled = scaled_wrench(
+            wrench, OFFSETS, *motion, PHI, np.zeros(10), gravity=R_WS.T @ GRAVITY_W, gamma=1.5,
+            sigma_gripper=0.0, sigma_object=0.0, sigma_weight=0.5, sigma_inertia=0.2,
+        )  # fmt: skip
+        expected = {
+            "contact_wrench_S": contact_wrench(wrench, OFFSETS, *motion, PHI),
+            "scaled_wrench_S": scaled,
+            "wrench_to_master": wrench_to_master(scaled, R_WS, np.eye(3), 0.1, 0.1),
+        }
+        load, scaling = blocks.NonContactWrench(PHI), blocks.WrenchScaling(CONFIG)
+        for convert in (lambda b: b, lambda b: b.ToAutoDiffXd(), lambda b: b.ToSymbolic()):
+            block = convert(load)
+            found = output(block, fixed(block, **only), "non_contact_wrench_S")
+            total = non_contact_wrench(*motion, PHI)
+            np.testing.assert_allclose(numbers(found), total, atol=1e-12, rtol=1e-12)
+            block = convert(scaling)
+            context = fixed(block, **values)
+            for name, wanted in expected.items():
+                found = numbers(output(block, context, name))
+                np.testing.assert_allclose(found, wanted, atol=1e-12, rtol=1e-12)
+
+
+def numbers(values) -> np.ndarray:
+    if values.dtype == float:
+        return values
+    is_autodiff = hasattr(values[0], "value")
+    return np.array([x.value() if is_autodiff else x.Evaluate() for x in values])
+
+
+def test_compiled_and_generic_mathematics_are_equal_over_many_samples():
+    rng = np.random.default_rng(1)
+    s, omega, alpha = 5 * rng.normal(size=(3, 10_000, 3))
+    generic = np.array(
+        [np.concatenate(wrench_of_load(*each, PHI))
+         for each in zip(s, omega, alpha, strict=True)]
+    )  # fmt: skip
+    compiled = non_contact_wrench(s, omega, alpha, PHI)
+    np.testing.assert_allclose(generic, compiled, rtol=1e-12, atol=1e-12)
+
+
+def test_gradient_of_the_elimination_equals_finite_differences():
+    rng = np.random.default_rng(2)
+    values = random_inputs(rng, rotations(1, rng)[0])
+    block = blocks.WrenchScaling(CONFIG)
+    double, auto = block, block.ToAutoDiffXd()
+    for name in ("specific_force_S", "angular_velocity_S", "R_WS"):
+        x = np.ravel(values[name])
+        context = fixed(auto, **values | {name: InitializeAutoDiff(x)})
+        gradient = ExtractGradient(output(auto, context, "wrench_to_master").reshape(-1, 1))
+        for k in range(x.size):
+            steps = [x + h * np.eye(x.size)[k] for h in (1e-6, -1e-6)]
+            ends = [
+                output(double, fixed(double, **values | {name: step}), "wrench_to_master")
+                for step in steps
+            ]
+            np.testing.assert_allclose(gradient[:, k], (ends[0] - ends[1]) / 2e-6, atol=1e-6)
+
+
+def test_symbolic_wrench_contains_the_variables():
+    block = blocks.NonContactWrench([2.0, *np.zeros(9)]).ToSymbolic()
+    a = MakeVectorVariable(3, "s")
+    values = dict.fromkeys(MOTION[1:], np.zeros(3)) | {MOTION[0]: a}
+    found = output(block, fixed(block, **values), "non_contact_wrench_S")
+    assert [str(x) for x in found[:2]] == ["(2 * s(0))", "(2 * s(1))"]
+    at = dict(zip(a, [1.0, 2.0, 3.0], strict=True))
+    np.testing.assert_allclose(Evaluate(found, at).ravel(), [2, 4, 6, 0, 0, 0])
+
+
+def test_load_is_an_input_or_a_parameter():
+    block, values = blocks.NonContactWrench(PHI), {name: np.ones(3) for name in MOTION}
+    by_port = output(block, fixed(block, **values, load=2 * PHI), "non_contact_wrench_S")
+    context = fixed(block, **values)
+    by_parameter = output(block, context, "non_contact_wrench_S")
+    np.testing.assert_allclose(by_port, 2 * by_parameter)
+    context.get_mutable_numeric_parameter(0).SetFromVector(3 * PHI)
+    found = output(block, context, "non_contact_wrench_S")
+    np.testing.assert_allclose(found, 3 * by_parameter)
+
+
+def test_missing_orientation_is_one_line():
+    rng = np.random.default_rng(3)
+    values = random_inputs(rng, np.eye(3))
+    del values["R_WS"]
+    block = blocks.WrenchScaling(CONFIG)
+    with pytest.raises(DrakeTeleopError, match="gravity in S: is unknown.*; connect R_WS"):
+        output(block, fixed(block, **values), "scaled_wrench_S")
+    block = blocks.WrenchScaling()
+    with pytest.raises(DrakeTeleopError, match="wrench_to_master: R_WS is not connected"):
+        output(block, fixed(block, **values), "wrench_to_master")
+    assert np.isfinite(output(block, fixed(block, **values), "scaled_wrench_S")).all()
+
+
+def stepped(block, rows, name):
+    """Return an output after each row of inputs, held for a period."""
+    simulator, found = Simulator(block), []
+    context = simulator.get_mutable_context()
+    for k, values in enumerate(rows):
+        for port, value in values.items():
+            block.GetInputPort(port).FixValue(context, np.ravel(value))
+        simulator.AdvanceTo(k * T + 0.5 * T)
+        found.append(output(block, context, name).copy())
+    return np.array(found)
+
+
+def samples(rng, count):
+    """Return samples for the plain ports, and for the port `sample` of the station."""
+    arm = NominalSlave(Slave()).arm
+    q, names = np.array([0.3, -0.5, -1.5, 0.2, -0.9, 1.0]), ("measured_wrench_S", *MOTION)
+    plain, fused = [], []
+    for k in range(count):
+        motion = rng.normal(size=(3, 3)) + [[0, 0, 9.81], [0, 0, 0], [0, 0, 0]]
+        wrench = non_contact_wrench(*motion, PHI) + OFFSETS + 0.1 * rng.normal(size=6)
+        wrench[0] += 20.0 * (k > count // 2)
+        invalid = [float(k % 13 == 5)]
+        plain.append(dict(zip(names, (wrench, *motion), strict=True)) | {"saturated": invalid})
+        fused.append({"sample": np.concatenate([wrench, *motion, invalid, q, [k * T]])})
+    return arm, q, plain, fused
+
+
+def test_load_estimator_equals_that_of_the_station():
+    _, _, plain, fused = samples(np.random.default_rng(4), 60)
+    config = load_estimator.LoadEstimatorConfig(enabled=True)
+    station = load_estimator.LoadEstimator(
+        config, np.ones(6), np.zeros(9), T, len(fused[0]["sample"]), np.zeros(16)
+    )
+    block = blocks.LoadEstimator(np.ones(6), T)
+    found = stepped(block, plain, "load_estimate")
+    np.testing.assert_array_equal(found, stepped(station, fused, "load_estimate"))
+    assert found[20, 6] == pytest.approx(2.0, abs=0.3)
+
+
+def test_contact_detector_equals_that_of_the_station():
+    arm, q, plain, fused = samples(np.random.default_rng(5), 60)
+    R_WS, p_WS = np.empty((3, 3)), np.empty(3)
+    forward_kinematics(arm.table, q, R_WS, p_WS)
+    estimate = {"load_estimate": np.concatenate([OFFSETS, PHI])}
+    config = contact_detection.ContactDetectionConfig()
+    station = contact_detection.ContactDetection(config, floor(), arm, T)
+    block = blocks.ContactDetector(floor(), T)
+    found = stepped(block, [row | estimate | {"R_WS": R_WS} for row in plain], "contact")
+    expected = stepped(station, [row | estimate for row in fused], "contact")
+    np.testing.assert_array_equal(found, expected)
+    assert not found[:25].any() and found[-1] == 1.0
+
+
+def test_force_display_equals_the_display_of_the_station():
+    master, rng = Scenario().master, np.random.default_rng(6)
+    device = master.device(0.0, 0.0)
+    q = device.inverse_kinematics(np.array([1.0, 0.0, 0.0, 0.0, *master.position]))
+    rows = [
+        {"wrench_command": 10 * rng.normal(size=6), "joint_position": q + 0.01 * k}
+        for k in range(40)
+    ]
+    rows[20]["wrench_command"] = np.full(6, np.nan)
+    # The outputs are of the period that follows the update at its start.
+    found = stepped(blocks.ForceDisplay(device, T, q), rows, "joint_torque")
+    memory, J, expected = initial_display(q, device.numbers), np.zeros((6, 6)), []
+    for row in rows:
+        for _ in range(2):
+            drive, memory[:6] = np.zeros(len(memory)), row["joint_position"]
+            display_into(row["wrench_command"], memory, device.numbers, T, J, drive)
+            if _ == 0:
+                memory = drive.copy()
+        expected.append(drive[:6])
+    np.testing.assert_array_equal(found, expected)
+
+
+DOCS = Path(__file__).parents[2] / "docs" / "blocks.md"
+
+
+def ports(block, kind) -> str:
+    count, get = getattr(block, f"num_{kind}_ports")(), getattr(block, f"get_{kind}_port")
+    return ", ".join(f"`{get(k).get_name()}` {get(k).size()}" for k in range(count))
+
+
+def test_the_table_of_blocks_is_that_of_the_real_ports():
+    rows = [line for line in DOCS.read_text().splitlines() if line.startswith("| `")]
+    found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:6]] for row in rows}
+    assert {*found} == {*EXAMPLES}
+    for name, (inputs, outputs, rate, scalars) in found.items():
+        block = EXAMPLES[name]()
+        assert (name, inputs, outputs) == (name, ports(block, "input"), ports(block, "output"))
+        events = block.GetUniquePeriodicDiscreteUpdateAttribute()
+        assert rate == ("continuous" if events is None else "`period`")
+        try:
+            others = bool(block.ToAutoDiffXd() and block.ToSymbolic())
+        except (DrakeTeleopError, RuntimeError):
+            others = False
+        assert scalars == ("double, AutoDiffXd, Expression" if others else "double")
+
+
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in GENERIC])
+def test_a_conversion_that_is_impossible_is_one_line(name):
+    with pytest.raises((DrakeTeleopError, RuntimeError), match=r"for double only|not support"):
+        EXAMPLES[name]().ToAutoDiffXd()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_ends_and_two_networks_equal_the_channel_of_the_station(method):
+    line = NetworkConfig(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1)
+    passivity, scales = PassivityConfig(method=method), np.array([2.0, 1.0])
+    if method == "ledger":
+        passivity = PassivityConfig(
+            method=method, slave_mass=[10.0, 0.1], servo_stiffness=[2e5, 2e3],
+            servo_damping=[4e3, 40.0],
+        )  # fmt: skip
+    names = ("pose_command", "wrench_B", "hand_wrench_E", "pose_slave", "saturated", "load_wrench_B")
+    channel = TeleopChannel(
+        Channel(delay=0.004, jitter=0.5, loss=0.1, duplicate=0.1, timeout=0.1), passivity,
+        np.eye(3), scales, 0.1, START, T, 7,
+    )  # fmt: skip
+    builder = DiagramBuilder()
+    same = dict(scales=scales, force_scale=0.1)
+    master = builder.AddSystem(blocks.PassivityAtMaster(passivity, T, START, **same))
+    slave = builder.AddSystem(blocks.PassivityAtSlave(passivity, T, START, **same))
+    there, back = (
+        builder.AddSystem(blocks.NetworkChannel(PACKET_SIZE, T, line, seed=7, direction=k))
+        for k in range(2)
+    )
+    for source, port, target in (
+        (master, "arriving", there), (slave, "received", back)
+    ):  # fmt: skip
+        builder.Connect(source.GetOutputPort("packet"), target.GetInputPort("packet"))
+        other = slave if source is master else master
+        builder.Connect(target.GetOutputPort(port), other.GetInputPort("received"))
+    for name in names:
+        end = master if name in ("pose_command", "hand_wrench_E") else slave
+        builder.ExportInput(end.GetInputPort(name), name)
+    for end, name in ((master, "wrench_to_master"), (slave, "pose_to_slave")):
+        builder.ExportOutput(end.GetOutputPort(name), name)
+    apart = builder.Build()
+    rng, rows, pose = np.random.default_rng(8), [], START.copy()
+    for k in range(120):
+        pose = pose + np.concatenate([np.zeros(4), 1e-4 * rng.normal(size=3)])
+        late = START if k < 10 else rows[k - 10]["pose_command"]
+        wrench = np.concatenate([2 * rng.normal(size=3), 0.01 * rng.normal(size=3)])
+        values = (pose, wrench, 0.5 * wrench, late, [float(k == 50)], 0.2 * wrench)
+        rows.append(dict(zip(names, values, strict=True)))
+    for one, two in (("wrench_received", "wrench_to_master"), ("pose_received", "pose_to_slave")):
+        found, expected = stepped(apart, rows, two), stepped(channel, rows, one)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert np.ptp(expected[:, 4:], axis=0).max() > 1e-5
+
+
+def test_network_delays_by_whole_periods():
+    block = blocks.NetworkChannel(2, T, NetworkConfig(delay=0.003))
+    rows = [{"packet": [k + 1.0, -k]} for k in range(8)]
+    found = stepped(block, rows, "received")
+    np.testing.assert_array_equal(found[:, 0], [0, 0, 1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(found[:, 2], [0, 0, 1, 1, 1, 1, 1, 1])
+    with pytest.raises(DrakeTeleopError, match="silence: 'zero' needs packets"):
+        blocks.NetworkChannel(2, T, NetworkConfig(silence="zero"))
+
+
+def test_a_block_of_compiled_code_refuses_other_scalars_in_one_line():
+    block = blocks.NetworkChannel(2, T)
+    for convert in (block.ToAutoDiffXd, block.ToSymbolic):
+        with pytest.raises(DrakeTeleopError, match="^NetworkChannel: computes with compiled code"):
+            convert()
+
+
+def test_every_block_has_an_example():
+    assert {*EXAMPLES} == {name for name in blocks.__all__ if not name.endswith("_")}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_blocks_are_freed(name):
+    block = EXAMPLES[name]()
+    gone = weakref.ref(block)
+    block.CreateDefaultContext()
+    del block
+    gc.collect()
+    assert gone() is None
