@@ -27,7 +27,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import RandomSource
 
-from drake_teleop.common.blocks import ONE_DICT, weak_callback
+from drake_teleop.common.blocks import ONE_DICT
 from drake_teleop.common.compiled import njit
 from drake_teleop.common.errors import DrakeTeleopError, expect
 from drake_teleop.common.vectors import (
@@ -130,9 +130,7 @@ def AddWristSensor(
     }.items():
         builder.Connect(source, sensor.GetInputPort(port))
     if sensor.HasInputPort("noise"):
-        noise = RandomSource(
-            RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * sensor.period
-        )
+        noise = RandomSource(RandomDistribution.kGaussian, NOISE_SIZE, NOISE_BLOCK * sensor.period)
         builder.AddNamedSystem(f"{name}_noise", noise)
         builder.Connect(noise.get_output_port(), sensor.GetInputPort("noise"))
     return sensor
@@ -282,7 +280,9 @@ def _true_values_into(geometry, configuration, acceleration, reaction, truth):
         truth[SPECIFIC_FORCE.start + i] = s[i]
         truth[ANGULAR_VELOCITY.start + i] = truth[TRUE_ANGLES.start + i] = omega[i]
         truth[ANGULAR_ACCELERATION.start + i] = alpha[i]
-    put(truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE)
+    put(
+        truth, TRUE_ANGLES.start + 3, configuration, _POSE_SIZE, configuration.shape[0] - _POSE_SIZE
+    )
 
 
 @njit(cache=True)
